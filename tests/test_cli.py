@@ -319,6 +319,30 @@ def test_a_command_imports_only_what_it_needs() -> None:
     assert {"sceneprint_lab.cli.train", "sceneprint.cli.sign"} & of_synth == set()
 
 
+@pytest.mark.parametrize(
+    ("words", "completions"),
+    [
+        (("ma",), ["maps", "make"]),
+        (("maps", "--quota"), ["--quota-frames", "--quota-bytes"]),
+        (("make", "m"), ["mesh"]),
+        (("make", "mesh", "hall", "--vo"), ["--voxel"]),
+        (("nothing", "--"), []),
+    ],
+)
+def test_a_shell_completes_commands_and_options(
+    words: tuple[str, ...], completions: list[str]
+) -> None:
+    code = (
+        f"{run('completion', 'bash').stdout}\n"
+        'COMP_WORDS=(sceneprint "$@"); COMP_CWORD=$#; _sceneprint; echo "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(
+        ["bash", "-c", code, "bash", *words], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == completions
+    assert run("completion", "zsh").stdout.endswith(run("completion", "bash").stdout)
+
+
 def test_sites_are_written_as_clouds_with_poses(tmp_path: Path) -> None:
     out = tmp_path / "sites"
     arguments = ["--rooms", "1", "--views", "2", "--seed", "5", "--jobs", "1"]

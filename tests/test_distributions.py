@@ -35,7 +35,7 @@ print(json.dumps({
     "train": run("train", "--out", sys.argv[1]),
     "scenes": [run(*one, *nowhere) for one in (
         ("query", "map", "nowhere.png"), ("localize", "map", "nowhere.png"), ("frames", "map"),
-        ("associate", "map", "--session", "a"),
+        ("make", "association", "map", "--session", "a"),
     )],
     "upload": run("upload", "map", "nowhere.png", "--url", "http://127.0.0.1:9"),
 }))

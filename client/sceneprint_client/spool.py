@@ -550,7 +550,7 @@ class Spool:
             if "full" in str(error):
                 raise errors.StoreFull(
                     f"{self._path}: The disk has no room for the spool ({error}), and nothing was "
-                    "changed. Free some, or upload what waits with `sceneprint spool sync`."
+                    "changed. Free some, or upload what waits: `sceneprint spool FILE --to MAP`."
                 ) from error
             if "locked" in str(error):
                 raise errors.StoreLocked(

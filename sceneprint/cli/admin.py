@@ -1,23 +1,30 @@
-"""`sceneprint keys` and `tenants`: who may use a service, and who pays."""
+"""`sceneprint keys` and `audit`: who may use a service, and who changed what."""
 
 from __future__ import annotations
 
 import argparse
+import socket
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sceneprint.cli import duration
-from sceneprint.cli.options import one_line
-from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.cli import duration, whole_number
+from sceneprint.cli.options import add_data_option, existing_store, settings_of
+from sceneprint.cli.output import count_of, one_line, print_error
+from sceneprint.errors import InvalidRequest
 from sceneprint.process import COMMAND, acting_as
 from sceneprint_client.api.admin import EVERY, SCOPES
 
 if TYPE_CHECKING:
     from sceneprint.engine import Engine
-    from sceneprint_client.api.admin import Key, MadeKey, Scope
+    from sceneprint.store.audit_log import AuditFilter
+    from sceneprint_client.api.admin import AuditLine, Key, MadeKey, Scope
 
-#: How long before the end of a key it is told of.
+#: Remaining lifetime below which the list warns that a key expires.
 SOON = timedelta(days=7)
 
 
@@ -26,59 +33,57 @@ def add_keys(command: argparse.ArgumentParser) -> None:
     what = command.add_mutually_exclusive_group(required=True)
     what.add_argument("--create", metavar="NAME", help="create a key and print its secret")
     what.add_argument(
-        "--list",
-        action="store_true",
+        "--list", action="store_true",
         help="list keys with their creation time, name, scope, tenant, expiry and last use",
-    )
+    )  # fmt: skip
     what.add_argument(
-        "--rotate",
-        metavar="NAME",
+        "--rotate", metavar="NAME",
         help="give a key a new secret and print it; the old one works for a while longer",
-    )
+    )  # fmt: skip
     what.add_argument("--revoke", metavar="NAME", help="revoke a key")
+    what.add_argument("--create-tenant", metavar="NAME", help="create a tenant without keys")
+    what.add_argument(
+        "--list-tenants", action="store_true",
+        help="list tenants with their creation time, name and number of keys",
+    )  # fmt: skip
+    what.add_argument("--delete-tenant", metavar="NAME", help="delete a tenant that has no key")
     command.add_argument("--scope", choices=SCOPES, help="scope of the new key (default: admin)")
     command.add_argument(
-        "--map",
-        action="append",
-        metavar="MAP",
-        help=(
-            "map that the key is valid for; repeatable (default: all maps and everything "
-            "outside of maps)"
-        ),
-    )
+        "--map", action="append", metavar="MAP",
+        help="map that the key is valid for; repeatable (default: all maps and everything outside "
+        "of maps)",
+    )  # fmt: skip
     command.add_argument(
-        "--tenant",
-        metavar="TENANT",
+        "--tenant", metavar="TENANT",
         help="tenant that the new key belongs to (default: one with the name of the key)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--expires",
-        type=duration,
-        metavar="TIME",
+        "--expires", type=duration, metavar="TIME",
         help="lifetime of the key, such as 12h, 30d or 8w (default: no expiry)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--overlap",
+        "--overlap", metavar="TIME",
         type=lambda text: timedelta() if text == "0" else duration(text),
-        metavar="TIME",
         help="how long the old secret still works, such as 30m or 7d, up to 30d; 0 ends it at once "
         "(default: 1h)",
-    )
+    )  # fmt: skip
     add_data_option(command)
     command.set_defaults(run=run_keys)
 
 
 def run_keys(options: argparse.Namespace) -> int:
-    """Create, list, rotate or revoke API keys. A service needs them once it listens beyond its
-    own machine. The secret of a key is printed once; only its hash is stored.
+    """Create, list, rotate or revoke API keys, and the tenants that they belong to. A service
+    needs keys once it listens beyond its own machine. The secret of a key is printed once; only
+    its hash is stored. The requests of a tenant's keys are limited together, and tenants take
+    turns at the workers.
     """
     from sceneprint.engine import Engine
-    from sceneprint.errors import InvalidRequest
+    from sceneprint.engine.admin.operations import create_tenant, delete_tenant
 
     own = ("scope", "map", "tenant", "expires")
-    given = [name for name in own if getattr(options, name) is not None]
-    if given and options.create is None:
-        raise InvalidRequest(f"--{given[0]} applies to a new key only. Use it with --create.")
+    foreign = [name for name in own if getattr(options, name) is not None]
+    if foreign and options.create is None:
+        raise InvalidRequest(f"--{foreign[0]} applies to a new key only. Use it with --create.")
     if options.overlap is not None and options.rotate is None:
         raise InvalidRequest("--overlap applies to a rotation only. Use it with --rotate.")
     with acting_as(COMMAND), Engine(settings_of(options)) as engine:
@@ -86,30 +91,36 @@ def run_keys(options: argparse.Namespace) -> int:
             _print_keys(engine)
         elif options.rotate is not None:
             overlap = timedelta(hours=1) if options.overlap is None else options.overlap
-            made = engine.rotate_key(options.rotate, overlap.total_seconds())
-            _print_secret(made)
-            if made.previous_until is not None:
-                ends = f"{made.previous_until:%Y-%m-%dT%H:%M:%SZ}"
-                print(f"the old secret works until {ends}", file=sys.stderr)
+            key = engine.rotate_key(options.rotate, overlap.total_seconds())
+            _print_secret(key)
+            if key.previous_until is not None:
+                print_error(f"the old secret works until {key.previous_until:%Y-%m-%dT%H:%M:%SZ}")
         elif options.revoke is not None:
             engine.revoke_key(options.revoke)
             print(f"key {one_line(options.revoke)} is revoked")
+        elif options.list_tenants:
+            _print_tenants(engine)
+        elif options.delete_tenant is not None:
+            delete_tenant(engine.store, options.delete_tenant)
+            print(f"tenant {one_line(options.delete_tenant)} is deleted")
+        elif options.create_tenant is not None:
+            create_tenant(engine.store, options.create_tenant)
+            print(f"tenant {one_line(options.create_tenant)} is created")
         else:
             scope: Scope = options.scope or "admin"
             grants = dict.fromkeys(options.map or [EVERY], scope)
             until = None if options.expires is None else datetime.now(UTC) + options.expires
-            made = engine.create_key(options.create, grants, until, options.tenant)
-            _print_secret(made)
+            _print_secret(engine.create_key(options.create, grants, until, options.tenant))
     return 0
 
 
-def _print_secret(made: MadeKey) -> None:
-    print(made.secret)
-    print("save this secret now: it is not stored and cannot be shown again", file=sys.stderr)
+def _print_secret(key: MadeKey) -> None:
+    print(key.secret)
+    print_error("save this secret now: it is not stored and cannot be shown again")
 
 
 def _print_keys(engine: Engine) -> None:
-    """All keys, and below which of them end soon."""
+    """Print all keys, and below which of them expire soon."""
     from sceneprint.engine.admin.operations import list_keys
 
     now, cursor, soon = datetime.now(UTC), None, []
@@ -123,11 +134,20 @@ def _print_keys(engine: Engine) -> None:
         if cursor is None:
             break
     if soon:
-        print(
-            f"expiring within {SOON.days} days: {', '.join(soon)}. Create keys in their place with "
-            "--create.",
-            file=sys.stderr,
+        names = ", ".join(soon)
+        print_error(
+            f"expiring within {SOON.days} days: {names}. Create keys in their place with --create."
         )
+
+
+def _print_tenants(engine: Engine) -> None:
+    from sceneprint.store.tenants import list_tenants
+
+    with engine.store.database.read() as connection:
+        tenants = list_tenants(connection)
+    for one in tenants:
+        at = datetime.fromtimestamp(one.created_at, UTC)
+        print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(one.name)}  {count_of(one.keys, 'key')}")
 
 
 def _key_line(key: Key) -> str:
@@ -147,44 +167,91 @@ def _key_line(key: Key) -> str:
     return text
 
 
-# `sceneprint tenants`: whom keys belong to.
+# `sceneprint audit`: the audit log.
+
+#: Facility `log audit`, severity `notice`, as RFC 5424 numbers them.
+_PRIORITY = 13 * 8 + 5
 
 
-def add_tenants(command: argparse.ArgumentParser) -> None:
-    """Add the options of `sceneprint tenants`."""
-    what = command.add_mutually_exclusive_group(required=True)
-    what.add_argument("--create", metavar="NAME", help="create a tenant without keys")
-    what.add_argument(
-        "--list",
-        action="store_true",
-        help="list tenants with their creation time, name and number of keys",
+def add_audit(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint audit`."""
+    command.add_argument(
+        "--actor", metavar="NAME",
+        help="only entries of this key, or `command` for the command line",
+    )  # fmt: skip
+    command.add_argument("--map", metavar="MAP", help="only entries about this map")
+    command.add_argument(
+        "--action", metavar="TEXT", help="only actions that begin so, such as `key.` or `refused`"
     )
-    what.add_argument("--delete", metavar="NAME", help="delete a tenant that has no key")
+    command.add_argument(
+        "--since", type=duration, metavar="DURATION", help="only entries of the last 12h, 30d or 8w"
+    )
+    command.add_argument(
+        "--limit", type=whole_number, default=100, metavar="N",
+        help="maximum number of entries to print without --format (default: 100)",
+    )  # fmt: skip
+    command.add_argument(
+        "--format", choices=tuple(_FORMATS),
+        help="export as JSON lines, or as syslog messages (RFC 5424), one per line",
+    )  # fmt: skip
+    command.add_argument(
+        "--output", type=Path, metavar="FILE",
+        help="with --format: append to this file (default: standard output)",
+    )  # fmt: skip
     add_data_option(command)
-    command.set_defaults(run=run_tenants)
+    command.set_defaults(run=run_audit)
 
 
-def run_tenants(options: argparse.Namespace) -> int:
-    """Create, list or delete tenants. What the keys of a tenant ask at once and per second is
-    counted together, and tenants take turns at the workers. A key that is created without
-    --tenant belongs to a tenant of its own name.
+def run_audit(options: argparse.Namespace) -> int:
+    """Print the newest entries of the audit log, newest first. Each entry names the key, its
+    address, and the change or the refused request. With --format, export all entries, oldest
+    first.
     """
     from sceneprint.engine import Engine
-    from sceneprint.engine.admin.operations import create_tenant, delete_tenant
-    from sceneprint.store.tenants import list_tenants
+    from sceneprint.store.audit_log import AuditFilter
 
-    with acting_as(COMMAND), Engine(settings_of(options)) as engine:
-        if options.list:
-            with engine.store.database.read() as connection:
-                found = list_tenants(connection)
-            for one in found:
-                at = datetime.fromtimestamp(one.created_at, UTC)
-                count = f"{one.keys} key{'s' * (one.keys != 1)}"
-                print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(one.name)}  {count}")
-        elif options.delete is not None:
-            delete_tenant(engine.store, options.delete)
-            print(f"tenant {one_line(options.delete)} is deleted")
-        else:
-            create_tenant(engine.store, options.create)
-            print(f"tenant {one_line(options.create)} is created")
+    if options.output is not None and options.format is None:
+        raise InvalidRequest("--output needs --format. Choose jsonl or syslog.")
+    since = None if options.since is None else time.time() - options.since.total_seconds()
+    wanted = AuditFilter(options.actor, options.map, options.action, since)
+    with Engine(existing_store(options)) as engine:
+        if options.format is None:
+            for one in _newest(engine, wanted, options.limit):
+                print(_audit_line(one))
+            return 0
+        target = options.output
+        with nullcontext(sys.stdout) if target is None else target.open("a") as file:
+            for one in engine.audit.lines(wanted):
+                print(_FORMATS[options.format](one), file=file)
     return 0
+
+
+def _newest(engine: Engine, wanted: AuditFilter, left: int) -> Iterator[AuditLine]:
+    cursor = None
+    while left > 0:
+        page = engine.audit.page(wanted, cursor, min(left, 1000))
+        yield from page.items
+        cursor, left = page.next_cursor, left - len(page.items)
+        if cursor is None:
+            return
+
+
+def _audit_line(one: AuditLine) -> str:
+    who = "no key" if one.actor is None else one.actor
+    whence = "" if one.address is None else f" from {one.address}"
+    operation = one.data.get("operation") if one.action == "refused" else None
+    what = " ".join(part for part in (one.action, operation, one.map, one.target) if part)
+    return one_line(f"{one.at:%Y-%m-%dT%H:%M:%SZ}  {who}{whence}  {what}")
+
+
+def _syslog_message(one: AuditLine) -> str:
+    """Return a message of RFC 5424 whose text is the JSON line."""
+    at = one.at.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    host = socket.gethostname() or "-"
+    return f"<{_PRIORITY}>1 {at} {host} sceneprint - audit - {one.model_dump_json()}"
+
+
+_FORMATS: dict[str, Callable[[AuditLine], str]] = {
+    "jsonl": lambda one: one.model_dump_json(),
+    "syslog": _syslog_message,
+}

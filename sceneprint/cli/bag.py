@@ -1,20 +1,17 @@
-"""`sceneprint bag`, and the options of every command that takes a recording of ROS."""
+"""`sceneprint bag`, and the options of all commands that read recordings of ROS."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from tqdm import tqdm
-
 from sceneprint.cli import number_within, positive_number
-from sceneprint.cli.options import one_line
+from sceneprint.cli.output import one_line, print_error, progress_bar
 from sceneprint.errors import InvalidRequest
 from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
 from sceneprint.formats.dataset.frame_reference import Layout
@@ -27,57 +24,35 @@ _DEFAULT = RecordingOptions()
 
 
 def add_recording_options(command: argparse.ArgumentParser) -> None:
-    """`--topic` and its like."""
+    """Add `--topic` and the other options of recordings."""
     group = command.add_argument_group(
         "recordings of ROS", f"for {titles_of('recording', last='or')} files, and rosbag2 folders"
     )
+    for option, metavar, text in (
+        ("--topic", "NAME", "topic of depth images or points (default: the only one)"),
+        ("--camera-info", "NAME",
+         "topic of the depth images' camera (default: the one beside them)"),
+        ("--pose-frame", "FRAME",
+         "frame that poses lead to (default: map, else odom, else the topmost frame)"),
+        ("--sensor-frame", "FRAME",
+         "frame of the sensor, of points that are in the frame of the world (default: the only one "
+         "at the end of the transforms below it)"),
+    ):  # fmt: skip
+        group.add_argument(option, metavar=metavar, help=text)
     group.add_argument(
-        "--topic", metavar="NAME", help="topic of depth images or points (default: the only one)"
-    )
-    group.add_argument(
-        "--camera-info",
-        metavar="NAME",
-        help="topic of the depth images' camera (default: the one beside them)",
-    )
-    group.add_argument(
-        "--depth-scale",
-        type=positive_number,
-        metavar="UNITS",
+        "--depth-scale", type=positive_number, metavar="UNITS",
         help="stored units per metre of 16-bit depth images, also of folders (default: as "
         "intrinsics.json says, else 1000, millimetres)",
-    )
-    group.add_argument(
-        "--pose-frame",
-        metavar="FRAME",
-        help="frame that poses lead to (default: map, else odom, else the topmost frame)",
-    )
-    group.add_argument(
-        "--sensor-frame",
-        metavar="FRAME",
-        help="frame of the sensor, of points that are in the frame of the world (default: the only "
-        "one at the end of the transforms below it)",
-    )
-    group.add_argument(
-        "--keyframe-m",
-        type=_from_zero,
-        default=_DEFAULT.keyframe_m,
-        metavar="METRES",
-        help="take a frame this far from the last one taken; 0 takes every frame (default: 0.3)",
-    )
-    group.add_argument(
-        "--keyframe-deg",
-        type=_from_zero,
-        default=_DEFAULT.keyframe_deg,
-        metavar="DEGREES",
-        help="or turned by this much (default: 15)",
-    )
-    group.add_argument(
-        "--keyframe-s",
-        type=_from_zero,
-        default=_DEFAULT.keyframe_s,
-        metavar="SECONDS",
-        help="without poses, take a frame this long after the last one taken (default: 0.5)",
-    )
+    )  # fmt: skip
+    for option, default, metavar, text in (
+        ("--keyframe-m", _DEFAULT.keyframe_m, "METRES",
+         "take a frame this far from the last one taken; 0 takes every frame (default: 0.3)"),
+        ("--keyframe-deg", _DEFAULT.keyframe_deg, "DEGREES",
+         "or turned by this much (default: 15)"),
+        ("--keyframe-s", _DEFAULT.keyframe_s, "SECONDS",
+         "without poses, take a frame this long after the last one taken (default: 0.5)"),
+    ):  # fmt: skip
+        group.add_argument(option, type=_from_zero, default=default, metavar=metavar, help=text)
 
 
 def _from_zero(text: str) -> float:
@@ -86,24 +61,14 @@ def _from_zero(text: str) -> float:
 
 @contextmanager
 def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]:
-    """What to take of recordings, with a bar while they are read."""
-    with tqdm(desc="read recording", unit="message", delay=0.5, leave=False, disable=None) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield RecordingOptions(
-            topic=options.topic,
-            camera_info=options.camera_info,
-            pose_frame=options.pose_frame,
-            keyframe_m=options.keyframe_m,
-            keyframe_deg=options.keyframe_deg,
-            keyframe_s=options.keyframe_s,
-            sensor_frame=options.sensor_frame,
-            depth_scale=options.depth_scale,
-            progress=progress,
-        )
+    """Yield the options of recordings, and show a bar while they are read."""
+    names = (
+        "topic", "camera_info", "pose_frame", "keyframe_m", "keyframe_deg", "keyframe_s",
+        "sensor_frame", "depth_scale",
+    )  # fmt: skip
+    with progress_bar("read recording", "message", delay=0.5, leave=False) as progress:
+        fields = {name: getattr(options, name) for name in names}
+        yield RecordingOptions(**fields, progress=progress)
 
 
 def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSequence:
@@ -132,39 +97,37 @@ def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSeque
 def sequences_at(
     path: Path, options: argparse.Namespace, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """The sequences at a path, of a recording as the options say; what was left out of one is told
-    on standard error. `camera` and what is raised: as of `find_sequences`.
+    """Return the sequences at a path, and print what was left out of a recording.
+
+    Takes `camera` and raises as `find_sequences`.
     """
     with recording_options(options) as recording:
         found = find_sequences(path, recording, camera)
     for sequence in found:
-        tell(sequence)
+        print_note(sequence)
     return tuple(with_depth_scale(one, options.depth_scale) for one in found)
 
 
-def tell(sequence: FrameSequence) -> None:
-    """Say on standard error what was left out of a recording."""
+def print_note(sequence: FrameSequence) -> None:
+    """Print what was left out of a recording on standard error."""
     if sequence.note:
-        print(f"{one_line(str(sequence.folder))}: {sequence.note}", file=sys.stderr)
+        print_error(f"{one_line(str(sequence.folder))}: {sequence.note}")
 
 
-# `sceneprint bag info`.
+# `sceneprint bag`.
 
 
 def add_bag(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint bag`."""
-    what = command.add_subparsers(dest="what", required=True, metavar="ACTION")
-    info = what.add_parser(
-        "info",
-        help="list topics, and which frames, camera and poses would be taken; exit code 1 if none",
-    )
-    info.add_argument("path", type=Path, metavar="PATH", help="a recording, or a folder of them")
-    add_recording_options(info)
+    command.add_argument("path", type=Path, metavar="PATH", help="a recording, or a folder of them")
+    add_recording_options(command)
     command.set_defaults(run=run_bag)
 
 
 def run_bag(options: argparse.Namespace) -> int:
-    """Look into a recording of ROS: an MCAP file, a rosbag2 folder or database, or a ROS 1 bag."""
+    """List the topics of a recording of ROS (an MCAP file, a rosbag2 folder or database, or a ROS 1
+    bag), and which frames, camera and poses would be taken. Exit code 1 if none.
+    """
     outlines: list[BagOutline] = []
     for path in find_recordings(options.path) or [options.path]:
         with recording_options(options) as recording:
@@ -201,7 +164,7 @@ def _lines(path: Path, outline: BagOutline) -> list[str]:
 
 
 def _span(outline: BagOutline) -> str:
-    """When it was recorded, and for how long."""
+    """Return the start and the duration of a recording."""
     seconds = (outline.end_ns - outline.start_ns) * 1e-9
     if not 0 <= seconds < 1e9:
         return "no messages"
@@ -213,7 +176,7 @@ def _span(outline: BagOutline) -> str:
 
 
 def _taken(sequence: FrameSequence) -> list[str]:
-    """What would be taken, a line each."""
+    """Return lines on the frames that would be taken."""
     first = sequence.frames[0]
     lines = [sequence.note] if sequence.note else []
     if first.camera is not None:

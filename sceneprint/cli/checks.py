@@ -1,4 +1,4 @@
-"""What `sceneprint doctor` has found by one look, and what it says of a running service."""
+"""Checks of `sceneprint doctor`: their records, and those of a running service."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Verdict = Literal["ok", "note", "WRONG"]
 
 #: Free space below which uploads are soon refused, and below which it is time to look, bytes.
 LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
-#: Clocks that differ by more are told, seconds.
+#: Largest difference of clocks that is not worth a note, seconds.
 APART_S = 2.0
 
 
@@ -42,13 +42,7 @@ class Check:
 
 
 def disk_check(subject: str, free: int) -> Check:
-    """Whether there is room for frames to come.
-
-    Parameters
-    ----------
-    subject : whose disk it is
-    free : bytes left on it
-    """
+    """Check that a disk with `free` bytes has room for more frames."""
     text = f"{free / 1e9:.1f} GB free; a frame takes about 0.25 MB"
     if free < LEAST_FREE:
         return Check("WRONG", subject, f"{text}. Free some space, or uploads will be rejected.")
@@ -56,7 +50,7 @@ def disk_check(subject: str, free: int) -> Check:
 
 
 def seconds_apart(before: float, there: float, after: float) -> float:
-    """How much two clocks differ at least, seconds.
+    """Return by how much two clocks differ at least, seconds.
 
     Parameters
     ----------
@@ -66,26 +60,16 @@ def seconds_apart(before: float, there: float, after: float) -> float:
     return max(before - there, there - after, 0.0)
 
 
-# Checks of a running service: what the service itself tells.
+# Checks of a running service, by its own answers.
 
-#: Age of a job that nobody does at which workers are missed, seconds.
+#: Age of a waiting job at which missing workers are a problem, seconds.
 LONGEST_S = 60.0
 #: Most names that a line has.
 _MOST_NAMES = 5
 
 
 def service_checks(client: Client, url: str) -> Iterator[Check]:
-    """Ask a service that answers for all that it tells.
-
-    Parameters
-    ----------
-    client : of the service
-    url : its address, for people
-
-    Raises
-    ------
-    SceneprintError : it ceased to answer.
-    """
+    """Yield checks of a service that answers at `url`; SceneprintError if it ceases to answer."""
     try:
         status = client.status()
     except KeyRequired as error:  # one that is not known
@@ -118,7 +102,7 @@ def service_checks(client: Client, url: str) -> Iterator[Check]:
 
 
 def version_check(url: str, status: Status) -> Check:
-    """Whether the service is of the version of this command."""
+    """Check that the service has the version of this command."""
     text = f"{url} answers, version {status.version}"
     if status.frames is not None:
         text += f", {sum(status.frames.values())} frames"
@@ -128,7 +112,7 @@ def version_check(url: str, status: Status) -> Check:
 
 
 def ready_check(status: Status) -> Check:
-    """Return whether the service takes uploads."""
+    """Check that the service takes uploads."""
     if status.read_only:
         text = "read-only: it answers queries and rejects uploads. Make its data folder writable"
         return Check("note", "ready", f"{text}.")
@@ -136,7 +120,7 @@ def ready_check(status: Status) -> Check:
 
 
 def clock_check(before: float, there: float, after: float) -> Check:
-    """The clocks of this machine and of the service, as far as the answer's way can tell."""
+    """Compare the clocks of this machine and of the service, but for the time of the request."""
     apart = seconds_apart(before, there, after)
     text = f"the service's clock differs from this machine's by {apart:.1f} s"
     if apart > APART_S:
@@ -146,7 +130,7 @@ def clock_check(before: float, there: float, after: float) -> Check:
 
 
 def store_check(stats: Stats) -> Check:
-    """What the service keeps, and where."""
+    """Return the sizes of the database, the blobs and the indexes."""
     sizes = stats.bytes
     # which database it is, no answer of the service tells
     place = "database" if sizes.database is None else f"database of {sizes.database / 1e6:.1f} MB"
@@ -155,7 +139,7 @@ def store_check(stats: Stats) -> Check:
 
 
 def scrub_check(stats: Stats) -> Check:
-    """What workers found that read all stored bytes."""
+    """Return the findings of the scrub, which reads all stored bytes."""
     seen = stats.scrub
     if seen is None:
         return Check("note", "scrub", "no stored bytes have been read to check them yet")
@@ -173,7 +157,7 @@ def scrub_check(stats: Stats) -> Check:
 
 
 def worker_check(stats: Stats, *, read_only: bool) -> Check:
-    """Whether anybody signs."""
+    """Check that workers run."""
     workers = stats.workers or []
     busy = sum(one.job_id is not None for one in workers)
     if workers or read_only:
@@ -186,7 +170,7 @@ def worker_check(stats: Stats, *, read_only: bool) -> Check:
 
 
 def queue_check(stats: Stats) -> Check:
-    """What waits, and what failed for good."""
+    """Count the jobs that wait and those that failed for good."""
     jobs = "1 job" if stats.waiting == 1 else f"{stats.waiting} jobs"
     text = f"{jobs} waiting, {stats.jobs.get('running', 0)} running"
     if stats.oldest_waiting_s is not None:
@@ -198,7 +182,7 @@ def queue_check(stats: Stats) -> Check:
 
 
 def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
-    """What maps are signed with; an older model of a preset's name is told."""
+    """List the models of the maps; an older model of a preset is a note."""
     presets = {one.name: one for one in models if one.preset}
     by_model: dict[str, list[str]] = defaultdict(list)
     older = []
@@ -207,8 +191,8 @@ def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
         preset = presets.get(one.model.rpartition("-")[0])
         if preset is not None and preset.model_id != one.model_id and one.reencoding is None:
             older.append((one.name, preset))
-    told = [f"{model}: {_listed(names)}" for model, names in sorted(by_model.items())]
-    text = "; ".join(told) or "no maps yet"
+    lines = [f"{model}: {_listed(names)}" for model, names in sorted(by_model.items())]
+    text = "; ".join(lines) or "no maps yet"
     if older:
         name, preset = older[0]
         count = "1 map has" if len(older) == 1 else f"{len(older)} maps have"

@@ -1,4 +1,4 @@
-"""`sceneprint doctor`: what is fine here, what is not, and what to do."""
+"""`sceneprint doctor`: checks of this machine, the data folder and the service, with advice."""
 
 from __future__ import annotations
 
@@ -29,107 +29,96 @@ from sceneprint.cli.checks import (
     service_checks,
     version_check,
 )
-from sceneprint.cli.options import add_service_options, one_line
-from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.cli.options import add_data_option, add_service_options, settings_of
+from sceneprint.cli.output import count_of, one_line
 from sceneprint.errors import SceneprintError
 from sceneprint_client.http import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from sqlalchemy import URL, Engine
+    from sqlalchemy import URL
 
     from sceneprint.settings import Settings
     from sceneprint.store import Database
     from sceneprint.store.database import SchemaRange
 
-# What `sceneprint doctor` says of the database, which is only ever read.
+# Checks of the database, which is only ever read.
 
 _CHECK = "Check SCENEPRINT_DATABASE_URL, or the data folder."
 
 
 def database(settings: Settings) -> Check:
-    """What is at the address of the database.
-
-    Parameters
-    ----------
-    settings : whose database is looked at
-    """
+    """Check the address of the database, its file or server, and its schema."""
     from sqlalchemy import make_url
     from sqlalchemy.exc import SQLAlchemyError
 
+    from sceneprint.store.database import reach_database, schema_range_of
+
     try:
         url = make_url(settings.database)
-    except ValueError:  # what was taken for the port may be half of a password: it is not shown
-        text = (
+    except ValueError:  # what looks like the port may be half of a password, and is not shown
+        return _wrong(
             "SCENEPRINT_DATABASE_URL: the port is not a number. Correct it; in a password, "
             "write @ : and / as %40 %3A and %2F."
         )
-        return _wrong(text)
     except SQLAlchemyError:
         return _wrong(f"cannot be opened (not an SQLAlchemy URL). {_CHECK}")
     try:
-        return (
-            _sqlite_file(settings, url)
-            if url.get_backend_name() == "sqlite"
-            else _database_server(settings)
-        )
+        if url.get_backend_name() == "sqlite":
+            return _sqlite_file(settings, url)
+        server = reach_database(settings.database)
+        try:
+            with server.read() as connection:
+                return _schema_check(schema_range_of(connection), server.shown)
+        finally:
+            server.close()
+    except SceneprintError as error:
+        return _wrong(str(error))
     except (SQLAlchemyError, ImportError) as error:
         reason = str(getattr(error, "orig", None) or error).partition("\n")[0]
         return _wrong(f"cannot be opened ({reason}). {_CHECK}")
 
 
 def _sqlite_file(settings: Settings, url: URL) -> Check:
-    """The file, opened so that SQLite writes nothing, not even beside it."""
+    """Check a file, opened so that SQLite writes nothing, not even beside it."""
     from sqlalchemy import NullPool, create_engine
+
+    from sceneprint.store.database import schema_range_of
 
     path = _path_of(url)
     if path is None:
-        text = "is an in-memory database, which processes cannot share. Name a file."
-        return _wrong(text)
+        return _wrong("is an in-memory database, which processes cannot share. Name a file.")
     if not path.exists():
-        # the data folder is made with the file, another one is not
+        # the data folder is created with the file, another one is not
         if settings.database_url is not None and not path.parent.is_dir():
             return _wrong(f"the folder of {path} does not exist. Create it, or name another file.")
         return Check("ok", "database", f"none yet; the first use creates {path}")
     wal, shm = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
-    if wal.exists() and not shm.exists():  # reading it would make the latter
+    if wal.exists() and not shm.exists():  # reading it would create the latter
         text = f"{path} was not closed cleanly; the next use recovers it"
         return Check("note", "database", text)
-    # without a log nobody writes, and the file is all there is; with one, its index is not renewed
+    # without a log nobody writes, and the file is complete; with one, its index is not renewed
     how = "readonly_shm=1" if wal.exists() else "immutable=1"
 
     def connect() -> sqlite3.Connection:
         return sqlite3.connect(f"{path.as_uri()}?mode=ro&{how}", uri=True)
 
-    found = _schema(create_engine(url, creator=connect, poolclass=NullPool))
-    # a folder that may not be written is a finding of its own
-    if (
-        found.verdict != "WRONG"
-        and os.access(path.parent, os.W_OK)
-        and not os.access(path, os.W_OK)
-    ):
-        text = f"{path} is readable but not writable, so uploads fail. Check its permissions."
-        return _wrong(text)
+    engine = create_engine(url, creator=connect, poolclass=NullPool)
+    try:
+        with engine.connect() as connection:
+            found = _schema_check(schema_range_of(connection), repr(engine.url))
+    finally:
+        engine.dispose()
+    # a folder that is not writable is a finding of its own
+    writable = os.access(path, os.W_OK) or not os.access(path.parent, os.W_OK)
+    if found.verdict != "WRONG" and not writable:
+        return _wrong(
+            f"{path} is readable but not writable, so uploads fail. Check its permissions."
+        )
     return found
 
 
-def _database_server(settings: Settings) -> Check:
-    from sceneprint.errors import SceneprintError
-    from sceneprint.store.database import reach_database, schema_range_of
-
-    try:
-        database = reach_database(settings.database)
-        try:
-            with database.read() as connection:
-                found = schema_range_of(connection)
-            return _compared(found, database.shown)
-        finally:
-            database.close()
-    except SceneprintError as error:
-        return _wrong(str(error))
-
-
 def _path_of(url: URL) -> Path | None:
-    """File of an SQLite URL; None: in memory."""
+    """Return the file of an SQLite URL; None if it is in memory."""
     name = url.database or ""
     if name.startswith("file:") and "uri" in url.query:
         if url.query.get("mode") == "memory":
@@ -138,84 +127,60 @@ def _path_of(url: URL) -> Path | None:
     return None if name in ("", ":memory:") else Path(name).absolute()
 
 
-def _schema(engine: Engine) -> Check:
-    """Compare the schema with the one of this version; the database is not touched."""
-    from sceneprint.store.database import schema_range_of
-
-    try:
-        with engine.connect() as connection:
-            found = schema_range_of(connection)
-    finally:
-        engine.dispose()
-    return _compared(found, repr(engine.url))
-
-
-def _compared(found: SchemaRange | None, place: str) -> Check:
+def _schema_check(found: SchemaRange | None, place: str) -> Check:
+    """Compare the schema of a database with that of this version."""
     from sceneprint.store.database import known_revisions
 
     head, known = known_revisions()
-    if found is None:
-        return Check(
-            "note", "database", f"{place}, schema None; the next use migrates it to {head}"
-        )
-    place = f"{place}, schema {found.revision}"
+    shown = f"{place}, schema {None if found is None else found.revision}"
+    if found is None or (found.revision in known and found.revision != head):
+        return Check("note", "database", f"{shown}; the next use migrates it to {head}")
     if found.revision == head:
-        return Check("ok", "database", place)
+        return Check("ok", "database", shown)
     if found.allows(head):
-        text = f"{place} of a later version, which this one may still use. Upgrade this one too."
+        text = f"{shown} of a later version, which this one may still use. Upgrade this one too."
         return Check("note", "database", text)
-    if found.revision in known:
-        return Check("note", "database", f"{place}; the next use migrates it to {head}")
-    text = (
-        f"{place}: it was written by a later version of sceneprint. Use that version, or another "
+    return _wrong(
+        f"{shown}: it was written by a later version of sceneprint. Use that version, or another "
         "folder."
     )
-    return _wrong(text)
 
 
 def _wrong(text: str) -> Check:
     return Check("WRONG", "database", text)
 
 
-# What `sceneprint doctor` says of object stores: a small object is written, read and removed.
+# Checks of object stores: a small object is written, read and removed.
 
 
 def object_stores(settings: Settings) -> Iterator[Check]:
-    """Yield findings about the stores of blobs and of indexes that are in no folder.
+    """Yield checks of the object stores of blobs and of indexes, if there are any."""
+    from sceneprint.store.blobs.object_client import VARIABLES, check_objects, open_objects
 
-    Parameters
-    ----------
-    settings : whose stores are looked at
-    """
     blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()
     for subject, setting, url in (
         ("blobs", "SCENEPRINT_BLOB_URL", blobs),
         ("indexes", "SCENEPRINT_INDEX_URL", settings.index_url),
     ):
-        if url is not None:
-            yield _looked_at(subject, setting, url)
+        if url is None:
+            continue
+        try:
+            objects = open_objects(url, setting)
+            seconds = check_objects(objects)
+        except SceneprintError as error:
+            yield Check("WRONG", subject, str(error))
+            continue
+        begin = VARIABLES[url.partition(":")[0].lower()]
+        of = f", with credentials from {begin}... in the environment" if begin else ""
+        text = f"{objects.url}: written, read and removed in {seconds:.2f} s{of}"
+        yield Check("ok", subject, text)
 
 
-def _looked_at(subject: str, setting: str, url: str) -> Check:
-    from sceneprint.errors import SceneprintError
-    from sceneprint.store.blobs.object_client import VARIABLES, check_objects, open_objects
+# Checks of a database server, which is only read.
 
-    try:
-        objects = open_objects(url, setting)
-        seconds = check_objects(objects)
-    except SceneprintError as error:
-        return Check("WRONG", subject, str(error))
-    begin = VARIABLES[url.partition(":")[0].lower()]
-    of = f", with credentials from {begin}... in the environment" if begin else ""
-    text = f"{objects.url}: written, read and removed in {seconds:.2f} s{of}"
-    return Check("ok", subject, text)
-
-
-# What `sceneprint doctor` says of a database server, which is only read.
-
-#: What a commit that was acknowledged needs to survive the loss of power.
+#: Settings that an acknowledged commit needs to survive the loss of power.
 _DURABLE = ("fsync", "full_page_writes")
-_ASKED = """
+_SETTINGS = """
 SELECT current_setting('server_version') AS version,
   current_setting('server_encoding') AS encoding,
   current_setting('fsync') AS fsync,
@@ -231,20 +196,13 @@ SELECT current_setting('server_version') AS version,
 
 
 def server(settings: Settings) -> Iterator[Check]:
-    """Yield findings about the database server.
-
-    Parameters
-    ----------
-    settings : whose database is looked at; of SQLite there is nothing to say
-    """
-    from sceneprint.errors import SceneprintError
+    """Yield checks of the database server; none of SQLite."""
     from sceneprint.store.database import reach_database
 
     database = reach_database(settings.database)
     try:
-        if database.is_sqlite:
-            return
-        yield from _server_settings(database, settings)
+        if not database.is_sqlite:
+            yield from _server_settings(database, settings)
     except SceneprintError as error:
         yield Check("WRONG", "database server", str(error))
     finally:
@@ -253,25 +211,31 @@ def server(settings: Settings) -> Iterator[Check]:
 
 def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
     with database.read() as connection:
-        told = dict(connection.exec_driver_sql(_ASKED).mappings().one())
+        values = dict(connection.exec_driver_sql(_SETTINGS).mappings().one())
         before = time.time()
         there = float(
             connection.exec_driver_sql("SELECT extract(epoch FROM clock_timestamp())").scalar_one()
         )
         after = time.time()
-    text = f"PostgreSQL {told['version']}, {told['encoding']}"
-    if told["standby"]:
+    text = f"PostgreSQL {values['version']}, {values['encoding']}"
+    if values["standby"]:
         text += "; it is a read-only standby. Name the primary."
         yield Check("WRONG", "database server", text)
         return
     yield Check("ok", "database server", text)
-    yield _durability(told)
-    yield _connections(told, settings)
-    yield _clock(before, there, after, settings)
+    yield _durability(values)
+    yield _connections(values, settings)
+    apart = seconds_apart(before, there, after)
+    text = f"the server's clock differs from this host's by {apart:.1f} s"
+    if apart > APART_S:
+        verdict: Verdict = "WRONG" if apart > settings.lease_s else "note"
+        yield Check(verdict, "clock", f"{text}. Synchronize both with a time server.")
+    else:
+        yield Check("ok", "clock", text)
 
 
-def _durability(told: Mapping[str, object]) -> Check:
-    off = [name for name in _DURABLE if told[name] == "off"]
+def _durability(values: Mapping[str, object]) -> Check:
+    off = [name for name in _DURABLE if values[name] == "off"]
     if off:
         text = (
             f"{', '.join(off)} off: acknowledged data may be lost when the server's host fails. "
@@ -279,25 +243,25 @@ def _durability(told: Mapping[str, object]) -> Check:
         )
         return Check("WRONG", "durability", text)
     text = "commits survive the loss of power"
-    if told["standbys"] and told["synchronous_commit"] == "local":
+    if values["standbys"] and values["synchronous_commit"] == "local":
         text += "; synchronous_commit is local, so commits do not wait for a standby. Turn it on."
         return Check("note", "durability", text)
-    if told["standbys"]:
-        text += f", and of the host: commits wait for a standby ({told['standbys']})"
+    if values["standbys"]:
+        text += f", and of the host: commits wait for a standby ({values['standbys']})"
     else:
         text += (
             "; commits do not wait for a standby, so the last ones may be lost with the host's disk"
         )
-    if told["checksums"] == "off":
+    if values["checksums"] == "off":
         text += "; data_checksums are off, so a damaged page may go unnoticed"
         return Check("note", "durability", text)
     return Check("ok", "durability", text)
 
 
-def _connections(told: Mapping[str, object], settings: Settings) -> Check:
+def _connections(values: Mapping[str, object], settings: Settings) -> Check:
     from sceneprint.store.postgres.connection import MOST
 
-    most, taken = int(str(told["connections"])), int(str(told["taken"]))
+    most, taken = int(str(values["connections"])), int(str(values["taken"]))
     # a worker takes one for its work, one for its lease, one to be woken, and three that last for
     # locks of blobs and indexes; a service as many as it answers at once, and those that last
     wanted = 6 * settings.workers + min(settings.concurrency + settings.waiting, MOST) + 3
@@ -310,19 +274,9 @@ def _connections(told: Mapping[str, object], settings: Settings) -> Check:
     return Check("ok", "connections", text)
 
 
-def _clock(before: float, there: float, after: float, settings: Settings) -> Check:
-    """The clocks of this host and of the server, as far as the answer's way can tell."""
-    apart = seconds_apart(before, there, after)
-    text = f"the server's clock differs from this host's by {apart:.1f} s"
-    if apart > APART_S:
-        verdict: Verdict = "WRONG" if apart > settings.lease_s else "note"
-        return Check(verdict, "clock", f"{text}. Synchronize both with a time server.")
-    return Check("ok", "clock", text)
+# Checks of this machine, which change nothing.
 
-
-# What `sceneprint doctor` looks at on this machine; nothing is changed by looking.
-
-#: The oldest SQLite with all that the store asks for (UPDATE ... RETURNING).
+#: The oldest SQLite that the store can use (UPDATE ... RETURNING).
 OLDEST_SQLITE = (3, 35, 0)
 #: System libraries that open3d loads, and the Debian packages that contain them.
 OPEN3D_LIBRARIES = {
@@ -335,12 +289,7 @@ OPEN3D_LIBRARIES = {
 
 
 def machine(settings: Settings) -> Iterator[Check]:
-    """Findings about this machine.
-
-    Parameters
-    ----------
-    settings : whose folders are looked at
-    """
+    """Yield checks of this machine, and of the folders and the database of the settings."""
     version = ".".join(map(str, sys.version_info[:3]))  # an older than 3.11 cannot install this
     yield Check("ok", "python", f"{version}, sceneprint {__version__}")
     yield _sqlite_version()
@@ -382,7 +331,7 @@ def _kernels() -> Check:
 
 
 def _decoders(settings: Settings) -> Check:
-    """Start a decoder, and say how it is confined."""
+    """Start a decoder, and check how it is confined."""
     if settings.decoders == 0:
         text = "uploads are decoded in service and workers (SCENEPRINT_DECODERS is 0)"
         return Check("note", "decoders", text)
@@ -476,13 +425,13 @@ def _open3d() -> Check:
 
 
 def _may_write(folder: Path) -> bool:
-    """Whether a file can be made in the folder, or where the folder is missing, above it."""
+    """Return whether a file can be created in the folder, or above it if it is missing."""
     return _unwritable(folder) is None
 
 
 def _unwritable(folder: Path) -> int | None:
-    """Why no file can be made there, as `errno`; None where one can."""
-    try:  # tried, as permissions say little of read-only disks and to root; leaves no trace
+    """Return the `errno` of creating a file there; None if it succeeds."""
+    try:  # permissions do not show read-only disks, and do not bind root; leaves no trace
         with tempfile.TemporaryFile(dir=nearest_folder(folder)) as file:
             file.write(b"x")  # a full disk may still have room for a name
             file.flush()
@@ -499,30 +448,23 @@ def add_doctor(command: argparse.ArgumentParser) -> None:
 
 
 def run_doctor(options: argparse.Namespace) -> int:
-    """Check this machine, the data folder and the service, and suggest fixes. With --url alone,
-    ask that service: version, store, workers, queue, disk, clock and models. Changes nothing.
-    Exit code 2 if something required is missing; missing optional parts are noted.
+    """Check this machine, the data folder and the service, and suggest fixes. With --url alone, ask
+    that service: version, store, workers, queue, disk, clock and models. Changes nothing. Exit code
+    2 if something required is missing; missing optional parts are noted.
     """
-    wrong = 0
-    for finding in (*_all(options),):
+    settings, wrong = settings_of(options), 0
+    # with the address of a service alone, this machine does not matter
+    stores = {"data_dir", "database_url", "blob_url"} & settings.model_fields_set
+    here = machine(settings) if options.url is None or stores else ()
+    for finding in (*here, *_service(options)):
         print(f"{finding.verdict:5}  {finding.subject:16}  {one_line(finding.text)}", flush=True)
         wrong += finding.verdict == "WRONG"
-    things = "1 problem found" if wrong == 1 else f"{wrong} problems found"
-    print(things if wrong else "no problems found")
+    print(f"{count_of(wrong, 'problem')} found" if wrong else "no problems found")
     return 2 if wrong else 0
 
 
-def _all(options: argparse.Namespace) -> Iterator[Check]:
-    settings = settings_of(options)
-    # with the address of a service alone, what lies here is of no interest
-    stores = {"data_dir", "database_url", "blob_url"} & settings.model_fields_set
-    if options.url is None or stores:
-        yield from machine(settings)
-    yield from _service(options)
-
-
 def _service(options: argparse.Namespace) -> Iterator[Check]:
-    """Findings about the service; that none runs is wrong only where one was named."""
+    """Yield checks of the service; that none runs is wrong only if the options name one."""
     from sceneprint_client import Client
 
     url = options.url or DEFAULT_URL

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from tqdm import tqdm
 
 from sceneprint.cli import positive_number
-from sceneprint.cli.options import up_of, waiting_reason
+from sceneprint.cli.options import mounting_of, up_of
+from sceneprint.cli.output import print_error, waiting_reason
 from sceneprint.errors import Busy, DatasetError, InvalidRequest, SceneprintError, UnknownFrame
 from sceneprint.formats.archive import is_archive
 from sceneprint.formats.exports import is_export
@@ -91,7 +91,7 @@ def is_starting(client: Client) -> bool:
     try:
         client.status()
     except Busy:
-        print("the service compiles its kernels, once after an installation", file=sys.stderr)
+        print_error("the service compiles its kernels, once after an installation")
         return True
     return False
 
@@ -101,8 +101,9 @@ def _options_of(options: argparse.Namespace, file: str, **more: Any) -> ImportOp
     return checked(
         ImportOptions, f"The metadata of {file}", robot=options.robot, session=options.session,
         tags=options.tag, parent_frame=options.parent_frame, with_poses=not options.no_pose,
-        every=options.every, T_base_sensor=options.base, up=options.up, priority=options.priority,
-        if_novel=options.if_novel, trust_depth=options.trust_depth, **more,
+        every=options.every, T_base_sensor=mounting_of(options), up=options.up,
+        priority=options.priority, if_novel=options.if_novel, trust_depth=options.trust_depth,
+        **more,
     )  # fmt: skip
 
 
@@ -142,7 +143,7 @@ def import_archives(
         job = _waited(client, options, path.name, job)
         _count(client, options.map, job, tally)
         if not job.state.over:
-            _tell_late(client, options, path.name, job)
+            _report_late(client, options, path.name, job)
             return False
         if job.error is not None:
             tally.refuse(path.name, job.error)
@@ -153,11 +154,10 @@ def import_archives(
     return True
 
 
-def _tell_late(client: Client, options: argparse.Namespace, name: str, job: Job) -> None:
-    print(
+def _report_late(client: Client, options: argparse.Namespace, name: str, job: Job) -> None:
+    print_error(
         f"{name}: import {job.job_id} did not end within {options.timeout or STALL_S:g} s, and "
-        f"goes on when a worker is free. {why_unsigned(client, [job.job_id])}",
-        file=sys.stderr,
+        f"goes on when a worker is free. {why_unsigned(client, [job.job_id])}"
     )
 
 
@@ -226,66 +226,46 @@ def axis_or_up(text: str) -> Axis | list[float]:
     return up_of(text) if axis is None else axis
 
 
-def units_of(text: str) -> float:
-    """Return how many units a metre has, stated by their name or number."""
-    return _UNITS[text] if text in _UNITS else positive_number(text)
+def _fields(read: Callable[[str], dict[str, float]]) -> Callable[[str], dict[str, float]]:
+    """Return a function that reads comma-separated numbers as argparse wants it."""
 
+    def fields(text: str) -> dict[str, float]:
+        try:
+            return read(text)
+        except InvalidRequest as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
 
-def camera_of(text: str) -> dict[str, float]:
-    """Return the fields of a camera that is written as six numbers."""
-    try:
-        return camera_fields(text)
-    except InvalidRequest as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def offset_of(text: str) -> dict[str, float]:
-    """Return the fields of an offset that is written as three numbers."""
-    try:
-        return offset_fields(text)
-    except InvalidRequest as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    return fields
 
 
 def add_map_options(command: argparse.ArgumentParser) -> None:
     """Add `--as-map`, and the options that describe the file."""
     group = command.add_argument_group("a whole map in one file")
     group.add_argument(
-        "--as-map",
-        action="store_true",
+        "--as-map", action="store_true",
         help=f"PATH is a cloud or mesh of a whole place ({titles_of('map', last='or')}): "
         "views of it are rendered, and become the frames of the map. --up takes the axis of the "
         "file that points up: x, y, z or, as in --up=-y, its opposite",
-    )
+    )  # fmt: skip
     group.add_argument(
-        "--height",
-        type=positive_number,
-        action="append",
-        default=[],
-        metavar="M",
+        "--height", type=positive_number, action="append", default=[], metavar="M",
         help="height of the robot's sensor above the floor, metres; repeatable (default: some "
         "that are usual for such a sensor)",
-    )
+    )  # fmt: skip
     group.add_argument(
-        "--units",
-        type=units_of,
-        metavar="N",
+        "--units", type=lambda text: _UNITS.get(text) or positive_number(text), metavar="N",
         help="unit of the file: m, cm, mm, ft, or how many are a metre (default: as the file "
         "says, else estimated)",
-    )
+    )  # fmt: skip
     group.add_argument(
-        "--offset",
-        type=offset_of,
-        metavar="X,Y,Z",
+        "--offset", type=_fields(offset_fields), metavar="X,Y,Z",
         help="metres that are taken off the coordinates of the file (default: none, or where it "
         "lies more than a kilometre from its origin, its middle)",
-    )
+    )  # fmt: skip
     group.add_argument(
-        "--camera",
-        type=camera_of,
-        metavar="FX,FY,CX,CY,WIDTH,HEIGHT",
+        "--camera", type=_fields(camera_fields), metavar="FX,FY,CX,CY,WIDTH,HEIGHT",
         help="depth camera of the robot, pixels (default: a usual one)",
-    )
+    )  # fmt: skip
 
 
 def check_map_options(options: argparse.Namespace) -> None:
@@ -340,10 +320,10 @@ def import_maps(client: Client, options: argparse.Namespace) -> int:
             continue
         job = _waited(client, options, path.name, job)
         if not job.state.over:
-            _tell_late(client, options, path.name, job)
+            _report_late(client, options, path.name, job)
             return 2
         if job.result is None:
-            print(f"{path.name}: {job.error or job.state.sentence}", file=sys.stderr)
+            print_error(f"{path.name}: {job.error or job.state.sentence}")
             code = 2
             continue
         print("\n".join(lines_of(path.name, options.map, MapImportResult(**job.result))))
@@ -399,8 +379,7 @@ def hint_at_maps(paths: list[Path]) -> None:
     """Say of files of points that are too large for one scan how a map is uploaded."""
     for path in paths:
         if path.is_file() and is_cloud(path.name) and path.stat().st_size > _SCAN_BYTES:
-            print(
+            print_error(
                 f"{path.name} is large for one scan. If it holds a whole place, upload it with "
-                "--as-map.",
-                file=sys.stderr,
+                "--as-map."
             )

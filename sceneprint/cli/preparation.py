@@ -24,10 +24,9 @@ def add_model_options(command: argparse.ArgumentParser) -> None:
     """`--preset` or `--model`."""
     choice = command.add_mutually_exclusive_group()
     choice.add_argument(
-        "--preset",
-        choices=PRESETS,
+        "--preset", choices=PRESETS,
         help=f"preset that ships with sceneprint (default: {PRESETS[0]})",
-    )
+    )  # fmt: skip
     choice.add_argument("--model", type=Path, metavar="FILE", help="path of your own model")
 
 

@@ -1,34 +1,22 @@
-"""`sceneprint query`: where in a map were these frames taken?"""
+"""`sceneprint query` and `localize`: where in a map frames were taken."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.options import (
-    add_asking_options,
-    add_prior_option,
-    add_service_options,
-    add_up_option,
-    explained_lines,
-    frame_label,
-    one_line,
-    open_client,
-    options_of,
-    percent,
-)
+from sceneprint.cli.options import add_query_options, add_service_options, open_client, query_fields
+from sceneprint.cli.output import count_of, frame_label, one_line, percent, print_error
 from sceneprint.cli.scenes import (
     Scene,
     add_scene_options,
-    check_kept,
     check_scene,
     open_scene,
     stamps_of,
@@ -37,6 +25,7 @@ from sceneprint.errors import (
     DatasetError,
     FrameError,
     InvalidPose,
+    InvalidRequest,
     MissingDependency,
     TooLarge,
     UnknownFrame,
@@ -60,58 +49,129 @@ if TYPE_CHECKING:
         Transform,
     )
 
-# The query's points laid on those of its best match, as a file for any viewer of clouds.
 
-
-def add_overlay_options(command: argparse.ArgumentParser) -> None:
-    """Describe the overlay to the parser of a command that asks for one frame."""
+def add_query(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint query`."""
     command.add_argument(
-        "--overlay",
-        type=Path,
-        metavar="FILE.ply",
+        "--map", action="append", default=[], metavar="NAME", dest="also",
+        help="search this map together with MAP; repeatable (MAP may be '*' for every map that "
+        "you may read)",
+    )  # fmt: skip
+    command.add_argument(
+        "--stages", default="retrieve,diversify,validate",
+        help="comma-separated stages, starting with `retrieve` (default: "
+        "retrieve,diversify,validate)",
+    )  # fmt: skip
+    command.add_argument(
+        "--overlay", type=Path, metavar="FILE.ply",
         help="for a single frame: write its points, aligned with those of its first match",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--color",
-        choices=COLOURS,
-        default="source",
+        "--color", choices=COLOURS, default="source",
         help="colour the overlay by frame, by normal, or by distance from the other surface "
         "(default: source)",
+    )  # fmt: skip
+    command.add_argument(
+        "--by", choices=TRANSFORMS, default="aligned",
+        help="transform of the overlay: the match's, its best rival, or none (default: aligned)",
+    )  # fmt: skip
+    _add_frame_options(command)
+    command.set_defaults(run=run_query)
+
+
+def _add_frame_options(command: argparse.ArgumentParser) -> None:
+    """Add the options of both commands."""
+    command.add_argument("map", metavar="MAP")
+    command.add_argument(
+        "path", type=Path, metavar="PATH", help="a depth image, a cloud, a folder or a recording"
     )
     command.add_argument(
-        "--by",
-        choices=TRANSFORMS,
-        default="aligned",
-        help="transform of the overlay: the match's, its best rival, or none (default: aligned)",
-    )
+        "--frame", metavar="N|FILE",
+        help="use only this frame of a folder: index from 0, or name (default: all)",
+    )  # fmt: skip
+    command.add_argument("--json", action="store_true", help="print one JSON answer per line")
+    add_query_options(command)
+    add_scene_options(command)
+    add_recording_options(command)
+    add_service_options(command)
 
 
-def check_overlay(options: argparse.Namespace, frames: int) -> None:
-    """See before the first query that the overlay can be written.
-
-    Raises
-    ------
-    DatasetError : several frames would go to one file.
-    OSError : the file cannot be written.
+def run_query(options: argparse.Namespace) -> int:
+    """Query a map with depth frames or point clouds: one file, or the frames of a folder (7-Scenes,
+    TUM RGB-D or plain depth images, with an intrinsics.json beside them or in a folder above; or
+    clouds), or the keyframes of a recording of ROS. They are not added to the map. Exit code 2 if a
+    frame could not be looked up.
     """
-    if options.overlay is None:
-        return
-    if frames != 1:
-        raise DatasetError(
-            f"{options.path}: has {frames} frames, but --overlay writes a single file. Choose a "
-            "frame with --frame."
-        )
-    check_writable(options.overlay)
+    _check_scene(options)
+    references = _wanted_frames(options, _frames_at(options))
+    fields = {**query_fields(options), "stages": options.stages}
+    several = options.map == "*" or options.also
+    if several:
+        fields["maps"] = "*" if options.map == "*" else [options.map, *options.also]
+    if options.overlay is not None:  # before the first query
+        if len(references) != 1:
+            raise DatasetError(
+                f"{options.path}: has {len(references)} frames, but --overlay writes a single "
+                "file. Choose a frame with --frame."
+            )
+        check_writable(options.overlay)
+    with open_client(options) as client, open_scene(options, client) as scene:
+
+        def ask(reference: FrameReference) -> tuple[Answer, str]:
+            answer = client.query(
+                None if several else options.map, reference, up=options.up, **fields
+            )
+            lines = [*answer_lines(reference.name, answer), *_explanation_lines(answer)]
+            return answer, "\n".join(lines)
+
+        add_to_scene, failed = _answer_scene(scene, references), 0
+        for reference, result in _results(options, references, ask):
+            if result is None:
+                failed += 1
+                continue
+            add_to_scene(reference, *result)
+            if options.overlay is not None:
+                print_error(_save_overlay(client, result[0], options))
+    return 2 if failed else 0
 
 
-def save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -> str:
-    """Write the overlay; returns a line about it.
+def _results(
+    options: argparse.Namespace,
+    references: Sequence[FrameReference],
+    ask: Callable[[FrameReference], tuple[Any, str]],
+) -> Iterator[tuple[FrameReference, tuple[Any, str] | None]]:
+    """Look frames up, and print and yield each answer with its text; None where a frame alone is
+    at fault.
+    """
+    for reference in references:
+        try:
+            record, text = ask(reference)
+        except (FrameError, MissingDependency, TooLarge) as error:
+            print_error(f"{one_line(reference.name)}: {one_line(str(error))}")
+            yield reference, None
+            continue
+        if options.json:
+            fields = {"name": reference.name, **record.model_dump(mode="json")}
+            print(json.dumps(fields), flush=True)
+        else:
+            print(text, flush=True)
+        yield reference, (record, text)
+
+
+def _check_scene(options: argparse.Namespace) -> None:
+    check_scene(options)
+    if options.mcap is not None and options.no_keep:
+        raise InvalidRequest("A scene is made of stored answers. Leave --no-keep out.")
+
+
+def _save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -> str:
+    """Write the points of the query aligned with those of its best match; return a line about it.
 
     Raises
     ------
     UnknownFrame : the answer has no match.
     InvalidRequest : its first match has no such transform.
-    NotIndexed : the query was asked without validation.
+    NotIndexed : the query had no validation.
     """
     if not answer.matches:
         raise UnknownFrame("The query has no match to overlay. Query a map that has frames.")
@@ -123,83 +183,10 @@ def save_overlay(client: Client, answer: Answer, options: argparse.Namespace) ->
     return f"{options.overlay}: the query aligned with {frame_label(best.frame_id, best.name)}"
 
 
-def add_query(command: argparse.ArgumentParser) -> None:
-    """Add the options of `sceneprint query`."""
-    command.add_argument("map", metavar="MAP")
-    command.add_argument("path", type=Path, metavar="PATH")
-    command.add_argument(
-        "--frame", metavar="N|FILE", help="use only this frame of a folder: index from 0, or name"
-    )
-    command.add_argument(
-        "--map",
-        action="append",
-        default=[],
-        metavar="NAME",
-        dest="also",
-        help="search this map together with MAP; repeatable (MAP may be '*' for every map that "
-        "you may read)",
-    )
-    command.add_argument(
-        "--stages",
-        default="retrieve,diversify,validate",
-        help=(
-            "comma-separated stages, starting with `retrieve` (default: "
-            "retrieve,diversify,validate)"
-        ),
-    )
-    command.add_argument("--json", action="store_true", help="print one JSON answer per line")
-    add_up_option(command)
-    add_asking_options(command)
-    add_prior_option(command)
-    add_overlay_options(command)
-    add_scene_options(command)
-    add_recording_options(command)
-    add_service_options(command)
-    command.set_defaults(run=run_query)
-
-
-def run_query(options: argparse.Namespace) -> int:
-    """Query a map with depth frames or point clouds: one file, or the frames of a folder
-    (7-Scenes, TUM RGB-D or plain depth images, with an intrinsics.json beside them or in a
-    folder above; or clouds), or the keyframes of a recording of ROS. They are not added to the
-    map.
-    """
-    check_scene(options)
-    check_kept(options)
-    references = query_frames(options)
-    how = {**options_of(options), "stages": options.stages, "prior": options.prior}
-    several = options.map == "*" or options.also
-    if several:
-        how["maps"] = "*" if options.map == "*" else [options.map, *options.also]
-    check_overlay(options, len(references))
-    failed = 0
-    with open_client(options) as client, open_scene(options, client) as scene:
-        add_to_scene = _answer_scene(scene, references)
-        for reference in references:
-            try:
-                answer = client.query(
-                    None if several else options.map, reference, up=options.up, **how
-                )
-            except (FrameError, MissingDependency, TooLarge) as error:  # of this file alone
-                failed += 1
-                print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
-                continue
-            text = "\n".join([*answer_lines(reference.name, answer), *explained_lines(answer)])
-            if options.json:
-                told = {"name": reference.name, **answer.model_dump(mode="json")}
-                print(json.dumps(told), flush=True)
-            else:
-                print(text, flush=True)
-            add_to_scene(reference, answer, text)
-            if options.overlay is not None:
-                print(save_overlay(client, answer, options), file=sys.stderr)
-    return 2 if failed else 0
-
-
 def _answer_scene(
     scene: Scene | None, references: Sequence[FrameReference]
 ) -> Callable[[FrameReference, Answer, str], None]:
-    """Return what adds the answer of a frame, and its text, to the scene, if there is one."""
+    """Return a function that adds the answer of a frame, and its text, to the scene, if any."""
     places = {one.path: place for place, one in enumerate(references)}
     stamps = stamps_of(references)
 
@@ -219,22 +206,17 @@ def _answer_scene(
     return add
 
 
-def query_frames(options: argparse.Namespace) -> list[FrameReference]:
-    """The frames to look up: all, or that of `--frame`.
-
-    Raises
-    ------
-    DatasetError : nothing is found at the path, or no such frame.
-    """
-    path = options.path
-    references = [frame for one in sequences_at(path, options) for frame in one.frames]
-    return references if options.frame is None else _wanted_frame(path, options.frame, references)
+def _frames_at(options: argparse.Namespace) -> list[FrameReference]:
+    return [frame for one in sequences_at(options.path, options) for frame in one.frames]
 
 
-def _wanted_frame(
-    path: Path, wanted: str, references: list[FrameReference]
+def _wanted_frames(
+    options: argparse.Namespace, references: list[FrameReference]
 ) -> list[FrameReference]:
-    """The frame of that index or name, alone; DatasetError where there is none."""
+    """Return all frames, or that of `--frame`; DatasetError if it does not exist."""
+    path, wanted = options.path, options.frame
+    if wanted is None:
+        return references
     if wanted.isascii() and wanted.isdigit():
         if int(wanted) < len(references):
             return [references[int(wanted)]]
@@ -258,7 +240,7 @@ def _wanted_frame(
 
 
 def answer_lines(name: str, answer: Answer) -> list[str]:
-    """An answer for people: a line of what came out, a line each match, and the pose."""
+    """Return the lines of an answer: its status, its matches and the pose."""
     counts = answer.counts
     tried = f"{counts.accepted} of {counts.validated} validated, " if counts.validated else ""
     of = f"{counts.map}"
@@ -283,8 +265,8 @@ def answer_lines(name: str, answer: Answer) -> list[str]:
         overlap = "" if v.overlap is None else f"{v.overlap:.2f}"
         lines.append(
             f"  {_label(match, several):{width}}  {match.rank:4}  {match.similarity:10.2f}  "
-            f"{status:15}  {overlap:>7}  {metres(match.transform):>20}  "
-            f"{_degrees(match.transform):>5}  {metres(match.pose_in_map):>20}  "
+            f"{status:15}  {overlap:>7}  {_metres(match.transform):>20}  "
+            f"{_degrees(match.transform):>5}  {_metres(match.pose_in_map):>20}  "
             f"{one_line(v.reason)}".rstrip()
         )
     if answer.location is not None:
@@ -298,7 +280,7 @@ def answer_lines(name: str, answer: Answer) -> list[str]:
 def _pose_line(pose: Transform) -> str:
     r = pose.rotation
     return (
-        f"  at {metres(pose)} m in {one_line(pose.parent_frame)}, rotation "
+        f"  at {_metres(pose)} m in {one_line(pose.parent_frame)}, rotation "
         f"{r.x:.4f} {r.y:.4f} {r.z:.4f} {r.w:.4f} (x y z w)"
     )
 
@@ -311,7 +293,7 @@ _DECIDED = {
 
 
 def _grounds(there: Location | Localization) -> str:
-    """What a pose that is found rests on, and what the map says of it and of other places."""
+    """Return the votes and the evidence for a pose, and what verified it."""
     if there.support == 0:
         voted = "no match votes for it"
     elif there.support == 1:
@@ -325,42 +307,32 @@ def _grounds(there: Location | Localization) -> str:
 
 
 def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
-    """The evidence that a confidence was computed from, in a line.
-
-    Parameters
-    ----------
-    e : of a pose
-    expected : whether it was compared only with places that the prior expects
-    """
+    """Return the evidence for a pose; `expected` if only places near the prior were compared."""
     if e is None:
         return "not compared with other places"
     place = "place that the prior expects" if expected else "place"
     rival = f"no other {place} fits"
     if e.rival >= 0.05:
         rival = f"the next best {place} fits {e.rival:.0%} as well"
-    planes, frames = _things(round(e.planes), "plane"), _things(e.frames, "frame")
+    planes, frames = count_of(round(e.planes), "plane"), count_of(e.frames, "frame")
     missing = "nothing" if e.excess < 0.005 else f"{e.excess:.0%}"
     return f"{planes} and {frames} of the map agree, {missing} is missing, {rival}"
 
 
-def _things(number: int, name: str) -> str:
-    return f"{number} {name}{'' if number == 1 else 's'}"
-
-
 def _percent(confidence: float | None) -> str:
-    """A confidence behind a status; nothing where there is none."""
+    """Return a confidence to print after a status."""
     return "" if confidence is None else f" {percent(confidence)}"
 
 
 def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
-    """The poses of an ambiguous answer, a line each; none of them is the answer."""
+    """Return the lines of the poses of an ambiguous answer."""
     if not alternatives:
         return []
     head = f"  {len(alternatives)} poses are supported; at most one is right:"
     if len(alternatives) == 1:
         head = "  one pose is supported, and not confirmed:"
     places = [
-        f"  {_percent(one.confidence):>7}  {metres(one.pose)} m in "
+        f"  {_percent(one.confidence):>7}  {_metres(one.pose)} m in "
         f"{one_line(one.pose.parent_frame)}, support {one.support}; "
         f"{_evidence(one.evidence)}"
         for one in alternatives
@@ -369,13 +341,13 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
 
 
 def _label(match: Match, several: bool) -> str:
-    """Who saw it, in which of several maps, its file, and its id to ask for the rest."""
+    """Return the map if there are several, the robot, session and file of a match, and its id."""
     seen = "/".join(one_line(who) for who in (match.robot, match.session, match.name) if who)
     return "  ".join(part for part in (match.map if several else "", seen, match.frame_id) if part)
 
 
-def metres(transform: Transform | None) -> str:
-    """Its translation; nothing where there is none."""
+def _metres(transform: Transform | None) -> str:
+    """Return a translation."""
     if transform is None:
         return ""
     t = transform.translation
@@ -383,72 +355,70 @@ def metres(transform: Transform | None) -> str:
 
 
 def _degrees(transform: Transform | None) -> str:
-    """Angle of the turn."""
+    """Return the angle of a rotation, degrees."""
     if transform is None:
         return ""
     r = transform.rotation
     return f"{math.degrees(2 * math.atan2(math.hypot(r.x, r.y, r.z), abs(r.w))):.1f}"
 
 
-# `sceneprint localize`: where in a map was this frame taken? One pose, or why there is none.
+def _explanation_lines(answer: Answer) -> list[str]:
+    """Return why frames of the ranking, or the named frame, dropped out, if it was asked."""
+    lines = [
+        f"  {one.rank:4}  {frame_label(one.frame_id, one.name)}  {one.similarity:4.2f}  "
+        f"{one.stage}: {one.outcome.replace('_', ' ')}; {one_line(one.reason)}"
+        for one in answer.explanations or []
+    ]
+    one = answer.explained_frame
+    if one is not None:
+        place = "not searched" if one.rank is None else f"rank {one.rank} of {one.of}"
+        lost = "a match" if one.lost_at is None else f"lost at {one.lost_at}"
+        label = frame_label(one.frame_id, one.name)
+        lines.append(f"  {label}: {place}; {lost}: {one_line(one.reason)}")
+    return lines
 
-#: With how many frames each is looked up by default, and how many before it these may be.
+
+# `sceneprint localize`: one pose of a frame in a map, or why there is none.
+
+#: Default number of frames of a sequence, and how far back the earlier ones may be.
 _LAST, _FARTHEST_BACK = 3, 200
 
 
 def add_localize(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint localize`."""
-    command.add_argument("map", metavar="MAP")
-    command.add_argument(
-        "path", type=Path, metavar="FRAME", help="a depth image, a cloud, a folder or a recording"
-    )
-    command.add_argument(
-        "--frame", metavar="N|FILE", help="frame of a folder: index from 0, or name (default: all)"
-    )
     command.add_argument(
         "--last", type=positive, metavar="K",
         help="look each frame up together with the frames before it, K in all, 1 to 10: those "
         "that were taken 0.1 m or 6 degrees apart. Their poses in the folder are used as odometry "
         "(default: 3 where frames have poses and --up is not given; 1: each frame alone)",
     )  # fmt: skip
-    command.add_argument("--json", action="store_true", help="print JSON")
-    add_up_option(command)
-    add_asking_options(command)
-    add_prior_option(command)
-    add_scene_options(command)
-    add_recording_options(command)
-    add_service_options(command)
+    _add_frame_options(command)
     command.set_defaults(run=run_localize)
 
 
 def run_localize(options: argparse.Namespace) -> int:
-    """Find the poses in a map at which depth frames or clouds were taken. They are not added to
-    the map. Exit code 0: all are found; 1: one is ambiguous or not found.
+    """Find the poses in a map at which depth frames or clouds were taken. They are not added to the
+    map. Exit code 0: all are found; 1: one is ambiguous or not found; 2: one could not be looked
+    up.
     """
-    check_scene(options)
-    check_kept(options)
-    every = [frame for one in sequences_at(options.path, options) for frame in one.frames]
-    chosen = _frames_to_localize(options, every)
-    how = {**options_of(options), "prior": options.prior}
+    _check_scene(options)
+    every = _frames_at(options)
+    references = _frames_to_localize(options, every)
+    fields = query_fields(options)
     lost = failed = 0
     with open_client(options) as client, open_scene(options, client) as scene:
-        add_to_scene = _answer_scene(scene, chosen)
-        for reference in chosen:
-            try:
-                there = _localize(client, options, every, reference, how)
-            except (FrameError, MissingDependency, TooLarge) as error:  # of this file alone
-                if len(chosen) == 1:
-                    raise
+
+        def ask(reference: FrameReference) -> tuple[Localization, str]:
+            there = _localize(client, options, every, reference, fields)
+            return there, "\n".join(localization_lines(reference.name, there))
+
+        add_to_scene = _answer_scene(scene, references)
+        for reference, result in _results(options, references, ask):
+            if result is None:
                 failed += 1
-                print(f"{one_line(reference.name)}: {one_line(str(error))}", file=sys.stderr)
                 continue
+            there, text = result
             lost += there.status != "found"
-            text = "\n".join(localization_lines(reference.name, there))
-            if options.json:
-                told = {"name": reference.name, **there.model_dump(mode="json")}
-                print(json.dumps(told), flush=True)
-            else:
-                print(text, flush=True)
             if scene is not None:
                 add_to_scene(reference, client.answer(there.query_id), text)
     return 2 if failed else min(lost, 1)
@@ -470,33 +440,31 @@ def _frames_to_localize(
             "--up is of one frame. Leave --last out, or have `up` in the intrinsics.json beside "
             "the frames."
         )
-    if options.frame is not None:
-        return _wanted_frame(options.path, options.frame, every)
-    if options.prior is not None and len(every) > 1:
+    if options.prior is not None and options.frame is None and len(every) > 1:
         raise DatasetError(
             f"{options.path} has {len(every)} frames, and --prior is of one. Name it with --frame."
         )
-    return every
+    return _wanted_frames(options, every)
 
 
 def _localize(
     client: Client, options: argparse.Namespace, every: list[FrameReference],
     reference: FrameReference, how: dict[str, Any],
 ) -> Localization:  # fmt: skip
-    """Look a frame up with those before it; alone where the service refuses one of these."""
+    """Look a frame up with earlier ones, or alone if the service refuses one of these."""
     before = _frames_before(options, every, reference)
     if before:
         try:
             return client.localize_sequence(options.map, [*before, reference], **how)
         except (FrameError, TooLarge):
-            pass  # asking with the frame alone tells whether the earlier ones are at fault
+            pass  # the frame alone shows whether an earlier one is at fault
     return client.localize(options.map, reference, up=options.up, **how)
 
 
 def _frames_before(
     options: argparse.Namespace, every: list[FrameReference], reference: FrameReference
 ) -> list[FrameReference]:
-    """Return the frames of its sequence that a frame is looked up with.
+    """Return the earlier frames of its sequence that a frame is looked up with.
 
     Raises
     ------
@@ -521,7 +489,7 @@ def _frames_before(
 
 
 def _pose_or_none(reference: FrameReference) -> Floats | None:
-    """Its pose; None where it has none, or its file holds none, as where tracking was lost."""
+    """Return the pose of a frame; None if it has none, or tracking was lost."""
     try:
         return reference.pose
     except InvalidPose:
@@ -529,7 +497,7 @@ def _pose_or_none(reference: FrameReference) -> Floats | None:
 
 
 def localization_lines(name: str, there: Localization) -> list[str]:
-    """A localization for people."""
+    """Return the lines of a localization."""
     sure = f" ({there.strength})" if there.strength else ""
     several = f"{there.frames} frames, " if there.frames > 1 else ""
     lines = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib.metadata import entry_points
@@ -13,8 +12,9 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from sceneprint.atomic_files import check_writable
 from sceneprint.cli import whole_number
-from sceneprint.cli.options import ended_by_signals, one_line
-from sceneprint.errors import InvalidRequest, MissingDependency
+from sceneprint.cli.options import ended_by_signals
+from sceneprint.cli.output import one_line, print_error
+from sceneprint.errors import MissingDependency
 
 if TYPE_CHECKING:
     from sceneprint_client import Client
@@ -72,12 +72,9 @@ def add_scene_options(command: argparse.ArgumentParser) -> None:
         help="write an MCAP file for Foxglove or Rerun (needs sceneprint-viewers)",
     )  # fmt: skip
     group.add_argument(
-        "--map-frames",
-        type=whole_number,
-        default=120,
-        metavar="N",
+        "--map-frames", type=whole_number, default=120, metavar="N",
         help="frames of the map whose points are shown, evenly taken (default: 120)",
-    )
+    )  # fmt: skip
 
 
 def check_scene(options: argparse.Namespace) -> None:
@@ -103,17 +100,6 @@ def _opener() -> SceneOpener:
     )
 
 
-def check_kept(options: argparse.Namespace) -> None:
-    """Check that the service stores the answers, from which a scene is drawn.
-
-    Raises
-    ------
-    InvalidRequest : it does not.
-    """
-    if options.mcap is not None and options.no_keep:
-        raise InvalidRequest("A scene is made of stored answers. Leave --no-keep out.")
-
-
 @contextmanager
 def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | None]:
     """Open the scene that `--mcap` names; None without that option."""
@@ -123,7 +109,7 @@ def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | 
     with ended_by_signals(), _opener()(options.mcap, client, options.map_frames) as scene:
         yield scene
     if not scene.is_empty:
-        print(f"wrote {one_line(str(options.mcap))}", file=sys.stderr)
+        print_error(f"wrote {one_line(str(options.mcap))}")
 
 
 def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:

@@ -7,83 +7,32 @@ import gc
 import logging
 import signal
 import threading
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sceneprint.cli import whole_number
-
-if TYPE_CHECKING:
-    from sceneprint.settings import Settings
+from sceneprint.cli.options import add_data_option, settings_of
 
 
 def add_serve(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint serve`."""
     add_data_option(command)
     command.add_argument(
-        "--host",
-        metavar="ADDRESS",
+        "--host", metavar="ADDRESS",
         help="address to listen on (default: 127.0.0.1, this machine only)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--port",
-        type=whole_number,
-        metavar="N",
+        "--port", type=whole_number, metavar="N",
         help="port to listen on (default: 8008); 0 picks a free port and prints it",
-    )
+    )  # fmt: skip
     add_workers_option(command)
     command.set_defaults(run=run_serve)
-
-
-def add_data_option(command: argparse.ArgumentParser) -> None:
-    """`--data`."""
-    command.add_argument(
-        "--data",
-        type=Path,
-        metavar="DIR",
-        help="data folder, with database and blobs (default: the user's data folder)",
-    )
 
 
 def add_workers_option(command: argparse.ArgumentParser) -> None:
     """`--workers`."""
     command.add_argument(
-        "--workers",
-        type=whole_number,
-        metavar="N",
+        "--workers", type=whole_number, metavar="N",
         help="number of worker processes (default: processors)",
-    )
-
-
-def settings_of(options: argparse.Namespace) -> Settings:
-    """Settings of the environment, and what the options say instead.
-
-    Raises
-    ------
-    InvalidRequest : a value that is none.
-    """
-    from pydantic import ValidationError
-
-    from sceneprint.errors import InvalidRequest
-    from sceneprint.settings import Settings
-
-    names = {"data": "data_dir", "host": "host", "port": "port", "workers": "workers"}
-    given = {
-        field: getattr(options, name)
-        for name, field in names.items()
-        if getattr(options, name, None) is not None
-    }
-    try:
-        return Settings(**given)
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = str(first["loc"][0])
-        # a URL may hold a password, and the error from pydantic quotes it as well
-        secret = name.endswith("_url")
-        value = "not usable" if secret else f"{first['input']!r:.60}"
-        raise InvalidRequest(
-            f"The setting {name} is {value}: {first['msg']}. Correct the option or "
-            f"SCENEPRINT_{name.upper()}."
-        ) from (None if secret else error)
+    )  # fmt: skip
 
 
 def run_serve(options: argparse.Namespace) -> int:

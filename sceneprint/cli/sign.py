@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from sceneprint.atomic_files import write_whole
 from sceneprint.cli.bag import add_recording_options, sequences_at
+from sceneprint.cli.output import one_line
 from sceneprint.cli.preparation import add_model_options, open_for
 from sceneprint.errors import DatasetError, FrameError
 from sceneprint.formats.dataset import FrameReference
@@ -27,17 +28,14 @@ def add_sign(command: argparse.ArgumentParser) -> None:
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
     add_model_options(command)
     command.add_argument(
-        "--psi",
-        action="store_true",
+        "--psi", action="store_true",
         help="sign with psi, the Fisher vectors of the paper, from the given model or else the "
         "preset paper",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
+        "--out", type=Path, metavar="DIR",
         help="write one FRAME.sig per frame (the bytes of the signature) and signatures.json",
-    )
+    )  # fmt: skip
     add_recording_options(command)
     command.set_defaults(run=run_sign)
 
@@ -138,12 +136,9 @@ def _sign(name: str, reference: FrameReference, signer: Signer) -> Signed:
 
 
 def _line(one: Signed, signer: Signer) -> str:
-    # a name may hold line breaks and escapes; a line of ours never does
-    name = one.name if one.name.isprintable() else ascii(one.name)
+    name = one_line(one.name)
     if one.signature is None:
-        return (
-            f"{name}  NOT SIGNED  {one.reason if one.reason.isprintable() else ascii(one.reason)}"
-        )
+        return f"{name}  NOT SIGNED  {one_line(one.reason)}"
     patches = "/".join(map(str, one.signature.n_patches))
     return (
         f"{name}  {patches} patches  {sum(one.signature.n_pairs)} pairs  "

@@ -1,30 +1,27 @@
-"""Commands on a store: `migrate`, `fsck`, `purge`, `snapshot`, `restore`, `pull`, `reencode`."""
+"""Commands on a store: `migrate`, `fsck`, `snapshot`, `restore`, `pull`, `reencode`."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import positive, whole_number
 from sceneprint.cli.options import (
+    add_data_option,
     add_service_options,
     ended_by_signals,
-    one_line,
+    existing_store,
     open_client,
-    require_database,
-    waiting_reason,
+    settings_of,
 )
-from sceneprint.cli.serve import add_data_option, settings_of
+from sceneprint.cli.output import one_line, print_error, progress_bar, waiting_reason
 from sceneprint.errors import InvalidRequest
 from sceneprint.process import COMMAND, acting_as
 
@@ -36,28 +33,25 @@ if TYPE_CHECKING:
     from sceneprint.store import Database
     from sceneprint_client.api import Map
 
-#: What was looked at, in the order in which it is told.
-_COUNTED = (
-    "models", "frames", "signatures", "blobs", "files", "indexes",
-)  # fmt: skip
+#: What fsck counts, in the order in which it prints the counts.
+_COUNTED = ("models", "frames", "signatures", "blobs", "files", "indexes")
 
 
 def add_migrate(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint migrate`."""
     add_data_option(command)
     command.add_argument(
-        "--check",
-        action="store_true",
+        "--check", action="store_true",
         help="change nothing; exit code 1 if the schema must first be created or upgraded",
-    )
+    )  # fmt: skip
     command.set_defaults(run=run_migrate)
 
 
 def run_migrate(options: argparse.Namespace) -> int:
     """Create or upgrade the schema of a data folder or of DATABASE_URL, in one transaction, and
-    print the revisions. `serve` and `work` do so by themselves when they start; use this as a
-    step of its own in a deployment. Where the schema is up to date it changes nothing. Exit code
-    2 if a later version wrote the database, or it cannot be reached.
+    print the revisions. `serve` and `work` do so by themselves when they start; use this as a step
+    of its own in a deployment. Where the schema is up to date it changes nothing. Exit code 2 if a
+    later version wrote the database, or it cannot be reached.
     """
     from sceneprint.engine import Engine
     from sceneprint.store.database import is_there, reach_database
@@ -70,7 +64,7 @@ def run_migrate(options: argparse.Namespace) -> int:
         if options.check:
             print(shown if usable else f"{shown}; run `sceneprint migrate`")
             return 0 if usable else 1
-        Engine(settings).close()  # opening it makes or upgrades the schema
+        Engine(settings).close()  # opening it creates or upgrades the schema
         after, _ = _revisions(database)
     finally:
         database.close()
@@ -79,7 +73,7 @@ def run_migrate(options: argparse.Namespace) -> int:
 
 
 def _revisions(database: Database) -> tuple[str | None, bool]:
-    """The revision of a store's schema, and whether this version can use it as it is."""
+    """Return the revision of a store's schema, and whether this version can use it as it is."""
     from sceneprint.store.database import current_revision, known_revisions, revision_of
 
     with database.read() as connection:
@@ -92,21 +86,22 @@ def add_fsck(command: argparse.ArgumentParser) -> None:
     command.add_argument("--map", metavar="MAP", help="check only this map")
     how = command.add_mutually_exclusive_group()
     how.add_argument(
-        "--repair",
-        action="store_true",
+        "--repair", action="store_true",
         help="repair what can be repaired; damaged files move to `quarantine` in the data folder",
-    )
+    )  # fmt: skip
     how.add_argument(
-        "--quick",
-        action="store_true",
+        "--quick", action="store_true",
         help="check that files exist, without reading their contents",
-    )
+    )  # fmt: skip
+    how.add_argument(
+        "--purge", action="store_true",
+        help="check nothing, but erase every byte of deleted frames on this node now, without "
+        "waiting for SCENEPRINT_PURGE_S; their deletion cannot be undone afterwards",
+    )  # fmt: skip
     command.add_argument(
-        "--grace",
-        type=whole_number,
-        metavar="SECONDS",
+        "--grace", type=whole_number, metavar="SECONDS",
         help="keep unreferenced files that changed within this time (default: 3600)",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the findings to this file"
     )
@@ -115,17 +110,29 @@ def add_fsck(command: argparse.ArgumentParser) -> None:
 
 def run_fsck(options: argparse.Namespace) -> int:
     """Check rows, signatures, blobs and indexes of a data folder, and report problems and what
-    --repair would do. Changes nothing without --repair. The service may be running. Exit code 1
-    if problems remain, 2 if the folder cannot be checked.
+    --repair would do. Changes nothing without --repair. The service may be running. Exit code 1 if
+    problems remain, 2 if the folder cannot be checked.
     """
     from sceneprint.engine import Engine
     from sceneprint.maintenance.fsck.check import fsck
     from sceneprint.maintenance.fsck.findings import GRACE_S
 
+    if options.purge:
+        return _purge(options)
     if options.json is not None:
         check_writable(options.json)
     counts, findings = Counter[str](), []
-    with acting_as(COMMAND), ended_by_signals(), _progress_bar() as progress:
+    with acting_as(COMMAND), ended_by_signals(), tqdm(disable=None, leave=False) as bar:
+
+        def progress(subject: str, done: int, total: int) -> None:
+            if bar.disable:
+                return
+            if bar.desc != f"{subject}: ":
+                bar.reset(total)
+                bar.set_description(subject)
+            bar.total, bar.n = total, done
+            bar.refresh()
+
         for finding in fsck(
             settings_of(options), map_name=options.map, repair=options.repair,
             quick=options.quick, progress=progress, counts=counts,
@@ -174,41 +181,13 @@ def _record(finding: Finding) -> dict[str, object]:
     return {name: getattr(finding, name) for name in names} | {"path": path}
 
 
-@contextmanager
-def _progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on a terminal, of one subject after the other."""
-    with tqdm(disable=None, leave=False) as bar:
-
-        def progress(subject: str, done: int, total: int) -> None:
-            if bar.disable:
-                return
-            if bar.desc != f"{subject}: ":
-                bar.reset(total)
-                bar.set_description(subject)
-            bar.total, bar.n = total, done
-            bar.refresh()
-
-        yield progress
-
-
-# `sceneprint purge`: deletions made final now.
-
-
-def add_purge(command: argparse.ArgumentParser) -> None:
-    """Add the options of `sceneprint purge`."""
-    add_data_option(command)
-    command.set_defaults(run=run_purge)
-
-
-def run_purge(options: argparse.Namespace) -> int:
-    """Erase every byte of deleted frames on this node now, without waiting for
-    SCENEPRINT_PURGE_S. Their deletion cannot be undone afterwards.
-    """
+def _purge(options: argparse.Namespace) -> int:
+    """Erase deleted frames; return 1 if the log of the database could not be emptied."""
     from sceneprint.engine import Engine
 
-    settings = settings_of(options)
-    require_database(settings)
-    with Engine(settings) as engine:
+    if not options.map is options.grace is options.json is None:
+        raise InvalidRequest("--purge checks nothing. Give no other option than --data with it.")
+    with Engine(existing_store(options)) as engine:
         found = engine.purging.now()
         print(
             f"purged {found.blobs} blobs, {found.answers} stored answers, "
@@ -220,63 +199,57 @@ def run_purge(options: argparse.Namespace) -> int:
     return 0
 
 
-# `sceneprint snapshot`: all that must not be lost, in one archive.
+# `sceneprint snapshot` and `restore`: bundles of database and blobs.
 
-#: Damaged blobs that are named one by one.
+#: Most damaged blobs whose names are printed.
 _SHOWN = 10
 
 
 def add_snapshot(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint snapshot`."""
-    add_data_option(command)
-    add_database_option(command)
+    _add_database_options(command)
     command.add_argument(
-        "--to",
-        required=True,
-        metavar="PLACE",
+        "--to", required=True, metavar="PLACE",
         help="folder or URL such as s3://bucket/prefix, with bundles of this store alone",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--keep",
-        type=positive,
-        metavar="N",
+        "--keep", type=positive, metavar="N",
         help="remove all but the newest N bundles afterwards (default: keep all)",
-    )
+    )  # fmt: skip
     command.set_defaults(run=run_snapshot)
 
 
 def run_snapshot(options: argparse.Namespace) -> int:
     """Write a bundle of database and blobs to a folder or an object store. The service and its
     workers may keep running. What an earlier bundle there holds is not written again. Search
-    indexes are left out, as they can be rebuilt. Exit code 1 if a blob was missing or damaged
-    and could not be included. A bundle contains all frames and the hashes of keys: protect it
-    like the data folder.
+    indexes are left out, as they can be rebuilt. Exit code 1 if a blob was missing or damaged and
+    could not be included. A bundle contains all frames and the hashes of keys: protect it like the
+    data folder.
     """
     from sceneprint.bundle.backup import take_backup
 
     start = time.perf_counter()
-    settings = named_database(options)
-    with ended_by_signals(), record_progress("snapshot") as progress:
+    settings = _named_database(options)
+    with ended_by_signals(), progress_bar("snapshot", "record", unit_scale=True) as progress:
         bundle = take_backup(settings, options.to, progress, keep=options.keep)
     print(
-        f"{one_line(options.to)}: bundle {bundle.manifest.name}, {contents(bundle)}, "
+        f"{one_line(options.to)}: bundle {bundle.manifest.name}, {_contents(bundle)}, "
         f"{bundle.written / 1e6:,.1f} MB of it new, in {time.perf_counter() - start:.1f} s"
     )
-    return 1 if name_lost(bundle, "Run `sceneprint fsck` to see what can be repaired.") else 0
+    return _report_lost(bundle, "Run `sceneprint fsck` to see what can be repaired.")
 
 
-def add_database_option(command: argparse.ArgumentParser) -> None:
-    """`--database`."""
+def _add_database_options(command: argparse.ArgumentParser) -> None:
+    add_data_option(command)
     command.add_argument(
-        "--database",
-        metavar="URL",
+        "--database", metavar="URL",
         help="URL such as postgresql://user@host/name (default: SCENEPRINT_DATABASE_URL, else "
         "SQLite in the data folder); put a password into that variable or PGPASSWORD",
-    )
+    )  # fmt: skip
 
 
-def named_database(options: argparse.Namespace) -> Settings:
-    """Settings of the environment, and the database that `--database` names.
+def _named_database(options: argparse.Namespace) -> Settings:
+    """Return the settings of the environment with the database that `--database` names.
 
     Raises
     ------
@@ -286,19 +259,16 @@ def named_database(options: argparse.Namespace) -> Settings:
     from sqlalchemy import make_url
     from sqlalchemy.exc import ArgumentError
 
-    from sceneprint.errors import InvalidRequest
-
     settings = settings_of(options)
     if options.database is None:
         return settings
     try:
-        told = make_url(options.database)
-        shown = told.password is not None or "password" in told.query
+        url = make_url(options.database)
     except (ArgumentError, ValueError):
         raise InvalidRequest(
             "--database: not a database URL such as postgresql://user@host/name."
         ) from None
-    if shown:
+    if url.password is not None or "password" in url.query:
         raise InvalidRequest(
             "--database: a password on the command line is visible to everybody on this "
             "machine. Set PGPASSWORD, or put the whole URL into SCENEPRINT_DATABASE_URL."
@@ -306,58 +276,36 @@ def named_database(options: argparse.Namespace) -> Settings:
     return settings.model_copy(update={"database_url": SecretStr(options.database)})
 
 
-@contextmanager
-def record_progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar of rows and blobs on a terminal; yield what sets how many are done, and of how
-    many."""
-    with tqdm(desc=what, unit="record", unit_scale=True, disable=None) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield progress
-
-
-def contents(bundle: Bundle) -> str:
-    """Return the content of a bundle in a few words."""
+def _contents(bundle: Bundle) -> str:
     held = bundle.manifest
     return (
         f"{held.maps} maps, {held.n_frames} frames, {held.blobs} blobs, {held.bytes / 1e6:,.1f} MB"
     )
 
 
-def name_lost(bundle: Bundle, advice: str) -> bool:
-    """Name on standard error the blobs that a bundle lacks; return whether there are any."""
+def _report_lost(bundle: Bundle, advice: str) -> int:
+    """Print the blobs that a bundle lacks on standard error; return 1 if there are any."""
     if not bundle.lost:
-        return False
+        return 0
     for one in bundle.lost[:_SHOWN]:
-        print(f"not in it: blob {one.digest[:12]}, {one.why}", file=sys.stderr)
-    more = len(bundle.lost) - _SHOWN
-    if more > 0:
-        print(f"... and {more} more", file=sys.stderr)
-    print(f"Everything else is included. {advice}", file=sys.stderr)
-    return True
-
-
-# `sceneprint restore`: a data folder of a bundle, or the store of a fleet.
+        print_error(f"not in it: blob {one.digest[:12]}, {one.why}")
+    if len(bundle.lost) > _SHOWN:
+        print_error(f"... and {len(bundle.lost) - _SHOWN} more")
+    print_error(f"Everything else is included. {advice}")
+    return 1
 
 
 def add_restore(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint restore`."""
     command.add_argument(
-        "place",
-        metavar="PLACE",
-        help="folder or URL that `sceneprint snapshot` wrote to",
+        "place", metavar="PLACE", help="folder or URL that `sceneprint snapshot` wrote to"
     )
-    add_data_option(command)
-    add_database_option(command)
+    _add_database_options(command)
     command.add_argument("--bundle", metavar="NAME", help="bundle to restore (default: the newest)")
     command.add_argument(
-        "--verify-only",
-        action="store_true",
+        "--verify-only", action="store_true",
         help="read and check the whole bundle without restoring it",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--list", action="store_true", help="list the bundles of the place, and restore none"
     )
@@ -365,25 +313,25 @@ def add_restore(command: argparse.ArgumentParser) -> None:
 
 
 def run_restore(options: argparse.Namespace) -> int:
-    """Restore a bundle to a data folder, verifying every byte. With the URL of an empty
-    PostgreSQL database, its rows go there in one transaction, and its blobs to
-    SCENEPRINT_BLOB_URL or else the data folder. A folder that is not empty stays untouched. A
-    restore that was interrupted goes on when you run it again. Exit code 1 if the bundle lists
-    blobs that were damaged when it was taken; 2 if nothing was restored.
+    """Restore a bundle to a data folder, verifying every byte. With the URL of an empty PostgreSQL
+    database, its rows go there in one transaction, and its blobs to SCENEPRINT_BLOB_URL or else
+    the data folder. A folder that is not empty stays untouched. A restore that was interrupted
+    goes on when you run it again. Exit code 1 if the bundle lists blobs that were damaged when it
+    was taken; 2 if nothing was restored.
     """
     from sceneprint.bundle import restoration
 
-    settings, start = named_database(options), time.perf_counter()
+    settings, start = _named_database(options), time.perf_counter()
     if options.list:
         return _list_bundles(options.place)
     place, name = options.place, options.bundle
     task = "verify" if options.verify_only else "restore"
-    with ended_by_signals(), record_progress(task) as go_on:
+    with ended_by_signals(), progress_bar(task, "record", unit_scale=True) as progress:
         if options.verify_only:
-            bundle, done = restoration.verify_bundle(place, name, go_on), "is complete"
+            bundle, done = restoration.verify_bundle(place, name, progress), "is complete"
         elif settings.database_url is not None:
             shown = _server(settings)
-            bundle = restoration.restore_to_server(place, settings, name, go_on)
+            bundle = restoration.restore_to_server(place, settings, name, progress)
             done = f"is restored to {shown}"
         else:
             if settings.blob_url is not None:
@@ -392,25 +340,25 @@ def run_restore(options: argparse.Namespace) -> int:
                     "no service would look for them. Unset the variable, or restore into a fleet "
                     "with --database."
                 )
-            bundle = restoration.restore_to_folder(place, settings.data_dir, name, go_on)
+            bundle = restoration.restore_to_folder(place, settings.data_dir, name, progress)
             done = f"is restored to {one_line(str(settings.data_dir))}"
     seconds = time.perf_counter() - start
-    print(f"{one_line(place)}: bundle {bundle.manifest.name} {done}: {contents(bundle)} "
+    print(f"{one_line(place)}: bundle {bundle.manifest.name} {done}: {_contents(bundle)} "
           f"in {seconds:.1f} s")  # fmt: skip
     advice = (
         "These blobs were damaged when the bundle was taken. Run `sceneprint fsck` on the restored "
         "store to see whose they are."
     )
-    return 1 if name_lost(bundle, advice) else 0
+    return _report_lost(bundle, advice)
 
 
-def _list_bundles(place: str) -> int:
+def _list_bundles(name: str) -> int:
     from sceneprint.bundle.place import BundlePlace
 
-    there = BundlePlace.open(place)
-    for name in there.names():
-        held = there.read(name)
-        print(f"{name}  {held.maps} maps, {held.n_frames} frames, {held.bytes / 1e6:,.1f} MB")
+    place = BundlePlace.open(name)
+    for bundle in place.names():
+        held = place.read(bundle)
+        print(f"{bundle}  {held.maps} maps, {held.n_frames} frames, {held.bytes / 1e6:,.1f} MB")
     return 0
 
 
@@ -462,12 +410,7 @@ def run_pull(options: argparse.Namespace) -> int:
         try:
             for name in dict.fromkeys(options.map):
                 start = time.perf_counter()
-                with tqdm(desc=name, unit="frame", disable=None) as bar:
-
-                    def progress(done: int, total: int, bar: Any = bar) -> None:
-                        bar.total = total
-                        bar.update(done - bar.n)
-
+                with progress_bar(name) as progress:
                     found = pull_map(client, store, name, progress)
                 print(
                     f"{one_line(str(folder))} has map {name} of revision {found.revision}: "
@@ -482,7 +425,7 @@ def run_pull(options: argparse.Namespace) -> int:
 
 # `sceneprint reencode`: a map signed with another model, to which it then switches.
 
-#: Seconds without a frame signed after which no worker is believed to be there.
+#: Seconds without a frame signed after which no worker is believed to run.
 STALL_S = 120.0
 #: Seconds between two looks; longer where a look takes more than a tenth of it.
 LOOK_S = 0.5
@@ -495,10 +438,9 @@ def add_reencode(command: argparse.ArgumentParser) -> None:
     what.add_argument("--model", metavar="MODEL", help="depth, lidar, paper, or a model file")
     what.add_argument("--status", action="store_true", help="show the progress")
     what.add_argument(
-        "--cancel",
-        action="store_true",
+        "--cancel", action="store_true",
         help="keep the current model, and discard signatures of the new one",
-    )
+    )  # fmt: skip
     command.add_argument("--wait", action="store_true", help="wait until the map has switched")
     add_data_option(command)
     command.set_defaults(run=run_reencode)
@@ -513,24 +455,22 @@ def run_reencode(options: argparse.Namespace) -> int:
     from sceneprint.engine import Engine
     from sceneprint.engine.maps import map_lifecycle
 
-    settings = settings_of(options)
-    require_database(settings)
-    with acting_as(COMMAND), Engine(settings) as engine:
+    with acting_as(COMMAND), Engine(existing_store(options)) as engine:
         if options.model is not None:
-            told = engine.reencode(options.map, options.model)
+            now = engine.reencode(options.map, options.model)
         elif options.cancel:
-            told = map_lifecycle.cancel_reencoding(engine.store, options.map)
+            now = map_lifecycle.cancel_reencoding(engine.store, options.map)
         else:
-            told = engine.get_map(options.map)
-        if options.wait and told.reencoding is not None:
-            return _wait(engine, told)
-        _print_reencoding(told)
+            now = engine.get_map(options.map)
+        if options.wait and now.reencoding is not None:
+            return _wait(engine, now)
+        _print_reencoding(now)
     return 0
 
 
-def _print_reencoding(told: Map) -> None:
-    print(f"map {told.name}, model {told.model}")
-    coming = told.reencoding
+def _print_reencoding(one: Map) -> None:
+    print(f"map {one.name}, model {one.model}")
+    coming = one.reencoding
     if coming is None:
         return
     print(f"next model: {coming.model}; {coming.done} frames signed, {coming.left} waiting")
@@ -546,32 +486,30 @@ def _print_reencoding(told: Map) -> None:
         )
 
 
-def _wait(engine: Engine, told: Map) -> int:
-    """Wait while frames are signed now and then."""
-    coming = told.reencoding
+def _wait(engine: Engine, one: Map) -> int:
+    """Wait as long as frames are signed now and then; return 2 if they are not."""
+    coming = one.reencoding
     assert coming is not None
     last, since = -1, time.monotonic()
-    with tqdm(desc=f"sign with {coming.model}", unit="frame", disable=None) as bar:
+    with progress_bar(f"sign with {coming.model}") as progress:
         while True:
             looked = time.monotonic()
-            told = engine.get_map(told.name)
+            one = engine.get_map(one.name)
             took = time.monotonic() - looked
-            now = told.reencoding
+            now = one.reencoding
             if now is None or now.model_id != coming.model_id:
                 break
             done = now.done + now.failed
-            bar.total = done + now.left + now.dead
-            bar.update(done - bar.n)
+            progress(done, done + now.left + now.dead)
             if done != last:
                 last, since = done, time.monotonic()
-            if (now.dead and not now.left) or time.monotonic() - since > STALL_S:
-                bar.close()
-                _print_reencoding(told)
-                if not now.dead:
-                    stats = engine.operations.statistics.tell(minutes=1)
-                    reason = waiting_reason(stats, 0 if now is None else now.left)
-                    print(f"no progress for {STALL_S:.0f} s. {reason}", file=sys.stderr)
-                return 2
+            stalled = time.monotonic() - since > STALL_S
+            if stalled or (now.dead and not now.left):
+                break
             time.sleep(max(LOOK_S, 10 * took))
-    _print_reencoding(told)
-    return 0 if told.model_id == coming.model_id else 2
+    _print_reencoding(one)
+    if now is not None and now.model_id == coming.model_id and not now.dead:
+        stats = engine.operations.statistics.tell(minutes=1)
+        reason = waiting_reason(stats, now.left)
+        print_error(f"no progress for {STALL_S:.0f} s. {reason}")
+    return 0 if one.model_id == coming.model_id else 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -18,8 +17,8 @@ from tqdm import tqdm
 from sceneprint.cli import positive, positive_number
 from sceneprint.cli.bag import (
     add_recording_options,
+    print_note,
     recording_options,
-    tell,
     with_depth_scale,
 )
 from sceneprint.cli.imports import (
@@ -36,14 +35,14 @@ from sceneprint.cli.imports import (
 )
 from sceneprint.cli.options import (
     add_service_options,
+    add_signing_options,
     add_up_option,
     base_of,
-    one_line,
+    mounting_of,
     open_client,
-    priority_of,
-    share_of,
     up_of,
 )
+from sceneprint.cli.output import one_line, print_error, progress_bar
 from sceneprint.errors import (
     DatasetError,
     FrameConflict,
@@ -55,7 +54,6 @@ from sceneprint.errors import (
     UnknownMap,
 )
 from sceneprint.formats.dataset import FrameReference, FrameSequence, find_sequences
-from sceneprint_client.api.base import NOVEL
 from sceneprint_client.api.maps import PRESETS
 from sceneprint_client.sidecars import row_of
 
@@ -65,12 +63,12 @@ if TYPE_CHECKING:
     from sceneprint_client.api.frames import SampleRange, UploadSummary
     from sceneprint_client.api.listing import Session
 
-# What has become of the frames of an upload.
+# The frames of an upload, counted by their outcomes.
 
 
 @dataclass
 class Tally:
-    """Counts frames by what has become of them."""
+    """Counts frames by their outcomes."""
 
     new: int = 0
     there: int = 0  #: in the map before
@@ -87,7 +85,7 @@ class Tally:
     lost: int = 0  #: frames and poses that could not be sent, though no option leaves them out
 
     def count(self, name: str, added: Added, new: bool) -> None:
-        """A frame that was received, or is there."""
+        """Count a frame that was received, or is in the map."""
         from sceneprint_client.api import FrameState
 
         self.new += new
@@ -104,12 +102,12 @@ class Tally:
             self._lose(name, added.reason, rejected=added.state is FrameState.REJECTED)
 
     def refuse(self, name: str, reason: str) -> None:
-        """A frame that was not received."""
+        """Count a frame that was not received."""
         self.refused += 1
         self.errors.append((name, reason))
 
     def end(self, job: Job, *, redundant: bool = False) -> None:
-        """A job that is over, and whether its frame was not kept."""
+        """Count the frames of a finished job; `redundant` if they were not kept."""
         from sceneprint_client.api import JobState
 
         for name in self.waiting.pop(job.job_id):
@@ -122,7 +120,7 @@ class Tally:
                 self._lose(name, reason, rejected=job.state is JobState.FAILED)
 
     def report(self, total: int, seconds: float) -> None:
-        """Print the sum, and a line for each frame that was not indexed."""
+        """Print the counts, and a line for each frame that was not indexed."""
         refused = f", {self.refused} refused" if self.refused else ""
         waiting = f", {len(self.waiting)} waiting" if self.waiting else ""
         redundant = f", {self.redundant} redundant" if self.redundant else ""
@@ -132,7 +130,7 @@ class Tally:
             f"{redundant}{waiting}; {(self.new + self.there) / max(seconds, 1e-9):.1f} frames/s"
         )
         for name, reason in sorted(self.errors):
-            print(f"{one_line(name)}: {one_line(reason)}", file=sys.stderr)
+            print_error(f"{one_line(name)}: {one_line(reason)}")
 
     def _lose(self, name: str, reason: str | None, *, rejected: bool) -> None:
         self.rejected += rejected
@@ -158,18 +156,15 @@ def wait_for_all(
     may_be_redundant : whether frames were sent to be kept only where the map lacks the place
     """
     total = len(tally.waiting)
-    with tqdm(total=total, desc="sign", unit="frame", disable=None) as bar:
+    with progress_bar("sign", total=total) as progress:
         while tally.waiting:
             before = total - len(tally.waiting)
 
-            def progress(done: int, _: int, before: int = before) -> None:
-                bar.update(before + done - bar.n)
+            def advance(done: int, _: int, before: int = before) -> None:
+                progress(before + done, total)
 
-            over = [
-                job
-                for job in client.wait(tally.waiting, timeout_s=patience.left_s, progress=progress)
-                if job.state.over
-            ]
+            waited = client.wait(tally.waiting, timeout_s=patience.left_s, progress=advance)
+            over = [job for job in waited if job.state.over]
             for job in over:
                 redundant = may_be_redundant and _is_redundant(client, map_name, job)
                 tally.end(job, redundant=redundant)
@@ -179,7 +174,7 @@ def wait_for_all(
 
 
 def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
-    """Whether a frame was signed and not kept: its job alone does not tell."""
+    """Return whether a frame was signed and not kept, which its job alone does not show."""
     from sceneprint_client.api import FrameState, JobState
 
     if job.state is not JobState.SUCCEEDED:
@@ -187,25 +182,22 @@ def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
     return client.frame(map_name, str(job.frame_id)).state is FrameState.REDUNDANT
 
 
-# What is said of all frames of a command.
+# Metadata of all frames of a command.
 
 
 def add_frame_options(
     command: argparse.ArgumentParser, up: Callable[[str], object] = up_of
 ) -> None:
-    """`--robot` and its like: metadata of frames; `up` reads what `--up` is."""
+    """Add `--robot` and other metadata of frames; `up` reads the text of `--up`."""
     command.add_argument(
-        "--row",
-        type=row_option,
-        metavar="NAMES",
+        "--row", type=row_option, metavar="NAMES",
         help="what a row of float32 in .bin files holds, such as x,y,z,i,ring (default: x,y,z and "
         "intensity)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--robot",
-        metavar="NAME",
+        "--robot", metavar="NAME",
         help="robot that took the frames; also qualifies the parent frame of the poses",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--session", metavar="NAME", help="session of the frames (default: the sequence's name)"
     )
@@ -213,111 +205,79 @@ def add_frame_options(
         "--tag", action="append", default=[], metavar="TAG", help="tag of the frames; repeatable"
     )
     command.add_argument(
-        "--parent-frame",
-        metavar="NAME",
+        "--parent-frame", metavar="NAME",
         help="parent frame of all poses; poses of several uploads are combined if they share it "
         "(default: the name of the scene's folder, with --robot ROBOT/SCENE)",
-    )
+    )  # fmt: skip
     command.add_argument("--no-pose", action="store_true", help="do not upload known poses")
     command.add_argument(
-        "--trust-depth",
-        action="store_true",
+        "--trust-depth", action="store_true",
         help="take depth images that do not look like depth, which are refused else",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--base",
-        type=base_of,
-        metavar="TX,TY,TZ,QX,QY,QZ,QW",
+        "--base", type=base_of, metavar="TX,TY,TZ,QX,QY,QZ,QW",
         help="mounting pose of the sensor, sensor to base: metres and a unit quaternion",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--base-frame", metavar="NAME", help="name of the robot's base frame (default: base_link)"
     )
     add_up_option(command, up)
 
 
-def meta_for(
+def frame_metadata(
     options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
 ) -> FrameMeta:
-    """What is known of a frame, with what the options say of it; raises as `meta_of`."""
+    """Return the metadata of a frame, with that of the options; raises as `meta_of`."""
     from sceneprint.formats.dataset.frame_reference import parent_frame_of, session_of
     from sceneprint_client.frame_files import meta_of
 
-    base = options.base
-    if base is not None and options.base_frame is not None:
-        base = base.model_copy(update={"base_frame": options.base_frame})
     return meta_of(
         reference,
         robot=options.robot,
         session=options.session or session_of(sequence),
         tags=options.tag,
         with_pose=not options.no_pose,
-        base=base,
+        base=mounting_of(options),
         up=options.up,
         parent_frame=options.parent_frame or parent_frame_of(sequence, options.robot),
         trust_depth=options.trust_depth,
     )
 
 
-#: What is wrong with one frame, and says nothing of the next.
+#: Errors of one frame, after which the next is still uploaded.
 OF_FRAME = (
     FrameError, DatasetError, FrameConflict, InvalidRequest, MissingDependency, Refused,
 )  # fmt: skip
 
 
 def add_upload(command: argparse.ArgumentParser) -> None:
-    """Add the options of `sceneprint upload`.
-
-    Length: a statement for each option, in the order of `--help`.
-    """
+    """Add the options of `sceneprint upload`."""
     command.add_argument(
         "map", metavar="MAP", help="map to upload to; created if it does not exist"
     )
     command.add_argument("paths", nargs="+", type=Path, metavar="PATH")
     add_frame_options(command, axis_or_up)
     command.add_argument(
-        "--create",
-        action=argparse.BooleanOptionalAction,
-        default=True,
+        "--create", action=argparse.BooleanOptionalAction, default=True,
         help="create the map if it does not exist (default)",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--model", choices=PRESETS, help=f"model of a new map (default: {PRESETS[0]})"
     )
     command.add_argument(
         "--every", type=positive, default=1, metavar="N", help="upload every Nth frame"
     )
-    command.add_argument(
-        "--priority",
-        type=priority_of,
-        default=0,
-        metavar="N",
-        help="-10 to 10; frames with a higher priority are signed first (default: 0)",
-    )
-    command.add_argument(
-        "--if-novel",
-        nargs="?",
-        type=share_of,
-        const=True,
-        metavar="D",
-        help="keep a frame only if its place is new to the map: the nearest frame is farther "
-        f"than D, as a share of the distance of unrelated frames (without a number: {NOVEL:g})",
-    )
+    add_signing_options(command)
     command.add_argument("--no-wait", action="store_true", help="do not wait for signing")
     command.add_argument(
-        "--timeout",
-        type=positive_number,
-        metavar="SECONDS",
+        "--timeout", type=positive_number, metavar="SECONDS",
         help="wait so long for signing; frames that are not signed by then are signed later "
         f"(default: until none was signed for {STALL_S:.0f} s)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--parallel",
-        type=positive,
-        default=4,
-        metavar="N",
+        "--parallel", type=positive, default=4, metavar="N",
         help="number of concurrent uploads (default: 4)",
-    )
+    )  # fmt: skip
     add_map_options(command)
     add_recording_options(command)
     add_service_options(command)
@@ -336,17 +296,15 @@ def run_upload(options: argparse.Namespace) -> int:
     check_map_options(options)
     if options.as_map:
         with open_client(options) as client:
-            _see_to_map(client, options)
+            _ensure_map(client, options)
             return import_maps(client, options)
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
     sequences = sequences_of(paths, options)
     found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
-    if options.base is not None and options.base_frame is not None:
-        options.base = options.base.model_copy(update={"base_frame": options.base_frame})
     tally, start, late = Tally(), time.perf_counter(), False
     with open_client(options) as client:
-        _see_to_map(client, options)
+        _ensure_map(client, options)
         try:
             _send_all(client, options, found, tally)
             late = not import_archives(client, options, archives, tally)
@@ -356,13 +314,13 @@ def run_upload(options: argparse.Namespace) -> int:
                 wait_for_all(client, options.map, tally, patience, may_be_redundant=novel)
                 if tally.waiting:
                     late = True
-                    _tell_late(client, options, tally)
+                    _report_late(client, options, tally)
         finally:  # what was received stays, however the run ended
             counted = tally.new + tally.there + tally.refused
             tally.report(max(len(found), counted), time.perf_counter() - start)
             for sequence in sequences:
                 if sequence.layout.is_export:  # the summary has the notes of others
-                    tell(sequence)
+                    print_note(sequence)
                 tally.lost += 0 if options.no_pose else sequence.lost
             hint_at_maps(paths)
             if found:
@@ -376,17 +334,16 @@ def run_upload(options: argparse.Namespace) -> int:
     return 2 if tally.errors or tally.lost or late else 0
 
 
-def _tell_late(client: Client, options: argparse.Namespace, tally: Tally) -> None:
+def _report_late(client: Client, options: argparse.Namespace, tally: Tally) -> None:
     how = "not" if options.timeout else "none was"
-    print(
+    print_error(
         f"{len(tally.waiting)} frames are stored and waiting, but {how} signed within "
-        f"{options.timeout or STALL_S:g} s. {why_unsigned(client, tally.waiting)}",
-        file=sys.stderr,
+        f"{options.timeout or STALL_S:g} s. {why_unsigned(client, tally.waiting)}"
     )
 
 
 def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
-    """Say what an upload leaves to do: poses, their parent frames, and the model of the map.
+    """Return advice after an upload, on poses, their parent frames, and the model of the map.
 
     Parameters
     ----------
@@ -418,7 +375,8 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
             if two[0].session == two[1].session and all(one.robot for one in two):
                 options += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
             line += (
-                f"; `sceneprint associate {now.name} {options}` does so at once, or says why not"
+                f"; `sceneprint make association {now.name} {options}` does so at once, or says "
+                "why not"
             )
         lines.append(f"{line}.")
     return lines
@@ -445,7 +403,7 @@ def summary_of(
 
 
 def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
-    """The sequences at all paths, numbered within their sessions.
+    """Return the sequences at all paths, numbered within their sessions.
 
     Raises
     ------
@@ -496,7 +454,7 @@ def _with_row(sequence: FrameSequence, row: tuple[str, ...]) -> FrameSequence:
     return replace(sequence, frames=frames)
 
 
-def _see_to_map(client: Client, options: argparse.Namespace) -> None:
+def _ensure_map(client: Client, options: argparse.Namespace) -> None:
     try:
         model = client.map(options.map).model
     except UnknownMap:
@@ -518,7 +476,7 @@ def _send_all(
     found: list[tuple[FrameSequence, FrameReference]],
     tally: Tally,
 ) -> None:
-    """Upload all, several at a time; what is wrong with the service ends it."""
+    """Upload all, several at a time, until an error of the service."""
     pool = ThreadPoolExecutor(options.parallel, thread_name_prefix="upload")
     sent = {pool.submit(_send, client, options, *one): one[1].name for one in found}
     try:
@@ -540,7 +498,7 @@ def _send_all(
 def _send(
     client: Client, options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
 ) -> tuple[Added, bool]:
-    meta = meta_for(options, sequence, reference)
+    meta = frame_metadata(options, sequence, reference)
     return client.add(
         options.map, reference, meta, priority=options.priority, if_novel=options.if_novel
     )

@@ -94,8 +94,8 @@ def leave_tenant(connection: Connection, key_name: str, tenant: str) -> None:
 def unknown_tenant(name: str) -> UnknownTenant:
     """That there is no tenant of a name."""
     return UnknownTenant(
-        f"There is no tenant named {name!r:.80}. Create it with `sceneprint tenants --create "
-        "NAME`; list them with `sceneprint tenants --list`."
+        f"There is no tenant named {name!r:.80}. Create it with `sceneprint keys --create-tenant "
+        "NAME`; list them with `sceneprint keys --list-tenants`."
     )
 
 

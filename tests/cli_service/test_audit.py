@@ -20,7 +20,7 @@ MESSAGE = re.compile(r"<109>1 \d{4}-\d\d-\d\dT[\d:.]{12}Z \S+ sceneprint - audit
 def data(sceneprint: Run, tmp_path: Path) -> Path:
     for arguments in (("--create", "robot"), ("--create", "screen"), ("--revoke", "robot")):
         sceneprint("keys", *arguments, "--data", tmp_path)
-    sceneprint("tenants", "--create", "fleet", "--data", tmp_path)
+    sceneprint("keys", "--create-tenant", "fleet", "--data", tmp_path)
     return tmp_path
 
 

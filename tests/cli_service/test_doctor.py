@@ -25,7 +25,7 @@ from sceneprint.cli.checks import (
     version_check,
     worker_check,
 )
-from sceneprint.cli.options import waiting_reason
+from sceneprint.cli.output import waiting_reason
 from sceneprint.cli.preparation import prepare_presets
 from sceneprint.engine import compilation
 from sceneprint.formats.dataset import find_sequences

@@ -106,23 +106,23 @@ def test_tenants_are_made_listed_and_deleted(sceneprint: Run, tmp_path: Path) ->
     def run(*arguments: str, expect: int = 0) -> Any:
         return sceneprint(*arguments, "--data", tmp_path, expect=expect)
 
-    assert run("tenants", "--create", "acme").stdout == "tenant acme is created\n"
-    assert "a tenant named 'acme'" in run("tenants", "--create", "acme", expect=2).stderr
+    assert run("keys", "--create-tenant", "acme").stdout == "tenant acme is created\n"
+    assert "a tenant named 'acme'" in run("keys", "--create-tenant", "acme", expect=2).stderr
     run("keys", "--create", "robot", "--tenant", "acme", "--scope", "read")
     run("keys", "--create", "alone", "--scope", "read")
     done = run("keys", "--create", "x", "--tenant", "other", expect=2)
     assert "There is no tenant named 'other'" in done.stderr
     listed = [line[22:] for line in run("keys", "--list").stdout.splitlines()]
     assert listed == ["alone  read of all", "robot  read of all, tenant acme"]
-    listed = [line[22:] for line in run("tenants", "--list").stdout.splitlines()]
+    listed = [line[22:] for line in run("keys", "--list-tenants").stdout.splitlines()]
     assert listed == ["acme  1 key", "alone  1 key"]
-    assert "has keys" in run("tenants", "--delete", "acme", expect=2).stderr
+    assert "has keys" in run("keys", "--delete-tenant", "acme", expect=2).stderr
     for name in ("robot", "alone"):  # the tenant that came with a key goes with it
         run("keys", "--revoke", name)
-    listed = [line[22:] for line in run("tenants", "--list").stdout.splitlines()]
+    listed = [line[22:] for line in run("keys", "--list-tenants").stdout.splitlines()]
     assert listed == ["acme  0 keys"]
-    assert run("tenants", "--delete", "acme").stdout == "tenant acme is deleted\n"
-    assert "no tenant named 'acme'" in run("tenants", "--delete", "acme", expect=2).stderr
+    assert run("keys", "--delete-tenant", "acme").stdout == "tenant acme is deleted\n"
+    assert "no tenant named 'acme'" in run("keys", "--delete-tenant", "acme", expect=2).stderr
 
 
 @pytest.mark.parametrize("time", ["30", "d", "0d", "-1d", "1y", "999999w", "1 d"])

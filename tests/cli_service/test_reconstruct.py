@@ -1,4 +1,4 @@
-"""`sceneprint reconstruct` against a real service."""
+"""`sceneprint make mesh` against a real service."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_mesh_and_its_figures(
     for path in rest:
         sceneprint("upload", "walk", path)
     mesh = tmp_path / "mesh.ply"
-    said = sceneprint("reconstruct", "walk", first, "--out", mesh, "--voxel", "0.05")
+    said = sceneprint("make", "mesh", "walk", first, "--out", mesh, "--voxel", "0.05")
     lines = said.stdout.splitlines()
     total = re.search(r"(\d+) views show ([\d.]+) m2 of surface", lines[1])
     assert total is not None
@@ -50,7 +50,7 @@ def test_a_mesh_and_its_figures(
     sceneprint("upload", "walk", first)
     with Client(service_url) as client:
         [*_, frame_id] = [frame.frame_id for frame in client.frames("walk")]
-    said = sceneprint("reconstruct", "walk", frame_id, "--out", mesh, "--cloud", "--voxel", "0.05")
+    said = sceneprint("make", "mesh", "walk", frame_id, "--out", mesh, "--cloud", "--voxel", "0.05")
     assert "a cloud" in said.stdout
     assert b"element face" not in mesh.read_bytes()[:1000]
 
@@ -59,9 +59,9 @@ def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: P
     with Client(service_url) as client:
         client.create_map("nothing", model="depth")
     first = min(walk.glob("*.png"))
-    said = sceneprint("reconstruct", "nothing", first, expect=1)
+    said = sceneprint("make", "mesh", "nothing", first, expect=1)
     assert said.stdout == f"{first}: not found, so there is nothing to fuse\n"
-    said = sceneprint("reconstruct", "nothing", walk, expect=2)
+    said = sceneprint("make", "mesh", "nothing", walk, expect=2)
     assert "6 frames found. Name a single frame file." in said.stderr
-    said = sceneprint("reconstruct", "nothing", "nobody", expect=2)
+    said = sceneprint("make", "mesh", "nothing", "nobody", expect=2)
     assert "There is no frame 'nobody'" in said.stderr

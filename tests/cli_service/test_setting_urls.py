@@ -10,7 +10,7 @@ import traceback
 import pytest
 from pydantic import ValidationError
 
-from sceneprint.cli.serve import settings_of
+from sceneprint.cli.options import settings_of
 from sceneprint.decoders.child_process import SHARED_BYTES
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings

@@ -24,13 +24,13 @@ def test_what_was_not_tried_is_not_told_to_be_there(
     sceneprint: Callable[..., Any], rooms: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "robot.spool"
-    sceneprint("spool", "add", path, rooms / "room-0", "--every", 3)
+    sceneprint("spool", path, rooms / "room-0", "--every", 3)
     with closing(sqlite3.connect(path)) as database:  # as a disk that is full after two more
         database.execute(
             "CREATE TRIGGER stop BEFORE INSERT ON frames "
             "WHEN (SELECT count(*) FROM frames) = 3 BEGIN SELECT RAISE(ABORT, 'full'); END"
         )
-    said = sceneprint("spool", "add", path, rooms, expect=2)
+    said = sceneprint("spool", path, rooms, expect=2)
     counts = "6 frames: 2 added, 1 already there, 0 refused, 3 not added"
     assert said.stdout == f"{counts}; 3 wait, 0 thinned\n"
     assert "The disk has no room for the spool" in said.stderr
@@ -40,23 +40,23 @@ def test_frames_are_spooled_and_uploaded(
     sceneprint: Callable[..., Any], service_url: str, rooms: Path, tmp_path: Path
 ) -> None:
     spool, bare = tmp_path / "robot.spool", tmp_path / "bare"
-    said = sceneprint("spool", "status", spool, expect=2)
+    said = sceneprint("spool", spool, expect=2)
     assert "There is no spool here" in said.stderr
     assert not spool.exists()
-    added = sceneprint("spool", "add", spool, rooms, "--robot", "cart", "--most-bytes", 10**8)
+    added = sceneprint("spool", spool, rooms, "--robot", "cart", "--most-bytes", 10**8)
     assert added.stdout == ("6 frames: 6 added, 0 already there, 0 refused; 6 wait, 0 thinned\n")
-    again = sceneprint("spool", "add", spool, rooms / "room-0", "--robot", "cart")
+    again = sceneprint("spool", spool, rooms / "room-0", "--robot", "cart")
     assert again.stdout == ("3 frames: 0 added, 3 already there, 0 refused; 6 wait, 0 thinned\n")
     bare.mkdir()
     (bare / "clouds.json").write_text("{}")
     (bare / "broken.ply").write_bytes(b"ply\nno cloud")
-    sceneprint("spool", "add", spool, bare)
-    said = sceneprint("spool", "sync", spool, "spool-nowhere", expect=2)
+    sceneprint("spool", spool, bare)
+    said = sceneprint("spool", spool, "--to", "spool-nowhere", expect=2)
     assert said.stdout == "0 frames uploaded; 0 refused, 7 wait\n"
     assert "spool-nowhere" in said.stderr
     with Client(service_url) as client:
         client.create_map("spooled", model="depth")
-        said = sceneprint("spool", "sync", spool, "spooled", "--priority", 1, expect=2)
+        said = sceneprint("spool", spool, "--to", "spooled", "--priority", 1, expect=2)
         counts, summary = said.stdout.splitlines()
         assert counts == "6 frames uploaded; 1 refused, 0 wait"
         assert summary.startswith("poses of 6 of 7 frames; depth ")
@@ -65,14 +65,14 @@ def test_frames_are_spooled_and_uploaded(
     assert len(found) == 6
     assert {one.robot for one in found} == {"cart"}
     assert {one.pose.parent_frame for one in found if one.pose} == {"cart/room-0", "cart/room-1"}
-    lines = sceneprint("spool", "status", spool).stdout.splitlines()
+    lines = sceneprint("spool", spool).stdout.splitlines()
     assert lines[0] == "0 frames wait; 0.0 of 100.0 MB"
     assert lines[1] == "6 uploaded, 1 refused, 0 thinned, 0 refused and discarded"
     assert lines[2].startswith("  broken.ply: ")
-    told = json.loads(sceneprint("spool", "status", spool, "--json").stdout)
+    told = json.loads(sceneprint("spool", spool, "--json").stdout)
     assert (told["uploaded"], told["oldest"], told["bytes"]) == (6, None, 8192)
     assert told["refusals"][0]["name"] == "broken.ply"
-    said = sceneprint("spool", "sync", spool, "spooled", "--retry-refused", expect=2)
+    said = sceneprint("spool", spool, "--to", "spooled", "--retry-refused", expect=2)
     assert said.stdout.startswith("0 frames uploaded; 1 refused, 0 wait\nposes of 0 of 1 frames")
 
 

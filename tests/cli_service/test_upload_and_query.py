@@ -42,7 +42,7 @@ def house(service_url: str, rooms: Path) -> str:
         "valid", third,
     )  # fmt: skip
     assert fourth.startswith("the poses of map house are in 2 parent frames")
-    join = "`sceneprint associate house --session room-0/seq-01 --session room-1/seq-01`"
+    join = "`sceneprint make association house --session room-0/seq-01 --session room-1/seq-01`"
     assert join in fourth
     assert re.fullmatch(r"created map house with model depth-[0-9a-f]{12}", first)
     assert second.startswith(

@@ -108,7 +108,7 @@ def test_the_command(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     client, out = associated.client, tmp_path / "graph.g2o"
-    of = ["associate", MAP, "--url", service_url, "--session", "a"]
+    of = ["make", "association", MAP, "--url", service_url, "--session", "a"]
     assert main([*of, "--session", "b", "--out", str(out), "--odometry"]) == 0
     lines = capsys.readouterr().out.splitlines()
     newest = next(iter(client.products(Association, MAP)))
@@ -119,7 +119,7 @@ def test_the_command(
     )
     assert lines[-1] == f"wrote {out}"
     assert out.read_text() == client.graph(MAP, newest.job_id, odometry=True)
-    undo = ["associate", MAP, "--url", service_url, "--undo"]
+    undo = ["make", "association", MAP, "--url", service_url, "--undo"]
     assert main([*undo, newest.job_id]) == 0
     assert capsys.readouterr().out.splitlines() == lines[:-1]  # it moved no pose
     assert main([*undo, "0" * 32]) == 2

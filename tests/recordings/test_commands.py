@@ -178,7 +178,7 @@ def test_each_bag_of_a_folder_is_a_session(sceneprint: Run, bags: Path, service_
     assert json.loads(done.stdout)["name"] == "day2/second/000002"
     done = sceneprint("localize", "days", bags, *options, "--frame", 0)
     assert done.stdout.startswith("first/000000: found")
-    done = sceneprint("bag", "info", bags, *options)
+    done = sceneprint("bag", bags, *options)
     assert done.stdout.count(" frames of /camera/depth/image_raw taken, poses of ") == 2
 
 
@@ -218,7 +218,7 @@ def test_bags_beside_other_frames_are_an_error(
 
 
 def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
-    done = sceneprint("bag", "info", recording, "--keyframe-m", 0)
+    done = sceneprint("bag", recording, "--keyframe-m", 0)
     head, *lines = done.stdout.splitlines()
     assert head == f"{recording}: ROS 2, 25 messages of 4 topics, 1.4 s from 2023-11-14T22:13:20Z"
     table = [re.sub(" +", " ", line.strip()) for line in lines]
@@ -242,7 +242,7 @@ def test_a_bag_of_which_nothing_would_be_taken(
     sceneprint: Run, tmp_path: Path, ros: SimpleNamespace
 ) -> None:
     path = ros.write(tmp_path, lambda writer: writer.imu(0.0, (0, 0, 9.8)), "ros1")
-    done = sceneprint("bag", "info", path, expect=1)
+    done = sceneprint("bag", path, expect=1)
     assert "ROS 1, 1 messages of 1 topics" in done.stdout
     assert "nothing would be taken: " in done.stdout
     done = sceneprint("upload", "none", path, expect=2)
@@ -252,14 +252,14 @@ def test_a_bag_of_which_nothing_would_be_taken(
 
 def test_files_that_are_no_bags(sceneprint: Run, tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(b"no bag")
-    done = sceneprint("bag", "info", tmp_path / "a.mcap", expect=2)
+    done = sceneprint("bag", tmp_path / "a.mcap", expect=2)
     assert re.fullmatch(
         r"sceneprint bag: .*a\.mcap: The recording cannot be read \(File magic is invalid\.\)\. If "
         r"the recorder was stopped before it closed the file, run `mcap recover`; else copy it "
         r"again\.\n",
         done.stderr,
     )
-    done = sceneprint("bag", "info", tmp_path / "gone.mcap", expect=2)
+    done = sceneprint("bag", tmp_path / "gone.mcap", expect=2)
     assert "There is no such file or folder" in done.stderr
 
 
@@ -283,7 +283,7 @@ def test_a_client_is_told_that_a_bag_is_no_frame(service_url: str, recording: Pa
 def test_options_that_are_none(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for given in ("-1", "nan", "x"):
         with pytest.raises(SystemExit):
-            main(["bag", "info", str(recording), "--keyframe-m", given])
+            main(["bag", str(recording), "--keyframe-m", given])
         assert "is not a number from 0 up" in capsys.readouterr().err
 
 

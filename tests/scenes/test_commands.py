@@ -139,7 +139,9 @@ def test_joined_sessions_are_shown_in_one_space(
 ) -> None:
     mcap = tmp_path / "a.mcap"
     how = ("--json", "--mcap", mcap)
-    said = sceneprint("associate", "halves", "--session", "even", "--session", "odd", *how)
+    said = sceneprint(
+        "make", "association", "halves", "--session", "even", "--session", "odd", *how
+    )
     told = json.loads(said.stdout)
     assert told["result"]["joins"][0]["transform"] is not None
     rows = mcap_rows(mcap)

@@ -12,11 +12,12 @@ import pytest
 
 import sceneprint_client
 from sceneprint import errors
-from sceneprint.cli import all_commands
+from sceneprint.cli import all_commands, parser
+from sceneprint.cli.completion import subcommands
 from sceneprint_client import Client
 from service.problems import type_of as problem_type
 from tools.site import http_pages
-from tools.site.code_pages import commands, metric_families
+from tools.site.code_pages import metric_families
 from tools.site.error_page import kinds, remedy, status
 from tools.site.markup import cell
 from tools.site.reference import GeneratedPage, api_document, generated_pages
@@ -123,8 +124,11 @@ def test_every_metric_is_listed_with_its_labels(pages: dict[str, GeneratedPage])
 
 def test_every_command_is_described_with_all_its_options(pages: dict[str, GeneratedPage]) -> None:
     found = sections(pages["reference/commands.md"].text)
-    assert list(found) == list(commands()) == list(all_commands())
-    for name, command in commands().items():
+    parsers = {name: one for name, _, one in subcommands(parser())}
+    assert list(found) == list(parsers)
+    assert [name for name in found if " " not in name] == list(all_commands())
+    assert {"make association", "make mesh"} < found.keys()
+    for name, command in parsers.items():
         cells = [row[0] for row in rows(found[name])]
         for option in command._actions:
             if option.help == argparse.SUPPRESS or "--help" in option.option_strings:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from prometheus_client.metrics import MetricWrapperBase
 
 from sceneprint.cli import COMMANDS, parser
+from sceneprint.cli.completion import subcommands
 from service.metrics import Metrics
 from tools.site.markup import cell, code, fenced, page, plain, table
 
@@ -60,28 +61,22 @@ def metrics_page() -> str:
     )
 
 
-def commands() -> dict[str, argparse.ArgumentParser]:
-    """The parser of each command of `sceneprint`, in the order of its help."""
-    (found,) = (one for one in parser()._actions if isinstance(one, argparse._SubParsersAction))
-    return dict(found.choices)
-
-
 def commands_page() -> str:
     """Markdown that describes every command with its options."""
-    found = commands()
-    (listed,) = (one for one in parser()._actions if isinstance(one, argparse._SubParsersAction))
-    added = ", ".join(f"`{name}`" for name in found if name not in COMMANDS)
-    shorts = {one.dest: one.help or "" for one in listed._choices_actions}
+    found = {name: (line, one) for name, line, one in subcommands(parser())}
+    own = [name for name in found if " " not in name]
+    added = ", ".join(f"`{name}`" for name in own if name not in COMMANDS)
     return page(
         "# Command line",
-        f"The {len(found)} commands of `sceneprint`. `sceneprint COMMAND --help` prints the same. "
+        f"The {len(own)} commands of `sceneprint`. `sceneprint COMMAND --help` prints the same. "
         f"`sceneprint-lab` adds {added}.",
         table(
             ("command", "what it does"),
-            ((f"[`{name}`](#{name})", cell(shorts[name])) for name in found),
+            ((f"[`{name}`](#{name.replace(' ', '-')})", cell(line))
+             for name, (line, _) in found.items()),
         ),
-        *(_command(name, one) for name, one in found.items()),
-    )
+        *(_command(name, one) for name, (_, one) in found.items()),
+    )  # fmt: skip
 
 
 def _command(name: str, one: argparse.ArgumentParser) -> str:

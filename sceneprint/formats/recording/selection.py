@@ -1,7 +1,7 @@
 """What of a bag becomes frames: which of the messages, at which poses.
 
 path, RecordingOptions  --recording_sequences-->  FrameSequence of each part
-Bag  --bag_outline-->  BagOutline: what would be taken, for `sceneprint bag info`
+Bag  --bag_outline-->  BagOutline: what would be taken, for `sceneprint bag`
 stamps, poses  --keyframes-->  places of those far enough from the last, or long enough after it
 """
 

@@ -210,7 +210,7 @@ def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
         if not named:
             raise DatasetError(
                 f"{bag.path}: There is no topic {wanted!r:.100}. Choose one of "
-                f"{listed(one.topic for one in candidates)}; `sceneprint bag info` lists all."
+                f"{listed(one.topic for one in candidates)}; `sceneprint bag` lists all."
             )
         found = next((one for one in candidates if one.topic.name == wanted), None)
         if found is None and named[0].type in (IMAGE, COMPRESSED, POINTS):
@@ -225,7 +225,7 @@ def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
     if not candidates:
         raise DatasetError(
             f"{bag.path}: There is no topic of depth images ({_READ}) or of points (PointCloud2). "
-            f"Images are {_encodings(bag)}. `sceneprint bag info` lists all topics."
+            f"Images are {_encodings(bag)}. `sceneprint bag` lists all topics."
         )
     if len(candidates) > 1:
         raise DatasetError(

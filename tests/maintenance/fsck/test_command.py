@@ -100,7 +100,7 @@ def test_what_is_not_there_is_not_made(
     typo, out = tmp_path / "typo", tmp_path / "out"
     shutil.rmtree(house.data / "blobs")
     for command in (
-        ["purge", "--data", typo],
+        ["fsck", "--purge", "--data", typo],
         ["reencode", "hall", "--status", "--data", typo],
         ["snapshot", "--data", house.data, "--to", out],
     )[0 if house.is_sqlite else 2 :]:

@@ -1,0 +1,57 @@
+"""`sceneprint completion`: a script that completes commands and options in a shell."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+from sceneprint.cli import parser
+
+_SCRIPT = """\
+_sceneprint() {{
+    local words="{commands}"
+    [ "$COMP_CWORD" -gt 1 ] && case "${{COMP_WORDS[1]}} ${{COMP_WORDS[2]}} " in
+{cases}
+    *) words= ;;
+    esac
+    COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o default -F _sceneprint sceneprint"""
+
+
+def add_completion(command: argparse.ArgumentParser) -> None:
+    """Add the options of `sceneprint completion`."""
+    command.add_argument("shell", choices=("bash", "zsh"))
+    command.set_defaults(run=run_completion)
+
+
+def run_completion(options: argparse.Namespace) -> int:
+    """Print a script that completes commands and options. Put `source <(sceneprint completion
+    bash)` into ~/.bashrc, or the same with zsh into ~/.zshrc.
+    """
+    found = [(name, one) for name, _, one in subcommands(parser())]
+    # the kinds of a command come before the command, whose pattern they match as well
+    cases = [f'    "{name} "*) words="{" ".join(_words(one))}" ;;' for name, one in found[::-1]]
+    commands = " ".join(name for name, _ in found if " " not in name)
+    if options.shell == "zsh":
+        print("autoload -U +X compinit bashcompinit && compinit && bashcompinit")
+    print(_SCRIPT.format(commands=commands, cases="\n".join(cases)))
+    return 0
+
+
+def subcommands(
+    above: argparse.ArgumentParser,
+) -> Iterator[tuple[str, str, argparse.ArgumentParser]]:
+    """Yield the name, the line of help and the parser of each command, and of its kinds."""
+    for action in above._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            lines = {one.dest: one.help or "" for one in action._choices_actions}
+            for name, one in action.choices.items():
+                yield one.prog.removeprefix("sceneprint "), lines[name], one
+                yield from subcommands(one)
+
+
+def _words(one: argparse.ArgumentParser) -> Iterator[str]:
+    """Yield the options and the fixed values of a command."""
+    for action in one._actions:
+        yield from action.option_strings or map(str, action.choices or ())

@@ -1,0 +1,101 @@
+"""What commands print: single lines, tables or JSON, and progress bars."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from sceneprint_client.api.admin import Stats
+
+Row = TypeVar("Row", bound="BaseModel")
+
+
+def one_line(text: str) -> str:
+    """Return a text without line breaks and escapes."""
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
+def percent(confidence: float) -> str:
+    """Return a confidence for people, rounded down, so that none looks better than it is."""
+    return f"{math.floor(1000 * min(confidence, 0.999)) / 10:.1f} %"
+
+
+def count_of(number: int, noun: str) -> str:
+    """Return a number with its noun, such as `1 frame` or `2 frames`."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def frame_label(frame_id: str, name: str | None) -> str:
+    """Return the id of a frame and the name of its file."""
+    return one_line(frame_id if name is None else f"{frame_id} ({name})")
+
+
+def source_label(record: Any) -> str:
+    """Return the robot and the session of a record."""
+    return one_line(f"{record.robot or '-'}/{record.session or '-'}")
+
+
+def print_rows(
+    rows: Iterable[Row], line: Callable[[Row], str], *, header: str, none: str, as_json: bool
+) -> None:
+    """Print records as they come: as a table, or each as a line of JSON.
+
+    Parameters
+    ----------
+    rows : of one kind
+    line : returns the line of a record in the table
+    header : first line of the table
+    none : text in place of a table without rows
+    as_json : whether to print JSON
+    """
+    empty = True
+    for row in rows:
+        if empty and not as_json:
+            print(header)
+        empty = False
+        print(row.model_dump_json() if as_json else line(row).rstrip())
+    if empty and not as_json:
+        print(none)
+
+
+def print_error(text: str) -> None:
+    """Print a text on standard error."""
+    print(text, file=sys.stderr)
+
+
+@contextmanager
+def progress_bar(
+    name: str, unit: str = "frame", **options: Any
+) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar on a terminal; yield a function that takes the finished steps and their number."""
+    from tqdm import tqdm
+
+    with tqdm(desc=name, unit=unit, disable=None, **options) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield progress
+
+
+def waiting_reason(stats: Stats | None, own: int = 0) -> str:
+    """Return why jobs wait, and what to do.
+
+    Parameters
+    ----------
+    stats : statistics of the whole service; None if the key may not see them
+    own : number of the caller's jobs that wait for a worker; those of others are ahead of them
+    """
+    if stats is None or not stats.workers:
+        return "Check that workers are running; `sceneprint work` starts some."
+    busy = sum(worker.job_id is not None for worker in stats.workers)
+    ahead = max(stats.waiting - own, 0)
+    of = count_of(len(stats.workers), "worker")
+    return f"{busy} of {of} busy, {count_of(ahead, 'job')} ahead."
