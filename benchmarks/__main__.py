@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import platform
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,12 +18,7 @@ from tempfile import TemporaryDirectory
 from tqdm import tqdm
 
 from benchmarks import dashboard, encode, readiness, registration, scan, search, service
-from benchmarks.machine import (
-    describe_machine,
-    measured_on,
-    pin_to_one_processor,
-    seconds_to_import,
-)
+from benchmarks.machine import measured_on, memory_gib, seconds_to_import, version_of
 from benchmarks.pairs import real_pairs, synthetic_pairs
 from sceneprint.formats.dataset import FrameReference, find_sequences
 from sceneprint.models import PRESETS
@@ -32,90 +28,90 @@ from sceneprint_lab.cli.demo import write_building
 from sceneprint_lab.synth import synthesise_room
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Folder of real recordings, which need not be there.
+#: Folder of real recordings. Synthetic rooms replace those that are missing.
 RECORDINGS = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
+
+
+def thin(frames: list[FrameReference], most: int) -> list[FrameReference]:
+    """Return at most so many frames, evenly spread."""
+    return frames[:: max(len(frames) // most, 1)][:most]
 
 
 def frames_to_sign(n: int) -> list[DepthFrame]:
     """Return `n` frames spread over the recordings, or of synthetic rooms."""
     scenes = [RECORDINGS / name for name in ("7scenes", "tum", "sun3d")]
-    found = [
-        frame
-        for scene in scenes
-        if scene.is_dir()
-        for sequence in find_sequences(scene)
-        for frame in sequence.frames
-    ]
-    if found:
-        return [frame.read_depth() for frame in found[:: max(len(found) // n, 1)][:n]]
+    sequences = [one for scene in scenes if scene.is_dir() for one in find_sequences(scene)]
+    if sequences:
+        every = [frame for sequence in sequences for frame in sequence.frames]
+        return [frame.read_depth() for frame in thin(every, n)]
     rooms = tqdm(range((n + 4) // 5), desc="synthetic rooms", disable=None)
     return [frame for i in rooms for frame in synthesise_room(3, i, 5).frames][:n]
 
 
 @contextmanager
-def frames_to_serve(dataset: Path, most: int = 320) -> Iterator[list[FrameReference]]:
-    """Yield frames of a data set, evenly thinned, or of a synthetic building."""
+def frames_to_serve(dataset: Path) -> Iterator[list[FrameReference]]:
+    """Yield up to 320 frames of a data set, or of a synthetic building if it does not exist."""
     with TemporaryDirectory(prefix="sceneprint-bench-") as temporary:
         if not dataset.is_dir():
             dataset = Path(temporary) / "building"
             for _ in tqdm(write_building(dataset, 6), "synthetic rooms", 6, disable=None):
                 pass
-        found = [frame for sequence in find_sequences(dataset) for frame in sequence.frames]
-        yield found[:: max(len(found) // most, 1)][:most]
+        yield thin([frame for run in find_sequences(dataset) for frame in run.frames], 320)
 
 
 def parts(options: argparse.Namespace) -> dict[str, Callable[[], list[str]]]:
-    """Return what measures each part. Those behind `service` run on one processor."""
+    """Return what measures each part. From `signing` on, all run on one processor."""
 
-    def served(measure: Callable[[list[FrameReference]], list[str]]) -> list[str]:
+    def serve(measure: Callable[[list[FrameReference]], list[str]]) -> list[str]:
         with frames_to_serve(options.dataset) as frames:
             return measure(frames)
 
-    def registered() -> list[str]:
+    def register() -> list[str]:
         pairs = real_pairs(RECORDINGS, options.pairs) or synthetic_pairs(options.pairs)
         return registration.measure(pairs, open_signer(PRESETS[0]).model)
 
-    def encoded() -> list[str]:
+    def sign() -> list[str]:
         frames = frames_to_sign(options.frames)
         return [line for one in PRESETS for line in encode.measure(frames, one)]
 
     return {
         "dashboard": dashboard.measure,
-        "readiness": lambda: served(lambda some: readiness.measure(some[0], some[1:201])),
-        "disk": lambda: served(lambda some: readiness.measure_disk(some[:40])),
-        "service": lambda: served(lambda some: service.measure(some, options.map_frames)),
-        "signing": encoded,
-        "registration": registered,
+        "readiness": lambda: serve(lambda some: readiness.measure(some[0], some[1:201])),
+        "disk": lambda: serve(lambda some: readiness.measure_disk(some[:40])),
+        "service": lambda: serve(lambda some: service.measure(some, options.map_frames)),
+        "signing": sign,
+        "registration": register,
         "scan": lambda: [line for size in scan.SCANNED for line in scan.measure(*size)],
         "search": search.table,
     }
 
 
 def main() -> int:
-    """Measure, and print."""
+    """Measure the parts, and print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", nargs="+", metavar="PART", help="parts to measure")
     parser.add_argument("--dataset", type=Path, default=RECORDINGS / "7scenes" / "redkitchen",
-                        help="of what a service is asked")  # fmt: skip
-    parser.add_argument("--frames", type=int, default=50, help="that are signed")
-    parser.add_argument("--pairs", type=int, default=20, help="that are registered")
-    parser.add_argument("--map-frames", type=int, default=0, help="of the served map, with random")
+                        help="frames for a service")  # fmt: skip
+    parser.add_argument("--frames", type=int, default=50, help="number of frames to sign")
+    parser.add_argument("--pairs", type=int, default=20, help="number of pairs to register")
+    parser.add_argument("--map-frames", type=int, default=0,
+                        help="fill the map of the service up to this number")  # fmt: skip
     options = parser.parse_args()
     every = parts(options)
     if unknown := set(options.only or ()) - set(every):
         parser.error(f"--only {min(unknown)}: choose from {', '.join(every)}")
-    machine = describe_machine()
-    packages = ", ".join(f"{name} {number}" for name, number in machine.packages.items())
+    packages = ", ".join(f"{name} {version_of(name)}" for name in ("numpy", "numba", "open3d"))
     lines = [
-        f"{measured_on('`make bench`')} {machine.memory_gib} GiB; Python {machine.python}, "
-        f"{packages}. The machine is shared: compare ratios, not milliseconds.",
+        f"{measured_on('`make bench`')} {memory_gib():.1f} GiB; Python "
+        f"{platform.python_version()}, {packages}. The machine is shared: compare ratios, not "
+        "milliseconds.",
         "",
     ]
     for name, measure in every.items():
         if name == "signing":
-            pin_to_one_processor()
+            os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
         if options.only is None or name in options.only:
             lines += measure()
     lines.append(f"`import sceneprint`: {seconds_to_import():.2f} s.")

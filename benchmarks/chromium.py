@@ -1,12 +1,13 @@
-"""A Chromium without a window, for what looks at the dashboard as a person would."""
+"""Drive a Chromium without a window, as a person would use the dashboard."""
 
 from __future__ import annotations
 
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+from benchmarks.waiting import until as until_true
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -16,9 +17,7 @@ FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-#: Seconds that a page may take to come.
-PATIENCE_S = 120.0
-#: Notes when the main part of the page was last there, by the clock that begins with the page.
+#: Notes when the main part of the page was last ready, by the clock that starts with the page.
 _WATCH = """new MutationObserver(() => {
   const main = document.getElementById("main");
   window.settledAt = main?.getAttribute("aria-busy") === "false" ? performance.now() : undefined;
@@ -26,13 +25,13 @@ _WATCH = """new MutationObserver(() => {
 
 
 def installed() -> str | None:
-    """Path of a Chromium; None where there is none."""
+    """Return the path of a Chromium, or None."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 @contextmanager
 def chromium(path: str) -> Iterator[Browser]:
-    """A browser; it is gone when this ends."""
+    """Run a browser until the context ends."""
     from playwright.sync_api import sync_playwright  # of the extra `dev`
 
     with sync_playwright() as playwright:
@@ -44,30 +43,24 @@ def chromium(path: str) -> Iterator[Browser]:
 
 
 def watched(page: Page) -> Page:
-    """A page that notes when it has settled: `settled` tells."""
+    """Let a page note when it has settled, for `settled`."""
     page.add_init_script(_WATCH)
     return page
 
 
 def settled(page: Page) -> float:
-    """Milliseconds from the beginning of a page until its main part was there."""
+    """Return the milliseconds from the start of a page until its main part was ready."""
     return float(until(page, "window.settledAt"))
 
 
 def until(page: Page, expression: str) -> Any:
-    """The first value of an expression that is neither null nor false.
+    """Return the first value of an expression that is neither null nor false.
 
-    Asked for again and again from here: what Playwright has for it evaluates in the page, which
-    the dashboard's policy forbids.
+    Playwright's own wait evaluates in the page, which the policy of the dashboard forbids.
     """
-    return _until(lambda: page.evaluate(expression), expression)
 
+    def values() -> list[Any]:
+        value = page.evaluate(expression)
+        return [] if value is None or value is False else [value]
 
-def _until(ask: Callable[[], Any], what: str) -> Any:
-    end = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end:
-        found = ask()
-        if found is not None and found is not False:
-            return found
-        time.sleep(0.02)
-    raise TimeoutError(f"{what} did not come true within {PATIENCE_S:g} s")
+    return until_true(values)[0]

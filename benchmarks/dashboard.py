@@ -128,12 +128,9 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
         *lines,
         f"Without a window or a graphics card (SwiftShader), cache empty, median of {runs}; "
         "service and browser share the processors.",
-        "",
-        "| | measured | bound |",
-        "|---|--:|--:|",
-        *(f"| {what} | {value} | {aim} |" for what, (value, aim) in rows.items()),
-        "",
-    ]
+        "", "| | measured | bound |", "|---|--:|--:|",
+        *(f"| {what} | {value} | {aim} |" for what, (value, aim) in rows.items()), "",
+    ]  # fmt: skip
 
 
 def _overlay(client: httpx.Client, views: list[Shot]) -> str:

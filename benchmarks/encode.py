@@ -103,15 +103,11 @@ def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list
     sums, other = [sum(row.values()) for row in ours], [sum(row.values()) for row in theirs]
     signing = [sum(row.values()) - row["artifact from bytes"] for row, _ in artifacts]
     lines = [
-        f"### Signing, `{preset}`: median of {len(frames)} frames, one thread, warm",
-        "",
-        "| stage | ms |",
-        "|---|--:|",
-        *stage_rows(ours),
+        f"### Signing, `{preset}`: median of {len(frames)} frames, one thread, warm", "",
+        "| stage | ms |", "|---|--:|", *stage_rows(ours),
         f"| **signing, sum** | **{np.median(sums):.1f}** |",
-        *stage_rows([row for row, _ in artifacts]),
-        *stage_rows(theirs),
-    ]
+        *stage_rows([row for row, _ in artifacts]), *stage_rows(theirs),
+    ]  # fmt: skip
     if other:
         whole = np.add(sums, signing)
         lines += [

@@ -50,7 +50,7 @@ class Library:
             self._poses.append(frame.pose)
 
     def ask(self, query: FrameReference) -> tuple[dict[str, float], Matches]:
-        """Milliseconds of each stage, and the accepted matches."""
+        """Return milliseconds of each stage, and the accepted matches."""
         clock = Clock()
         frame = clock.run("decode", query.read)
         signature, seen = clock.run("sign, with geometry", lambda: prepare(frame, self._signer))
@@ -87,7 +87,7 @@ class Library:
 
 
 def accepted(answer: Answer, names: Mapping[str, int]) -> Matches:
-    """The accepted matches of a service's answer, in the terms of `Library.ask`."""
+    """Return the accepted matches of a service's answer, in the terms of `Library.ask`."""
     return [
         (names[match.frame_id], match.transform.matrix)
         for match in answer.matches
@@ -96,7 +96,7 @@ def accepted(answer: Answer, names: Mapping[str, int]) -> Matches:
 
 
 def are_same(some: Matches, others: Matches) -> bool:
-    """Whether matches are the same to 0.01 mm.
+    """Return whether matches are the same to 0.01 mm.
 
     A service stores poses in other last bits. Where one lets a point more or less into the last
     step of a refinement, the transform moves by some micrometres.

@@ -1,67 +1,50 @@
-"""The machine a figure was measured on, and what a process costs there."""
+"""Describe the machine of a measurement, and read from /proc what processes cost there."""
 
 from __future__ import annotations
 
 import os
 import platform
+import re
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 
-@dataclass(frozen=True)
-class Machine:
-    """What a reader needs to compare figures with their own."""
-
-    processor: str
-    cores: int
-    memory_gib: float
-    python: str
-    packages: dict[str, str]
-
-
-def describe_machine() -> Machine:
-    """This machine, as its kernel describes it."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    packages = {}
-    for name in ("numpy", "numba", "open3d"):
-        try:
-            packages[name] = version(name)
-        except PackageNotFoundError:
-            packages[name] = "absent"
-    model = [
-        line.split(":", 1)[1].strip()
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if line.startswith("model name")
-    ]
-    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return Machine(
-        processor=model[0] if model else platform.machine(),
-        cores=os.cpu_count() or 1,
-        memory_gib=round(pages / 2**30, 1),
-        python=platform.python_version(),
-        packages=packages,
-    )
+def version_of(package: str) -> str:
+    """Return the version of a package, or "absent"."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "absent"
 
 
 def measured_on(command: str) -> str:
     """Return a sentence that says when, where and by which command figures were measured."""
-    machine = describe_machine()
+    names = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
+    processor = names[0] if names else platform.machine()
     return (
-        f"Measured {datetime.now(UTC):%Y-%m-%d} on {machine.processor}, {machine.cores} "
-        f"processors; {command}."
+        f"Measured {datetime.now(UTC):%Y-%m-%d} on {processor}, {os.cpu_count()} processors; "
+        f"{command}."
     )
 
 
+def memory_gib() -> float:
+    """Return the memory of the machine, GiB."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / (1 << 30)
+
+
 def seconds_to_import(runs: int = 5) -> float:
-    """Median wall time that `import sceneprint` adds to an interpreter's start."""
+    """Return the median wall time that `import sceneprint` adds to an interpreter's start."""
 
     def start(code: str) -> float:
         begin = time.perf_counter()
@@ -72,12 +55,12 @@ def seconds_to_import(runs: int = 5) -> float:
 
 
 def peak_megabytes_of_signing(folder: Path, preset: str) -> float:
-    """Peak resident memory of a process that signs the frames of a folder, table mapped."""
+    """Return the peak resident memory of a process that signs the frames of a folder."""
     code = (
         "import sys\n"
         "from sceneprint.cli import main\n"
         f"main(['sign', sys.argv[1], '--preset', {preset!r}])\n"
-        # not ru_maxrss: that survives exec, and would be the peak of whoever started us
+        # ru_maxrss survives exec, and would be the peak of the parent
         "status = open('/proc/self/status').read()\n"
         "print(status.split('VmHWM:')[1].split()[0], file=sys.stderr)\n"
     )
@@ -87,45 +70,50 @@ def peak_megabytes_of_signing(folder: Path, preset: str) -> float:
     return int(done.stderr.split()[-1]) / 1024
 
 
-def pin_to_one_processor() -> int:
-    """Let this process, and every thread it starts, run on one processor only."""
-    cpu = max(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpu})
-    return cpu
+def read_process(pid: int, name: str) -> bytes:
+    """Return a file of a process under /proc, which is empty once the process has ended."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/{name}").read_bytes()
+    return b""
+
+
+def running_processes() -> Iterator[tuple[int, int, int]]:
+    """Yield the number, group and parent of each process that runs."""
+    for path in Path("/proc").glob("[0-9]*"):
+        fields = read_process(int(path.name), "stat").rpartition(b")")[2].split()
+        if fields and fields[0] != b"Z":
+            yield int(path.name), int(fields[2]), int(fields[1])
+
+
+def peak_bytes(pid: int) -> int:
+    """Return the most memory that a process ever had."""
+    found = re.search(rb"^VmHWM:\s+(\d+) kB", read_process(pid, "status"), re.MULTILINE)
+    return 1024 * int(found[1]) if found else 0
 
 
 def own_bytes(process: Path) -> int:
-    """Memory that a process, by its folder under /proc, shares with no other."""
+    """Return the memory that a process, by its folder under /proc, shares with no other."""
     lines = (process / "smaps_rollup").read_text().splitlines()
     return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))
 
 
-def memory_of(folder: Path, command: str) -> int:
-    """Bytes that the processes of a command on a data folder have for themselves."""
-    return sum(_of_processes(folder, command, own_bytes))
+def processor_ns(process: Path) -> int:
+    """Return the processor time that a process and its running children have used."""
+    total = 0
+    for task in process.glob("task/*"):
+        total += int((task / "schedstat").read_text().split()[0])
+        for child in (task / "children").read_text().split():
+            with suppress(OSError):  # it has ended
+                total += processor_ns(Path("/proc") / child)
+    return total
 
 
-def processor_seconds(folder: Path, command: str) -> float:
-    """Processor time that the processes of a command on a data folder have used, in seconds.
-
-    That of processes which they have started and which still run counts as well.
-    """
-
-    def used(process: Path) -> int:
-        total = 0
-        for task in process.glob("task/*"):
-            total += int((task / "schedstat").read_text().split()[0])
-            for child in (task / "children").read_text().split():
-                with suppress(OSError):  # it ended meanwhile
-                    total += used(Path("/proc") / child)
-        return total
-
-    return 1e-9 * sum(_of_processes(folder, command, used))
-
-
-def _of_processes(folder: Path, command: str, figure: Callable[[Path], int]) -> Iterator[int]:
+def sum_over_processes(figure: Callable[[Path], int], data: Path, command: str) -> int:
+    """Return add up a figure of all processes that run a command on a data folder."""
+    total = 0
     for path in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):  # it ended meanwhile
+        with suppress(OSError):  # it has ended
             words = path.read_bytes().split(b"\0")
-            if str(folder).encode() in words and command.encode() in words:
-                yield figure(path.parent)
+            if str(data).encode() in words and command.encode() in words:
+                total += figure(path.parent)
+    return total

@@ -39,7 +39,7 @@ class FramePair:
 
 
 def pairs_among(frames: Sequence[DepthFrame], apart: int = 1) -> list[FramePair]:
-    """All pairs of a list of frames that overlap enough, `apart` places or more in the list."""
+    """Return all pairs of frames that overlap enough, and are `apart` places or more apart."""
     views, found = [view_of(frame) for frame in frames], []
     for i, query in enumerate(frames):
         for j, match in enumerate(frames[: max(i + 1 - apart, 0)]):
@@ -53,7 +53,7 @@ def pairs_among(frames: Sequence[DepthFrame], apart: int = 1) -> list[FramePair]
 
 
 def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
-    """`n` pairs spread over the first 7-Scenes sequence, none closer than two steps; or none."""
+    """Return `n` pairs of the first 7-Scenes sequence, two steps or more apart, or none."""
     scenes = recordings / "7scenes"
     if not scenes.is_dir():
         return []
@@ -62,7 +62,7 @@ def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
 
 
 def synthetic_pairs(n: int) -> list[FramePair]:
-    """`n` pairs of views of synthetic rooms, a few of each room."""
+    """Return `n` pairs of views of synthetic rooms, a few of each room."""
     found: list[FramePair] = []
     number = 0
     while len(found) < n:

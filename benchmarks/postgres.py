@@ -12,42 +12,44 @@ import shutil
 import signal
 import socket
 import subprocess
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
-#: Below the ports that outgoing connections take, so that a server finds its own again.
+from benchmarks.machine import running_processes
+from benchmarks.waiting import until
+
+#: Below the ports of outgoing connections, so that a restarted server finds its port free.
 PORTS = range(15_000, 31_000)
-#: Seconds for a server to begin or to end, on a machine that is busy with much else.
+#: Seconds for a server to start or to end, on a machine that is busy with much else.
 PATIENCE_S = 90.0
-#: Small, and as patient as tests on few cores need.
+#: Settings of a small server that waits long for clients on few cores.
 OPTIONS = {
     "shared_buffers": "32MB", "max_connections": "200", "unix_socket_directories": "",
     "listen_addresses": "127.0.0.1", "jit": "off", "logging_collector": "off",
     "log_timezone": "UTC", "timezone": "UTC", "max_wal_size": "256MB",
-    # in its folder: nobody else would remove from /dev/shm what a killed one leaves
+    # in its folder: nothing else would remove from /dev/shm what a killed server leaves
     "dynamic_shared_memory_type": "mmap",
 }  # fmt: skip
-#: What a test need not wait for: a SIGKILL loses nothing that the kernel has.
+#: Tests need no durability beyond SIGKILL, which loses nothing that the kernel has.
 FORGETFUL = {"fsync": "off", "full_page_writes": "off"}
-#: Root may not run PostgreSQL: `nobody` does, who may read what root may. Without the last bit
+#: Root may not run PostgreSQL: `nobody` does, and may read what root may. Without the last bit
 #: access(2), by which PostgreSQL looks for its own files, would forget that.
 _AS_NOBODY = (
     "setpriv", "--reuid=65534", "--regid=65534", "--clear-groups",
     "--securebits=+no_setuid_fixup", "--inh-caps=+dac_override", "--ambient-caps=+dac_override",
 )  # fmt: skip
-#: Ends the server of that number when whoever holds the other end of its pipe is gone.
+#: Ends the server of that number when the process at the other end of its pipe has ended.
 _GUARD = 'read -r _; kill -QUIT "$1" 2>/dev/null'
 
 
 class NoServer(Exception):
-    """There is no PostgreSQL to run here, or it does not begin."""
+    """PostgreSQL is not installed, or does not start."""
 
 
 def binaries() -> Path:
-    """Folder of `postgres`, `initdb` and the others.
+    """Return the folder of `postgres`, `initdb` and the others.
 
     Raises
     ------
@@ -65,30 +67,27 @@ def binaries() -> Path:
 
 
 class Server:
-    """A PostgreSQL server of its own on 127.0.0.1; it ends with the process that started it.
+    """A PostgreSQL server on 127.0.0.1, which ends with the process that started it.
 
     Parameters
     ----------
-    folder : of its data and its log; made
-    port : a free one unless told
-    durable : whether a commit survives the power
+    folder : of its data and its log; created if it does not exist
+    port : default: a free one
+    durable : whether commits survive a power cut
     options : more settings of `postgres`
     """
 
     def __init__(
-        self,
-        folder: Path,
-        port: int | None = None,
-        *,
-        durable: bool = False,
+        self, folder: Path, port: int | None = None, *, durable: bool = False,
         options: Mapping[str, str] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.folder, self.port, self._bin = folder, port or _free_port(), binaries()
+        self.data, self.log = folder / "data", folder / "log"
         self._options = {**OPTIONS, **({} if durable else FORGETFUL), **(options or {})}
         self._process: subprocess.Popen[bytes] | None = None
         self._guard: subprocess.Popen[bytes] | None = None
         if not self.data.exists():
-            self._own(folder)
+            _create_folder(folder)
             self._run(
                 "initdb", "--pgdata", str(self.data), "--username=postgres", "--auth=trust",
                 "--encoding=UTF8", "--locale=C", "--no-instructions", "--no-sync",
@@ -96,26 +95,16 @@ class Server:
             )  # fmt: skip
 
     @property
-    def data(self) -> Path:
-        """Folder of its data."""
-        return self.folder / "data"
-
-    @property
-    def log(self) -> Path:
-        """File of what it has to say."""
-        return self.folder / "log"
-
-    @property
     def is_running(self) -> bool:
-        """Whether its first process is there."""
+        """Return whether its first process runs."""
         return self._process is not None and self._process.poll() is None
 
     def url(self, database: str = "postgres") -> str:
-        """URL of a database of it, as SQLAlchemy wants it."""
+        """Return the SQLAlchemy URL of a database."""
         return f"postgresql+psycopg://postgres@127.0.0.1:{self.port}/{database}"
 
     def start(self) -> None:
-        """Begin, and return when it answers.
+        """Start the server, and return when it answers.
 
         Raises
         ------
@@ -123,12 +112,12 @@ class Server:
         """
         if self.is_running:
             return
-        told = {**self._options, "port": str(self.port)}
+        settings = {**self._options, "port": str(self.port)}
         command = [*of_nobody(), str(self._bin / "postgres"), "-D", str(self.data)]
-        command += [part for item in told.items() for part in ("-c", "=".join(item))]
-        (self.data / "postmaster.pid").unlink(missing_ok=True)  # of one that was killed
+        command += [part for item in settings.items() for part in ("-c", "=".join(item))]
+        (self.data / "postmaster.pid").unlink(missing_ok=True)  # of a killed server
         with self.log.open("ab") as log:
-            # a session of its own: Ctrl-C is for who waits for the server
+            # in a session of its own: Ctrl-C is for the process that waits for the server
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=_environment(),
                 cwd="/", start_new_session=True,
@@ -137,20 +126,18 @@ class Server:
             ["sh", "-c", _GUARD, "guard", str(self._process.pid)],
             stdin=subprocess.PIPE, start_new_session=True, cwd="/",
         )  # fmt: skip
-        deadline = time.monotonic() + PATIENCE_S
-        while not self._answers():
-            if self._process.poll() is not None or time.monotonic() > deadline:
-                self.kill()
-                said = self.log.read_text(errors="replace")[-2000:]
-                raise NoServer(f"PostgreSQL in {self.folder} does not begin:\n{said}")
-            time.sleep(0.02)
+        with suppress(AssertionError):
+            until(lambda: self._answers() or not self.is_running, PATIENCE_S)
+        if not self._answers():
+            self.kill()
+            end = self.log.read_text(errors="replace")[-2000:]
+            raise NoServer(f"PostgreSQL in {self.folder} does not start:\n{end}")
 
     def stop(self, mode: str = "fast") -> None:
-        """End as an administrator would: "smart", "fast" or "immediate"."""
+        """Stop the server as an administrator would: "smart", "fast" or "immediate"."""
         if self._process is not None:
-            ways = {"smart": signal.SIGTERM, "fast": signal.SIGINT, "immediate": signal.SIGQUIT}
-            if self.is_running:
-                self._process.send_signal(ways[mode])
+            signals = {"smart": signal.SIGTERM, "fast": signal.SIGINT, "immediate": signal.SIGQUIT}
+            self._process.send_signal(signals[mode])
             try:
                 self._process.wait(PATIENCE_S)
             except subprocess.TimeoutExpired:
@@ -158,41 +145,40 @@ class Server:
         self._forget()
 
     def kill(self) -> None:
-        """SIGKILL all its processes at once, as if the machine had died."""
+        """Send SIGKILL to all its processes at once, as if the machine had died."""
         if self._process is not None and self.is_running:
-            # stopped first: it begins no other while its children are counted
+            # stopped first: it starts no other while its children are counted
             self._process.send_signal(signal.SIGSTOP)
-            children = _children(self._process.pid)
+            children = self._children()
             self._process.kill()
             for child in children:
                 with suppress(ProcessLookupError):
                     os.kill(child, signal.SIGKILL)
             self._process.wait(PATIENCE_S)
-            while any(map(_lives, children)):
-                time.sleep(0.01)
+            until(lambda: children.isdisjoint(pid for pid, _, _ in running_processes()), PATIENCE_S)
             self._remove_segment()
         self._forget()
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal to all its processes: first to the one that begins others."""
+        """Send a signal to all its processes: first to the one that starts others."""
         if self._process is not None and self.is_running:
             self._process.send_signal(number)
-            for child in _children(self._process.pid):
+            for child in self._children():
                 with suppress(ProcessLookupError):
                     os.kill(child, number)
 
     def create(self, database: str, template: str | None = None) -> str:
-        """Make a database, empty or a copy of one that nobody is connected to; its URL."""
+        """Create a database, empty or as a copy of one without connections; return its URL."""
         copied = "" if template is None else f' TEMPLATE "{template}"'
         self.execute(f'CREATE DATABASE "{database}"{copied}')
         return self.url(database)
 
     def drop(self, database: str) -> None:
-        """Remove a database, whoever is connected to it."""
+        """Remove a database, and end its connections."""
         self.execute(f'DROP DATABASE IF EXISTS "{database}" WITH (FORCE)')
 
     def execute(self, statement: str, database: str = "postgres") -> list[tuple[object, ...]]:
-        """Run one statement as its administrator, outside of a transaction; the rows."""
+        """Run one statement outside of a transaction as the administrator; return the rows."""
         import psycopg
 
         plain = self.url(database).replace("+psycopg", "")
@@ -201,22 +187,22 @@ class Server:
             return cursor.fetchall() if cursor.description else []
 
     def standby(self, folder: Path, *, synchronous: bool, port: int | None = None) -> Server:
-        """Another server that follows this one, started.
+        """Start another server that follows this one, and return it.
 
         Parameters
         ----------
-        folder : of it
-        synchronous : whether a commit here waits until it has it too
-        port : a free one unless told
+        folder : of the standby
+        synchronous : whether commits wait for the standby
+        port : default: a free one
         """
-        self._own(folder)
+        _create_folder(folder)
         self._run(
             "pg_basebackup", "--pgdata", str(folder / "data"), "--host=127.0.0.1",
             f"--port={self.port}", "--username=postgres", "--write-recovery-conf",
             "--checkpoint=fast", "--no-sync",
         )  # fmt: skip
-        with (folder / "data" / "postgresql.auto.conf").open("a") as told:
-            told.write("synchronous_standby_names = ''\n")  # who followed the other one
+        with (folder / "data" / "postgresql.auto.conf").open("a") as conf:
+            conf.write("synchronous_standby_names = ''\n")  # the copy has those of this server
         name = f"standby{os.urandom(4).hex()}"
         follower = Server(
             folder, port, durable="fsync" not in self._options,
@@ -224,33 +210,34 @@ class Server:
         )  # fmt: skip
         follower.start()
         if synchronous:
-            # set after the copy was made: once promoted, it waits for nobody
+            # set after the copy: a promoted standby waits for nobody
             self.execute(f"ALTER SYSTEM SET synchronous_standby_names = '{name}'")
             self.execute("SELECT pg_reload_conf()")
-        state = "sync" if synchronous else "async"
-        deadline = time.monotonic() + PATIENCE_S
-        while (name, "streaming", state) not in self.execute(
-            "SELECT application_name, state, sync_state FROM pg_stat_replication"
-        ):
-            if time.monotonic() > deadline:
-                follower.kill()
-                raise NoServer(f"the standby in {folder} does not follow")
-            time.sleep(0.05)
+        wanted = (name, "streaming", "sync" if synchronous else "async")
+        asked = "SELECT application_name, state, sync_state FROM pg_stat_replication"
+        try:
+            until(lambda: wanted in self.execute(asked), PATIENCE_S, 0.05)
+        except AssertionError:
+            follower.kill()
+            raise NoServer(f"the standby in {folder} does not follow") from None
         return follower
 
     def promote(self) -> None:
-        """Let a standby be a primary; returns when it is."""
+        """Make a standby a primary, and return when it is one."""
         self.execute(f"SELECT pg_promote(true, {int(PATIENCE_S)})")
 
     def _answers(self) -> bool:
-        try:
+        with suppress(OSError, IndexError):
             lines = (self.data / "postmaster.pid").read_text().splitlines()
-        except OSError:
-            return False
-        return len(lines) >= 8 and lines[7].strip() == "ready"
+            return lines[7].strip() == "ready"
+        return False
+
+    def _children(self) -> set[int]:
+        assert self._process is not None
+        return {pid for pid, _, parent in running_processes() if parent == self._process.pid}
 
     def _remove_segment(self) -> None:
-        """What marks that a server has this folder, and outlives it; there are only so many."""
+        """Remove the shared memory that marks the folder as used: it outlives a killed server."""
         with suppress(OSError, IndexError, ValueError):
             line = (self.data / "postmaster.pid").read_text().splitlines()[6]
             ctypes.CDLL(None).shmctl(int(line.split()[1]), 0, None)  # IPC_RMID
@@ -258,14 +245,9 @@ class Server:
     def _forget(self) -> None:
         self._process = None
         if self._guard is not None:
-            self._guard.kill()  # before its pipe ends: the number may be another's by then
+            self._guard.kill()  # before its pipe ends: another process may have the number then
             self._guard.communicate()
             self._guard = None
-
-    def _own(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.geteuid() == 0:
-            os.chown(folder, 65534, 65534)
 
     def _run(self, name: str, *arguments: str) -> None:
         done = subprocess.run(
@@ -277,41 +259,25 @@ class Server:
 
 
 def of_nobody() -> tuple[str, ...]:
-    """What a command begins with that root may not run: PostgreSQL's, for one."""
+    """Return the words before a command that root may not run, such as PostgreSQL's."""
     return _AS_NOBODY if os.geteuid() == 0 else ()
 
 
+def _create_folder(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if os.geteuid() == 0:
+        os.chown(folder, 65534, 65534)
+
+
 def _environment() -> dict[str, str]:
-    """Without what would lead `pg_basebackup` elsewhere."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("PG", "LC_", "LANG"))}
-    return {**kept, "LC_ALL": "C"}
+    """Return the environment without variables that change where `pg_basebackup` connects."""
+    plain = {k: v for k, v in os.environ.items() if not k.startswith(("PG", "LC_", "LANG"))}
+    return {**plain, "LC_ALL": "C"}
 
 
 def _free_port() -> int:
     while True:
         port = random.choice(PORTS)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-        return port
-
-
-def _children(parent: int) -> list[int]:
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:  # it ended meanwhile
-            continue
-        if int(fields[1]) == parent:
-            found.append(int(path.parent.name))
-    return found
-
-
-def _lives(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.indexed_frames import fill
-from benchmarks.machine import memory_of
+from benchmarks.machine import own_bytes, sum_over_processes
 from benchmarks.search import signatures
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import FrameReference
@@ -59,20 +59,16 @@ def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[st
         signed = {n: _sign(Path(folder) / f"by-{n}", to_sign, n) for n in (1, 2)}
     length = read_model("depth").signature_bytes
     return [
-        f"### A service with {FRAMES:,} frames of {length:,} bytes starts",
-        "",
-        "| | s, MB |",
-        "|---|--:|",
-        f"| until it answers | {ready:.1f} |",
+        f"### A service with {FRAMES:,} frames of {length:,} bytes starts", "", "| | s, MB |",
+        "|---|--:|", f"| until it answers | {ready:.1f} |",
         f"| until the first query is answered | {first:.1f} |",
         f"| the same with its index deleted, from the database, exactly | {bare:.1f} |",
         f"| its own memory then | {memory:.0f} |",
-        f"| the same without its index | {bare_memory:.0f} |",
-        "",
+        f"| the same without its index | {bare_memory:.0f} |", "",
         f"One worker signs {signed[1]:.1f} frames a second, two {signed[2]:.1f}: "
         f"**{signed[2] / signed[1]:.2f}** times as many.",
         "",
-    ]
+    ]  # fmt: skip
 
 
 def _start(data: Path, frame: FrameReference) -> tuple[float, float, float]:
@@ -84,7 +80,7 @@ def _start(data: Path, frame: FrameReference) -> tuple[float, float, float]:
         ready = time.perf_counter() - begun
         client.query(MAP, frame, stages=("retrieve",))
         first = time.perf_counter() - begun
-        return ready, first, memory_of(data, "serve") / 1e6
+        return ready, first, sum_over_processes(own_bytes, data, "serve") / 1e6
 
 
 def _sign(data: Path, frames: Sequence[FrameReference], n: int) -> float:
@@ -120,11 +116,9 @@ def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
     frames : four or more; the first quarter pays what an empty database costs
     """
     lines = [
-        "### Disk a frame, beside the index; bytes",
-        "",
-        "| signature | rows of the database | upload | geometry artifact |",
-        "|--:|--:|--:|--:|",
-    ]
+        "### Disk a frame, beside the index; bytes", "",
+        "| signature | rows of the database | upload | geometry artifact |", "|--:|--:|--:|--:|",
+    ]  # fmt: skip
     first = max(len(frames) // 4, 1)
     n = len(frames) - first
     uploads = sum(frame.path.stat().st_size for frame in frames[first:])

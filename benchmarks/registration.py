@@ -86,13 +86,9 @@ def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> list[
     lines = [
         f"### Registration: median of {len(pairs)} pairs of frames (mean overlap "
         f"{np.mean([pair.overlap for pair in pairs]):.2f}), one thread, warm",
-        "",
-        "| stage | ms |",
-        "|---|--:|",
-        *stage_rows(ours),
-        f"| **ours, sum** | **{np.median(sums):.1f}** |",
-        *stage_rows(theirs, "Open3D "),
-    ]
+        "", "| stage | ms |", "|---|--:|", *stage_rows(ours),
+        f"| **ours, sum** | **{np.median(sums):.1f}** |", *stage_rows(theirs, "Open3D "),
+    ]  # fmt: skip
     text = (
         f"Accepted and within 10 cm and 10 degrees of the truth: {np.mean(right):.2f} of the pairs"
     )

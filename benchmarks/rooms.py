@@ -1,4 +1,4 @@
-"""Synthetic rooms in a running service, as what looks at the dashboard needs them."""
+"""Put synthetic rooms into a running service, for the dashboard to show."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from PIL import Image
 from sqlalchemy import insert, select
 
 from benchmarks.indexed_frames import fill
+from benchmarks.waiting import until
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.export import write_ply
@@ -25,6 +26,7 @@ from sceneprint.models import read_model
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, jobs, signatures
+from sceneprint.types import Floats, Intrinsics
 from sceneprint_client.api import NewMap
 from sceneprint_lab.synth import KINECT, symmetric_box, synthesise_room, synthesise_survey, take
 from sceneprint_lab.synth.trajectories import pose
@@ -34,74 +36,82 @@ SEED = 21
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image of a room (or a scan of a hall), and what is sent with it."""
+    """A depth image of a room or a scan of a hall, and the fields of its upload."""
 
     data: bytes
     meta: dict[str, Any]
     name: str = "frame.png"
 
 
-def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
-    """Views along a path through each room, by two robots in turn, a second apart.
+def camera_of(k: Intrinsics) -> dict[str, float]:
+    """Return the intrinsics of an upload."""
+    return {name: getattr(k, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
-    `rooms`: their numbers; `step`: of so many views on the path (some 5 cm or 2 degrees apart)
-    one is taken.
+
+def pose_in(parent: str, T: Floats | None) -> dict[str, Any]:
+    """Return the pose of an upload."""
+    assert T is not None  # synthetic frames have poses
+    return {"parent_frame": parent, "matrix": T.tolist()}
+
+
+def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
+    """Return views along a path through each room, by two robots in turn, a second apart.
+
+    Parameters
+    ----------
+    rooms : their numbers
+    views : of each room
+    step : use every so many views of the path, which are some 5 cm or 2 degrees apart
     """
     found = []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "frame.png"
         for room, number in enumerate(rooms):
-            made = synthesise_room(SEED, number, views * step, along_path=True, step=step).frames
-            for view, frame in enumerate(made):
+            walk = synthesise_room(SEED, number, views * step, along_path=True, step=step).frames
+            for view, frame in enumerate(walk):
                 write_depth_png(path, frame.depth, 1000.0)
-                lens, who = frame.intrinsics, "bob" if view % 2 else "ann"
-                if frame.pose is None:
-                    raise ValueError(f"view {view} of room {room} has no pose")
+                robot = "bob" if view % 2 else "ann"
                 meta = {
-                    "intrinsics": {
-                        n: getattr(lens, n) for n in ("width", "height", "fx", "fy", "cx", "cy")
-                    },
-                    "robot": who,
-                    "session": f"room-{room}/{who}",
+                    "intrinsics": camera_of(frame.intrinsics), "robot": robot,
+                    "session": f"room-{room}/{robot}",
                     "captured_at": f"2026-11-20T09:{room:02d}:{view:02d}Z",
-                    "pose": {"parent_frame": f"room-{room}", "matrix": frame.pose.tolist()},
+                    "pose": pose_in(f"room-{room}", frame.pose),
                     "tags": ["door"] if view == 0 else [],
-                }
+                }  # fmt: skip
                 found.append(Shot(path.read_bytes(), meta))
     return found
 
 
 def scans(views: int) -> list[Shot]:
-    """Scans of a spinning LiDAR on one walk through a hall."""
-    made = synthesise_survey(SEED, 0, views, along_path=True, kind="hall").clouds
+    """Return scans of a spinning LiDAR on one walk through a hall."""
+    clouds = synthesise_survey(SEED, 0, views, along_path=True, kind="hall").clouds
     found = []
-    for view, cloud in enumerate(made):
-        if cloud.pose is None:
-            raise ValueError(f"scan {view} has no pose")
+    for view, cloud in enumerate(clouds):
         meta = {
-            "robot": "cart", "session": "hall-3/cart",
+            "robot": "cart", "session": "hall-3/cart", "pose": pose_in("hall-3", cloud.pose),
             "captured_at": f"2026-11-20T10:00:{view:02d}Z",
-            "pose": {"parent_frame": "hall-3", "matrix": cloud.pose.tolist()},
         }  # fmt: skip
         found.append(Shot(write_ply(cloud.points), meta, f"scan-{view:06d}.ply"))
     return found
 
 
 def box(ahead: float) -> Shot:
-    """A bare box of a room, `ahead` metres nearer its end; upside down it looks the same."""
+    """Return a view of a bare room, `ahead` metres nearer its end; it is the same upside down."""
     v, u = np.mgrid[:240, :320].astype(float)
     x, y = abs(u - 159.5) / 292.5, abs(v - 119.5) / 292.5
     depth = np.minimum.reduce([1.5 / np.maximum(x, 1e-6), 1.1 / y, np.full(x.shape, 3.2 - ahead)])
     file = io.BytesIO()
     Image.fromarray((depth * 1000).round().astype(np.uint16)).save(file, "PNG")
-    lens = {"width": 320, "height": 240, "fx": 292.5, "fy": 292.5, "cx": 159.5, "cy": 119.5}
+    lens = camera_of(Intrinsics(320, 240, 292.5, 292.5, 159.5, 119.5))
     return Shot(file.getvalue(), {"intrinsics": lens})
 
 
 def circled(azimuths: Sequence[float]) -> list[Shot]:
-    """A cube in an empty hall from all around, 1.8 m away: its four sides look the same.
+    """Return views of a cube in an empty hall, 1.8 m away: its four sides look the same.
 
-    `azimuths`: of the camera as seen from the cube, degrees.
+    Parameters
+    ----------
+    azimuths : of the camera as seen from the cube, degrees
     """
     room, rng, found = symmetric_box(), np.random.default_rng(SEED), []
     for view, azimuth in enumerate(azimuths):
@@ -110,17 +120,16 @@ def circled(azimuths: Sequence[float]) -> list[Shot]:
         T = pose(np.array([*eye, a + math.pi, math.atan2(-0.9, 1.8), 0.0]))
         file = io.BytesIO()
         np.save(file, take(room, T, KINECT, rng))
-        lens = {n: getattr(KINECT, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
         meta = {
-            "intrinsics": lens, "session": "round", "captured_at": f"2026-11-20T11:00:{view:02d}Z",
-            "pose": {"parent_frame": "hall", "matrix": T.tolist()},
+            "intrinsics": camera_of(KINECT), "session": "round", "pose": pose_in("hall", T),
+            "captured_at": f"2026-11-20T11:00:{view:02d}Z",
         }  # fmt: skip
         found.append(Shot(file.getvalue(), meta, "frame.npy"))
     return found
 
 
 def send(client: httpx.Client, name: str, of: list[Shot]) -> list[str]:
-    """Send frames to a map; their ids."""
+    """Send frames to a map, and return their ids."""
     ids = []
     for shot in of:
         files = {"frame": (shot.name, shot.data, "application/octet-stream")}
@@ -133,22 +142,20 @@ def send(client: httpx.Client, name: str, of: list[Shot]) -> list[str]:
 
 def wait(client: httpx.Client, path: str, states: set[str]) -> None:
     """Wait until all frames of a map are in one of these states."""
-    while set(client.get(path).raise_for_status().json()["frames"]) - states:
-        time.sleep(0.1)
+    until(lambda: not set(client.get(path).raise_for_status().json()["frames"]) - states)
 
 
 def fuse(client: httpx.Client, name: str) -> None:
     """Build the surface of a map, and wait for it."""
     path = f"/v1/maps/{name}/surface"
     client.post(path).raise_for_status()
-    while client.get(path).raise_for_status().json()["state"] != "ready":
-        time.sleep(0.1)
+    until(lambda: client.get(path).raise_for_status().json()["state"] == "ready")
 
 
 def multiply(data: Path, source: str, name: str, count: int) -> None:
-    """Make a map of many frames that are all like the first of another map, for lists to show.
+    """Create a map of many frames that are all like the first of another map, for lists to show.
 
-    They share its blobs; their signatures are a byte long, since nobody asks this map anything.
+    They share its blobs; their signatures are a byte long, since no query searches this map.
 
     Parameters
     ----------
@@ -167,10 +174,11 @@ def multiply(data: Path, source: str, name: str, count: int) -> None:
             first = first.where(frames.c.revision > 0).order_by(frames.c.number).limit(1)
             frame = dict(connection.execute(first).mappings().one())
             number = frame.pop("number")
-            of_it = select(signatures).where(signatures.c.frame_number == number)
-            signed = dict(connection.execute(of_it).mappings().one())
-            of_it = select(jobs).where(jobs.c.frame_number == number)
-            job = dict(connection.execute(of_it).mappings().one())
+            signed, job = (
+                dict(connection.execute(select(table).where(table.c.frame_number == number))
+                     .mappings().one())
+                for table in (signatures, jobs)
+            )  # fmt: skip
             del job["number"]
         names = rng.bytes(16 * count).hex()
         own = {"map_number": row.number, "received_at": time.time(), "indexed_at": time.time()}
@@ -183,7 +191,8 @@ def multiply(data: Path, source: str, name: str, count: int) -> None:
         fill(database, name, read_model("depth"), vectors, columns=columns, signed=signed)
         with database.write() as connection:
             added = select(frames.c.number).where(frames.c.map_number == row.number)
-            numbers = connection.execute(added).scalars().all()
-            about = {"map_number": row.number}
-            done = [{**job, **about, "id": f"{n:032x}", "frame_number": n} for n in numbers]
-            connection.execute(insert(jobs), done)
+            rows = [
+                {**job, "map_number": row.number, "id": f"{n:032x}", "frame_number": n}
+                for n in connection.execute(added).scalars().all()
+            ]
+            connection.execute(insert(jobs), rows)

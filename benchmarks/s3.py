@@ -1,92 +1,66 @@
-"""A real server of the S3 protocol, as a process: moto's, from PyPI.
-
-What it keeps is gone with it. It takes any credentials, and checks no signatures.
-"""
+"""Run a server of the S3 protocol as a process: moto's, which keeps objects in memory."""
 
 from __future__ import annotations
 
 import os
 import re
-import socket
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
 from collections import Counter
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-#: Seconds for it to begin: it loads much.
-BEGIN_S = 60.0
+import httpx
+
+from benchmarks.waiting import answers, free_port, until
+
 _MAIN = "import sys; from moto.server import main; main(sys.argv[1:])"
 
 
 class ObjectServer:
-    """A server on this machine, started when it is entered.
+    """A server on this machine, which starts when it is entered; it checks no signatures.
 
     Parameters
     ----------
     port : to listen on; 0 for a free one
-    log : file that has a line for each request; None: nobody counts them
+    log : file that gets a line for each request, which `requests` counts
     """
 
     def __init__(self, port: int = 0, log: Path | None = None) -> None:
-        self.port, self._log = port or _free_port(), log
+        self.port, self._log = port or free_port(), log or Path(os.devnull)
+        self.endpoint = f"http://127.0.0.1:{self.port}"
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
-    def endpoint(self) -> str:
-        """Where it listens."""
-        return f"http://127.0.0.1:{self.port}"
-
-    @property
     def env(self) -> dict[str, str]:
-        """What a process needs in its environment to use it."""
+        """Return the environment variables of a process that uses the server."""
         return {
-            "AWS_ENDPOINT_URL": self.endpoint,
-            "AWS_ALLOW_HTTP": "true",
-            "AWS_ACCESS_KEY_ID": "fleet",
-            "AWS_SECRET_ACCESS_KEY": "no-secret",
-            "AWS_REGION": "us-east-1",
-        }
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it was started, and has not ended."""
-        return self._process is not None and self._process.poll() is None
+            "AWS_ENDPOINT_URL": self.endpoint, "AWS_ALLOW_HTTP": "true", "AWS_REGION": "us-east-1",
+            "AWS_ACCESS_KEY_ID": "fleet", "AWS_SECRET_ACCESS_KEY": "no-secret",
+        }  # fmt: skip
 
     def start(self) -> None:
-        """Start it, and wait until it answers."""
-        with (self._log or Path(os.devnull)).open("wb") as log:
+        """Start the server, and wait until it answers."""
+        with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _MAIN, "-H", "127.0.0.1", "-p", str(self.port)],
                 stdout=subprocess.DEVNULL, stderr=log,
             )  # fmt: skip
-        until = time.monotonic() + BEGIN_S
-        while time.monotonic() < until and self.is_running:
-            try:
-                with urllib.request.urlopen(f"{self.endpoint}/moto-api/", timeout=5):
-                    return
-            except (OSError, urllib.error.URLError):
-                time.sleep(0.05)
-        self.kill()
-        raise RuntimeError(f"moto_server does not answer on {self.endpoint}")
+        until(lambda: answers(f"{self.endpoint}/moto-api/"))
 
     def bucket(self, name: str) -> str:
-        """Make a bucket; returns its URL."""
-        asked = urllib.request.Request(f"{self.endpoint}/{name}", method="PUT")
-        with urllib.request.urlopen(asked, timeout=10):
-            return f"s3://{name}"
+        """Create a bucket, and return its URL."""
+        httpx.put(f"{self.endpoint}/{name}", timeout=10, trust_env=False).raise_for_status()
+        return f"s3://{name}"
 
     def requests(self) -> Counter[str]:
-        """Requests so far, by method."""
-        text = "" if self._log is None else self._log.read_text(errors="replace")
+        """Count the requests so far by method."""
+        text = self._log.read_text(errors="replace")
         return Counter(re.findall(r'"(GET|HEAD|PUT|POST|DELETE) ', text))
 
     def kill(self) -> None:
-        """End it as a loss of power would: what it kept is gone."""
+        """Kill the server; its objects are lost."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -100,9 +74,3 @@ class ObjectServer:
         trace: TracebackType | None,
     ) -> None:  # fmt: skip
         self.kill()
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -53,11 +53,9 @@ def measure(signatures: int, length: int, runs: int) -> list[str]:
     lines = [
         f"### Exact scan of {signatures} signatures of {length:,} bytes "
         f"({signatures * length / 1e6:.1f} MB), one thread, warm",
-        "",
-        "| | ms a query | of the bandwidth of the read | quartiles |",
-        "|---|--:|--:|--:|",
+        "", "| | ms a query | of the bandwidth of the read | quartiles |", "|---|--:|--:|--:|",
         f"| plain read (sum of 64-bit words) | {np.median(reads):.2f} | 1 | |",
-    ]
+    ]  # fmt: skip
     for name, own in times.items():
         low, share, high = np.quantile(np.divide(reads, own), (0.25, 0.5, 0.75))
         lines.append(f"| {name} | {np.median(own):.2f} | {share:.2f} | {low:.2f} to {high:.2f} |")

@@ -1,7 +1,6 @@
-"""`make screenshots`: every page of the dashboard, light and dark, over a real service.
+"""Take a picture of every page of the dashboard, light and dark: `make screenshots`.
 
-All that is to be seen is synthetic: rooms and a hall of `sceneprint_lab.synth`, signed by two
-workers.
+The service shows synthetic rooms and a hall of `sceneprint_lab.synth`.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,41 +17,44 @@ from typing import TYPE_CHECKING, Any
 import httpx
 from tqdm import tqdm
 
-from benchmarks.chromium import PATIENCE_S, chromium, installed, settled, watched
+from benchmarks.chromium import chromium, installed, settled, watched
 from benchmarks.rooms import Shot, box, circled, fuse, scans, send, shots, wait
+from benchmarks.waiting import PATIENCE_S, until
 from sceneprint_lab.cli.demo import serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import FilePayload
 
 MAP, HALL, BOXES, SIDES = "building", "hall-3", "boxes", "four-sides"
-THEMES = ("light", "dark")
-#: Which rooms, views of each, and every how many-th of its path one is.
+#: Rooms, views of each, and the number of steps of the path from one view to the next.
 ROOMS, VIEWS, STEP = (3, 0), 12, 4
 #: Width, and least and greatest height of a picture.
 WIDTH, LOW, HIGH = 1280, 800, 2400
-#: Width and height of a tablet held upright.
-TABLET = (768, 1024)
-#: Of a phone.
-PHONE = (390, 844)
-#: Seconds that a page may go on drawing after it is there.
+#: Width and height of an upright tablet, and of a phone.
+TABLET, PHONE = (768, 1024), (390, 844)
+#: Seconds that a page may go on drawing after its main part is ready.
 LINGER_S = 2.0
-#: Bytes a second at which uploads are sent, to be seen at it.
-SLOWLY = 20_000
-#: Whether all pictures that a page has asked for are drawn.
+#: Bytes a second of uploads, so slow that a picture shows them.
+SLOW_UPLOADS = 20_000
+#: Waits until all pictures of a page are drawn.
 _PICTURES = """Promise.all([...document.querySelectorAll("canvas.picture")].map((one) =>
   one.ready)).then(() => true)"""
-#: An address as a proxy would tell it, which makes the service ask for a key.
+#: The address that a proxy would send, for which the service requires a key.
 ELSEWHERE = {"X-Forwarded-For": "192.0.2.7"}
 
 
 @dataclass(frozen=True)
 class View:
-    """A page to be taken: name of the picture, address behind the dashboard's.
+    """A page of the dashboard.
 
-    `tall`: as high as what is on it; `size`: of the window; `headers`: sent with every request;
-    `key`: kept in the tab; `files`: chosen on the page, by name; `press`: the text of buttons that
-    are pressed then; `gone`: whether the service is out of reach when the page is entered.
+    Parameters
+    ----------
+    name, address : of the picture, and after that of the dashboard
+    tall : whether the picture is as high as the page
+    size : of the window
+    headers, key : sent with every request, and stored in the tab
+    files, press : files to choose, and texts of buttons to press then
+    gone : whether the service cannot be reached when the page is opened
     """
 
     name: str
@@ -67,111 +68,146 @@ class View:
     gone: bool = False
 
 
-def take(out: Path) -> list[Path]:
-    """Fill a service, and take all pages.
-
-    Parameters
-    ----------
-    out : folder of the pictures; made if need be
-
-    Raises
-    ------
-    FileNotFoundError : no Chromium is installed.
-    """
-    path = installed()
-    if path is None:
-        raise FileNotFoundError("no Chromium is installed (on Debian: apt install chromium)")
+def take_all(path: str, out: Path) -> int:
+    """Fill a service, take all pages with a Chromium, and return the number of pictures."""
     out.mkdir(parents=True, exist_ok=True)
-    made = shots(ROOMS, VIEWS, STEP)
+    frames, number = shots(ROOMS, VIEWS, STEP), 0
     with TemporaryDirectory() as folder:
         data = Path(folder)
         with serving(data, workers=0) as url, httpx.Client(base_url=url, timeout=120) as client:
-            fill(client, data, made)
+            fill(client, data, frames)
         with serving(data, workers=2) as url, httpx.Client(base_url=url, timeout=120) as client:
-            pages = views(client, made)
+            pages = list(views(client, frames))
             with chromium(path) as browser:
-                return [
-                    picture(browser, url, view, theme, out / f"{place:02d}-{view.name}-{theme}.png")
-                    for place, view in enumerate(tqdm(pages, desc="pages", disable=None), 1)
-                    for theme in THEMES
-                ]
+                for place, view in enumerate(tqdm(pages, desc="pages", disable=None), 1):
+                    for theme in ("light", "dark"):
+                        file = out / f"{place:02d}-{view.name}-{theme}.png"
+                        take_picture(browser, url, view, theme, file)
+                        number += 1
+    return number
 
 
-def fill(client: httpx.Client, data: Path, made: list[Shot]) -> None:
-    """Upload all frames while nobody signs them, and damage one of them on the disk."""
+def fill(client: httpx.Client, data: Path, frames: list[Shot]) -> None:
+    """Upload all frames while no worker runs, and damage one of them on the disk."""
     for name, title, model in (
         (MAP, "Two rooms, two robots", "depth"), (HALL, "Hall 3", "lidar"),
         (BOXES, "Rooms without furniture", "depth"), (SIDES, "A cube in a hall", "depth"),
         ("empty", None, "depth"),
     ):  # fmt: skip
-        new = {"name": name, "title": title, "model": model}
-        client.post("/v1/maps", json=new).raise_for_status()
-    send(client, MAP, made)
+        _post(client, "maps", {"name": name, "title": title, "model": model})
+    send(client, MAP, frames)
     send(client, BOXES, [box(0.0)])
     send(client, SIDES, circled(range(30, 390, 30)))
     walk = scans(4)
     send(client, HALL, walk[:-1])
-    known = set((data / "blobs").rglob("*"))
+    before = set((data / "blobs").rglob("*"))
     send(client, HALL, walk[-1:])
-    (blob,) = (one for one in set((data / "blobs").rglob("*")) - known if one.is_file())
+    (blob,) = (one for one in set((data / "blobs").rglob("*")) - before if one.is_file())
     blob.chmod(0o644)
     blob.write_bytes(blob.read_bytes()[:-1])
 
 
-def views(client: httpx.Client, made: list[Shot]) -> list[View]:
-    """Have all frames signed, ask, associate, make keys; the pages of all that."""
-    wait(client, f"/v1/maps/{MAP}", {"indexed"})
-    wait(client, f"/v1/maps/{BOXES}", {"indexed"})
-    wait(client, f"/v1/maps/{SIDES}", {"indexed"})
-    wait(client, f"/v1/maps/{HALL}", {"indexed", "failed"})
-    whole = {"grants": {"*": "admin"}}
-    client.post("/v1/keys", json={"name": "operator", **whole}).raise_for_status()
-    few = {"name": "robot-7", "grants": {MAP: "write", HALL: "read"}}
-    key = client.post("/v1/keys", json=few).raise_for_status().json()["secret"]
+def views(client: httpx.Client, frames: list[Shot]) -> Iterator[View]:
+    """Let the workers sign, query and associate frames, create keys, and yield all pages."""
+    for name in (MAP, BOXES, SIDES, HALL):
+        wait(client, f"/v1/maps/{name}", {"indexed", "failed"} if name == HALL else {"indexed"})
+    _post(client, "keys", {"name": "operator", "grants": {"*": "admin"}})
+    key = _post(client, "keys", {"name": "robot-7", "grants": {MAP: "write", HALL: "read"}})
     both = {"sessions": ["room-0/ann", "room-0/bob"]}
-    found = client.post(f"/v1/maps/{MAP}/associations", json=both).raise_for_status().json()
-    _done(client, found["job_id"])
+    _await_job(client, _post(client, f"maps/{MAP}/associations", both)["job_id"])
     for name in (MAP, HALL, SIDES):
         fuse(client, name)
     for name in (MAP, SIDES):
-        _measure_coverage(client, name)
-    ids = [str(one["frame_id"]) for one in _listed(client, MAP)]
-    asked = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
-    answer = client.post(f"/v1/maps/{MAP}/queries", json=asked).raise_for_status().json()
-    for one in (made[5], made[8], made[-2]):
-        _ask(client, MAP, one)
-    boxed = _ask(client, BOXES, box(0.3))
-    sides = str(_ask(client, SIDES, circled([40])[0])["query_id"])
-    absent = str(_ask(client, SIDES, made[0])["query_id"])
+        _await_job(client, _post(client, f"maps/{name}/coverage", {"not_within_s": 0})["job_id"])
+    ids = _frame_ids(client, MAP)
+    query = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
+    answer = _post(client, f"maps/{MAP}/queries", query)
+    for one in (frames[5], frames[8], frames[-2]):
+        _query(client, MAP, one)
+    boxed = _query(client, BOXES, box(0.3))
+    sides = str(_query(client, SIDES, circled([40])[0])["query_id"])
+    absent = str(_query(client, SIDES, frames[0])["query_id"])
     dead, *_ = client.get("/v1/jobs", params={"state": "dead"}).json()["items"]
-    hall = str(_listed(client, HALL, "indexed")[0]["frame_id"])
-    return [
-        *_views(answer, boxed, ids[3], hall, dead["job_id"], key, made),
-        *_unsure(sides, absent),
-    ]
+    scan = _frame_ids(client, HALL, state="indexed")[0]
+    yield from _pages(answer, boxed, ids[3], scan)
+    yield View("job-dead", f"#/operations/jobs/{dead['job_id']}")
+    yield View("key", "#/", headers=ELSEWHERE)
+    yield View("key-too-little", "#/operations?tab=keys", headers=ELSEWHERE, key=key["secret"])
+    yield View("nowhere", "#/nowhere")
+    yield View("gone", f"#/maps/{MAP}", gone=True)
+    # several poses, and none
+    for view in (
+        View("answer-ambiguous", f"#/queries/{sides}"),
+        View("place-ambiguous", f"#/maps/{SIDES}/place?query={sides}", tall=True),
+        View("answer-not-found", f"#/queries/{absent}"),
+        View("coverage", f"#/maps/{SIDES}/coverage?cell=6,-4", tall=True),
+    ):
+        yield from (view, replace(view, name=f"{view.name}-phone", size=PHONE))
+    # the last: it fills the empty map
+    sent = [(f"frame-{i:06d}.depth.png", one.data) for i, one in enumerate(frames[:6])]
+    lens = json.dumps({**frames[0].meta["intrinsics"], "depth_scale": 1000}).encode()
+    files = (("torn.ply", b"ply\nformat ascii 1.0\n"), *sent, ("intrinsics.json", lens))
+    yield View("uploading", "#/maps/empty/upload", files=files, press=("Upload 7 files",))
 
 
-def _listed(client: httpx.Client, name: str, state: str | None = None) -> list[dict[str, Any]]:
-    """Frames of a map, the first taken first."""
-    params = {"limit": "100"} if state is None else {"limit": "100", "state": state}
-    items = client.get(f"/v1/maps/{name}/frames", params=params).raise_for_status().json()["items"]
-    return sorted(items, key=lambda one: str(one["captured_at"]))
+def _pages(answer: dict[str, Any], boxed: dict[str, Any], frame: str, scan: str) -> Iterator[View]:
+    query = answer["query_id"]
+    overlay = f"#/queries/{query}/matches/{_farthest(answer)}?map={MAP}"
+    rival = f"#/queries/{boxed['query_id']}/matches/{boxed['matches'][0]['frame_id']}?map={BOXES}"
+    place = View("place", f"#/maps/{MAP}/place?parent=room-{ROOMS[0]}")
+    queries = View("queries", f"#/maps/{MAP}/queries")
+    on_tablets = (
+        View("maps", "#/"), place, View("frames", f"#/maps/{MAP}"),
+        View("answer", f"#/queries/{query}", tall=True), View("overlay", overlay, tall=True),
+        View("place-query", f"#/maps/{MAP}/place?view=3d&query={query}", tall=True),
+        View("operations", "#/operations", tall=True),
+    )  # fmt: skip
+    for one in on_tablets:
+        yield from (one, replace(one, name=f"{one.name}-tablet", size=TABLET))
+    yield replace(place, name="place-phone", size=PHONE, tall=True)
+    yield from (queries, replace(queries, name="queries-phone", size=PHONE))
+    for name, address in {
+        "place-3d": f"{place.address}&view=3d&colour=session&association=none",
+        "place-scans": f"#/maps/{HALL}/place", "place-none": "#/maps/empty/place",
+        "frames-normals": f"#/maps/{MAP}?view=normals",
+        "frames-patches": f"#/maps/{MAP}?view=patches", "frames-scans": f"#/maps/{HALL}",
+        "frames-none": "#/maps/empty", "sessions": f"#/maps/{MAP}/sessions",
+        "upload": f"#/maps/{MAP}/upload",
+        **{tab: f"#/operations?tab={tab}" for tab in ("jobs", "events", "keys", "audit")},
+    }.items():  # fmt: skip
+        yield View(name, address)
+    for name, address in {
+        "frame": f"#/maps/{MAP}/frames/{frame}", "frame-scan": f"#/maps/{HALL}/frames/{scan}",
+        "query": f"#/maps/{MAP}/query?frame={frame}", "overlay-before": f"{overlay}&pose=before",
+        "overlay-residual": f"{overlay}&colour=residual", "overlay-rival": f"{rival}&pose=rival",
+        "operations-map": f"#/operations?map={HALL}",
+    }.items():  # fmt: skip
+        yield View(name, address, tall=True)
+    yield View("session-tags", f"#/maps/{MAP}/sessions", press=("Tag session room-0/ann",))
+    yield View("new-map", "#/", press=("New map",))
+    yield View("new-key", "#/operations?tab=keys", press=("Create a key",))
 
 
-def _measure_coverage(client: httpx.Client, name: str) -> None:
-    asked = {"not_within_s": 0}
-    told = client.post(f"/v1/maps/{name}/coverage", json=asked).raise_for_status().json()
-    _done(client, told["job_id"])
+def _post(client: httpx.Client, path: str, body: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = client.post(f"/v1/{path}", json=body).raise_for_status().json()
+    return found
 
 
-def _done(client: httpx.Client, job: str) -> None:
-    while client.get(f"/v1/jobs/{job}").json()["state"] in ("queued", "running"):
-        time.sleep(0.2)
+def _frame_ids(client: httpx.Client, name: str, **params: str) -> list[str]:
+    """Return the ids of the frames of a map in the order of capture."""
+    answer = client.get(f"/v1/maps/{name}/frames", params={"limit": "100", **params})
+    items = answer.raise_for_status().json()["items"]
+    return [one["frame_id"] for one in sorted(items, key=lambda one: str(one["captured_at"]))]
 
 
-def _ask(client: httpx.Client, name: str, shot: Shot) -> dict[str, Any]:
-    known = ("intrinsics", "robot", "session")
-    fields = {"meta": json.dumps({key: shot.meta[key] for key in known if key in shot.meta})}
+def _await_job(client: httpx.Client, job: str) -> None:
+    running = ("queued", "running")
+    until(lambda: client.get(f"/v1/jobs/{job}").json()["state"] not in running, pause_s=0.2)
+
+
+def _query(client: httpx.Client, name: str, shot: Shot) -> dict[str, Any]:
+    names = ("intrinsics", "robot", "session")
+    fields = {"meta": json.dumps({key: shot.meta[key] for key in names if key in shot.meta})}
     files = {"frame": (shot.name, shot.data, "image/png")}
     answer = client.post(f"/v1/maps/{name}/queries", data=fields, files=files)
     found: dict[str, Any] = answer.raise_for_status().json()
@@ -179,83 +215,17 @@ def _ask(client: httpx.Client, name: str, shot: Shot) -> dict[str, Any]:
 
 
 def _farthest(answer: dict[str, Any]) -> str:
-    """Of the strong matches the one from whose sensor the query's is farthest."""
-    found = [one for one in answer["matches"] if one["validation"]["strength"] == "strong"]
+    """Return the strong match whose sensor is farthest from the query's."""
+    strong = [one for one in answer["matches"] if one["validation"]["strength"] == "strong"]
 
     def distance(one: dict[str, Any]) -> float:
         return sum(float(row[3]) ** 2 for row in one["transform"]["matrix"][:3])
 
-    return str(max(found, key=distance)["frame_id"])
+    return str(max(strong, key=distance)["frame_id"])
 
 
-def _views(
-    answer: dict[str, Any], boxed: dict[str, Any], frame: str, scan: str, dead: str, key: str,
-    made: list[Shot],
-) -> Iterator[View]:  # fmt: skip
-    query = answer["query_id"]
-    overlay = f"#/queries/{query}/matches/{_farthest(answer)}?map={MAP}"
-    rival = f"#/queries/{boxed['query_id']}/matches/{boxed['matches'][0]['frame_id']}?map={BOXES}"
-    maps, frames = View("maps", "#/"), View("frames", f"#/maps/{MAP}")
-    rows = View("answer", f"#/queries/{query}", tall=True)
-    aligned = View("overlay", overlay, tall=True)
-    queries = View("queries", f"#/maps/{MAP}/queries")
-    place = View("place", f"#/maps/{MAP}/place?parent=room-{ROOMS[0]}")
-    paths = View("place-query", f"#/maps/{MAP}/place?view=3d&query={query}", tall=True)
-    operations = View("operations", "#/operations", tall=True)
-    yield from (maps, place, replace(place, name="place-phone", size=PHONE, tall=True))
-    yield View("place-3d", f"{place.address}&view=3d&colour=session&association=none")
-    yield View("place-scans", f"#/maps/{HALL}/place")
-    yield View("place-none", "#/maps/empty/place")
-    yield frames
-    yield View("frames-normals", f"#/maps/{MAP}?view=normals")
-    yield View("frames-patches", f"#/maps/{MAP}?view=patches")
-    yield View("frames-scans", f"#/maps/{HALL}")
-    yield View("frames-none", "#/maps/empty")
-    yield View("sessions", f"#/maps/{MAP}/sessions")
-    yield View("session-tags", f"#/maps/{MAP}/sessions", press=("Tag session room-0/ann",))
-    yield View("frame", f"#/maps/{MAP}/frames/{frame}", tall=True)
-    yield View("frame-scan", f"#/maps/{HALL}/frames/{scan}", tall=True)
-    yield View("upload", f"#/maps/{MAP}/upload")
-    yield View("query", f"#/maps/{MAP}/query?frame={frame}", tall=True)
-    yield from (queries, replace(queries, name="queries-phone", size=PHONE))
-    yield rows
-    yield aligned
-    yield View("overlay-before", f"{overlay}&pose=before", tall=True)
-    yield View("overlay-residual", f"{overlay}&colour=residual", tall=True)
-    yield View("overlay-rival", f"{rival}&pose=rival", tall=True)
-    yield from (paths, operations)
-    yield View("operations-map", f"#/operations?map={HALL}", tall=True)
-    for tab in ("jobs", "events", "keys", "audit"):
-        yield View(tab, f"#/operations?tab={tab}")
-    yield View("new-map", "#/", press=("New map",))
-    yield View("new-key", "#/operations?tab=keys", press=("Create a key",))
-    yield View("job-dead", f"#/operations/jobs/{dead}")
-    yield View("key", "#/", headers=ELSEWHERE)
-    yield View("key-too-little", "#/operations?tab=keys", headers=ELSEWHERE, key=key)
-    yield View("nowhere", "#/nowhere")
-    yield View("gone", f"#/maps/{MAP}", gone=True)
-    for one in (maps, place, frames, rows, aligned, paths, operations):
-        yield replace(one, name=f"{one.name}-tablet", size=TABLET)
-    # the last: the map is empty no more
-    sent = [(f"frame-{i:06d}.depth.png", one.data) for i, one in enumerate(made[:6])]
-    lens = json.dumps({**made[0].meta["intrinsics"], "depth_scale": 1000}).encode()
-    files = (("torn.ply", b"ply\nformat ascii 1.0\n"), *sent, ("intrinsics.json", lens))
-    yield View("uploading", "#/maps/empty/upload", files=files, press=("Upload 7 files",))
-
-
-def _unsure(sides: str, absent: str) -> Iterator[View]:
-    """Answers that are not found: one of several poses, and one of none."""
-    several = View("answer-ambiguous", f"#/queries/{sides}")
-    plan = View("place-ambiguous", f"#/maps/{SIDES}/place?query={sides}", tall=True)
-    none = View("answer-not-found", f"#/queries/{absent}")
-    lost = View("coverage", f"#/maps/{SIDES}/coverage?cell=6,-4", tall=True)
-    for one in (several, plan, none, lost):
-        yield one
-        yield replace(one, name=f"{one.name}-phone", size=PHONE)
-
-
-def picture(browser: Any, url: str, view: View, theme: str, path: Path) -> Path:
-    """Take one page.
+def take_picture(browser: Any, url: str, view: View, theme: str, path: Path) -> None:
+    """Take a picture of one page.
 
     Parameters
     ----------
@@ -281,11 +251,15 @@ def picture(browser: Any, url: str, view: View, theme: str, path: Path) -> Path:
             context.set_offline(True)
             page.evaluate("address => { location.hash = address; }", view.address)
         if view.files:
-            _throttled(context, page)
-            given: list[FilePayload] = [
-                {"name": n, "mimeType": "", "buffer": data} for n, data in view.files
+            network = context.new_cdp_session(page)
+            network.send("Network.enable")
+            slow = {"offline": False, "latency": 0, "downloadThroughput": -1}
+            slow["uploadThroughput"] = SLOW_UPLOADS
+            network.send("Network.emulateNetworkConditions", slow)
+            chosen: list[FilePayload] = [
+                {"name": name, "mimeType": "", "buffer": data} for name, data in view.files
             ]
-            page.locator("input[name=files]").set_input_files(given)
+            page.locator("input[name=files]").set_input_files(chosen)
         for text in view.press:
             page.get_by_role("button", name=text).click()
         page.wait_for_timeout(1000 * LINGER_S)
@@ -295,29 +269,19 @@ def picture(browser: Any, url: str, view: View, theme: str, path: Path) -> Path:
             page.wait_for_timeout(1000 * LINGER_S)
         page.evaluate(_PICTURES)
         page.screenshot(path=path)
-        return path
     finally:
         context.close()
 
 
-def _throttled(context: Any, page: Any) -> None:
-    network = context.new_cdp_session(page)
-    network.send("Network.enable")
-    slow = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": SLOWLY}
-    network.send("Network.emulateNetworkConditions", slow)
-
-
 def main() -> int:
-    """Take them all."""
+    """Take all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/screenshots"))
     options = parser.parse_args()
-    try:
-        taken = take(options.out)
-    except FileNotFoundError as error:
-        print(f"screenshots: {error}", file=sys.stderr)
+    if (path := installed()) is None:
+        print("screenshots: install Chromium (on Debian: apt install chromium)", file=sys.stderr)
         return 2
-    print(f"{len(taken)} pictures in {options.out}")
+    print(f"{take_all(path, options.out)} pictures in {options.out}")
     return 0
 
 

@@ -54,7 +54,7 @@ print(1e3 * opened, *(held() - before))
 
 
 def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
-    """Signatures (n, length) of frames by their numbers: fifty about each place, none twice."""
+    """Return signatures (n, length) of frames by their numbers: fifty about each place."""
     places, frame = np.divmod(keys, PLACE)
     rows = np.empty((len(keys), length))
     for place in np.unique(places):
@@ -131,17 +131,15 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
 def table() -> list[str]:
     """Return the table of all sizes of maps."""
     return [
-        f"### Search for the {SIZE} nearest frames: one thread, warm",
-        "",
+        f"### Search for the {SIZE} nearest frames: one thread, warm", "",
         "| frames | bytes | compared | search, ms | all, ms | search / all | recall@10 "
         "| publish, s | append 1,000, s | open and verify, s | memory: own, shared, MB |",
         "|--:|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|",
-        *(measure(n, kind) for kind in (FLAT, SKETCHES) for n in FRAMES),
-        "",
+        *(measure(n, kind) for kind in (FLAT, SKETCHES) for n in FRAMES), "",
         "A service compares all frames of a map up to 16 MiB of signatures, and selects frames by "
         "sketches beyond.",
         "",
-    ]
+    ]  # fmt: skip
 
 
 def _probed(folder: Path, queries: Bytes) -> list[float]:

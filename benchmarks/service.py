@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from benchmarks.encode import stage_rows
 from benchmarks.library import Library, accepted, are_same
-from benchmarks.machine import processor_seconds
+from benchmarks.machine import processor_ns, sum_over_processes
 from benchmarks.readiness import MAP, fill_map
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
@@ -63,10 +63,10 @@ def measure(
         library.ask(queries[0])
         http, cpu, stages = [], [], []
         for frame in queries:  # in turn, so that both meet the same machine
-            start, used = time.perf_counter(), processor_seconds(folder, "serve")
+            start, used = time.perf_counter(), sum_over_processes(processor_ns, folder, "serve")
             answer = client.query(MAP, frame)
             http.append(1e3 * (time.perf_counter() - start))
-            cpu.append(1e3 * (processor_seconds(folder, "serve") - used))
+            cpu.append(1e-6 * (sum_over_processes(processor_ns, folder, "serve") - used))
             spent, expected = library.ask(frame)
             stages.append(spent)
             assert map_frames > len(database) or are_same(accepted(answer, names), expected)
@@ -79,10 +79,7 @@ def measure(
     return [
         f"### A query over HTTP, {max(map_frames, len(database)):,} frames in the map, k = 5, all "
         f"stages, warm: median of {len(queries)}",
-        "",
-        "| | ms |",
-        "|---|--:|",
-        *stage_rows(stages),
+        "", "| | ms |", "|---|--:|", *stage_rows(stages),
         f"| **library, sum** | **{statistics.median(sums):.1f}** |",
         f"| **over HTTP** | **{_spread(http)}** |",
         f"| **processor time of the service** | **{_spread(cpu)}** |",
@@ -90,16 +87,12 @@ def measure(
         f"| /healthz, idle: p50, p99 | {idle[0]:.1f}, {idle[1]:.1f} |",
         f"| /healthz while {CLIENTS} clients query and a worker signs: p50, p99 | "
         f"{loaded[0]:.1f}, {loaded[1]:.1f} |",
-        "",
-        f"Queries answered meanwhile: {sum(map(len, meanwhile)) / SECONDS:.1f} a second.",
-        "",
+        "", f"Queries answered meanwhile: {sum(map(len, meanwhile)) / SECONDS:.1f} a second.", "",
         "| clients at once | queries a second | p50, ms | p99, ms | slowest client / mean |",
-        "|--:|--:|--:|--:|--:|",
-        *(_row(n, crowd) for n, crowd in crowds.items()),
-        "",
+        "|--:|--:|--:|--:|--:|", *(_row(n, crowd) for n, crowd in crowds.items()), "",
         f"{CROWD} clients are answered **{rates[CROWD] / rates[1]:.2f}** times as often as one.",
         "",
-    ]
+    ]  # fmt: skip
 
 
 def _row(n: int, crowd: Sequence[Sequence[float]]) -> str:

@@ -29,7 +29,6 @@ from sceneprint.pipeline import (
 )
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
-from sceneprint_lab.evaluation.judgement import voters
 from sceneprint_lab.synth import KINECT, take, trajectory
 from sceneprint_lab.synth.dataset import room_and_rng
 
@@ -292,27 +291,6 @@ def test_of_scans_all_around_the_nearest_goes_first() -> None:
     assert preferred(around) == [3, 2, 0, 1]
     assert preferred([*around[:3], nearest]) == [0, 2, 3, 1]  # one of a camera: not comparable
     assert preferred([replace(far, around=True)]) == [0]
-
-
-# What an evaluation averages
-
-
-def test_voters_by_hand() -> None:
-    def all_strong(parents: list[str], most: int = 5) -> list[int]:
-        return voters(parents, [True] * len(parents), most)
-
-    assert all_strong([]) == []
-    assert all_strong(["a"]) == [0]
-    assert all_strong(["b", "a", "a", "c"]) == [1, 2]
-    # equally many: of the one that comes first
-    assert all_strong(["b", "a", "a", "b"]) == [0, 3]
-    assert all_strong(["a"] * 8) == [0, 1, 2, 3, 4]
-    assert all_strong(["b", *["a"] * 8], 3) == [1, 2, 3]
-    # one strong match outvotes two weak ones, and equals are parted by the weak
-    assert voters(["b", "a", "a"], [True, False, False]) == [0]
-    assert voters(["b", "a", "a"], [True, True, False]) == [1, 2]
-    with pytest.raises(ValueError, match="zip"):
-        voters(["a"], [])
 
 
 def test_frames_are_judged_by_the_numbers_of_their_model(

@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.postgres import NoServer, binaries
 from benchmarks.soak import attacks, audit, faults
-from benchmarks.soak.__main__ import parse_faults
+from benchmarks.soak.__main__ import parse_fault
 from benchmarks.soak.attacks import ATTACKS, AttackFigures
 from benchmarks.soak.audit import Found, check, count_separated, wrong_matches
 from benchmarks.soak.broken_uploads import FILES, BrokenFigures, mutated
@@ -234,7 +234,7 @@ def test_what_is_lost_is_seen(
             frames=[kept[0], kept[1], wrong, kept[4], kept[5]], deleted={kept[4].frame_id: (0, 1)}
         )
         client_of_nobody = FailoverClient(["http://127.0.0.1:1"], RequestLog())
-        listener = Listener("fleet", "secret", client_of_nobody)
+        listener = Listener("fleet", "secret", client_of_nobody, RequestLog())
         listener.heard["frame.received", kept[0].frame_id] = 2
         found = check(ledger, [kept[0].frame_id], [client, client], [listener])
         ages = {"fleet": 10.0}
@@ -373,7 +373,7 @@ def test_every_plan_has_known_faults_and_marks_in_the_page() -> None:
     for name, plan in PLANS.items():
         assert set(plan.faults) <= set(FAULTS)
         assert text.count(f"<!-- {name}:begin -->") == text.count(f"<!-- {name}:end -->") == 1
-    assert parse_faults(["kill=5", "full-disk=1"]) == {"kill": 5, "full-disk": 1}
+    assert parse_fault("full-disk=1") == ("full-disk", 1)
 
 
 def test_mutations_are_the_same_each_time_and_break_things(shots: list[Shot]) -> None:

@@ -30,10 +30,8 @@ _TIMES = {1: "once", 2: "twice"}
 
 def title(plan: Plan) -> str:
     """Return what a plan runs, in a few words."""
-    store = "SQLite"
-    if plan.store == "postgresql":
-        standby = "an asynchronous" if plan.asynchronous else "a synchronous"
-        store = f"PostgreSQL with {standby} standby"
+    standby = "an asynchronous" if plan.asynchronous else "a synchronous"
+    store = "SQLite" if plan.store == "sqlite" else f"PostgreSQL with {standby} standby"
     return f"{plan.robots:,} robots for {plan.seconds:.0f} s, {store}"
 
 
@@ -151,26 +149,24 @@ def table(figures: SoakFigures) -> list[str]:
     return [*lines, ""]
 
 
-def parse_faults(texts: Sequence[str]) -> dict[str, int]:
-    """Return the faults that the command line names."""
-    found = {}
-    for text in texts:
-        name, _, count = text.partition("=")
-        if name not in FAULTS or not count.isdigit():
-            raise argparse.ArgumentTypeError(f"{text}: write FAULT=N; faults: {', '.join(FAULTS)}")
-        found[name] = int(count)
-    return found
+def parse_fault(text: str) -> tuple[str, int]:
+    """Return a fault of the command line, and its number."""
+    name, _, count = text.partition("=")
+    if name not in FAULTS or not count.isdigit():
+        raise argparse.ArgumentTypeError(f"{text}: write FAULT=N; faults: {', '.join(FAULTS)}")
+    return name, int(count)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run plans; exit code 1 where anything was lost, doubled, half stored or wrong."""
+    """Run plans; return 1 if anything was lost, doubled, half stored or wrong."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("plans", nargs="+", choices=list(PLANS), metavar="PLAN",
                         help=", ".join(PLANS))  # fmt: skip
     parser.add_argument("--store", choices=("sqlite", "postgresql"))
-    parser.add_argument("--faults", nargs="*", metavar="FAULT=N", help=", ".join(FAULTS))
+    parser.add_argument("--faults", nargs="*", type=parse_fault, metavar="FAULT=N",
+                        help=", ".join(FAULTS))  # fmt: skip
     for name in ("seconds", "rate", "retention_s", "most_turn_ms", "most_query_ms"):
         parser.add_argument(f"--{name.replace('_', '-')}", type=float)
     for name in ("robots", "readers", "services", "workers", "seed"):
@@ -178,16 +174,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("asynchronous", "objects", "delays", "signed"):
         parser.add_argument(f"--{name}", action="store_true", default=None)
     parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
-    parser.add_argument("--page", type=Path, help="whose figures to replace")
-    parser.add_argument("--keep", type=Path, help="new folder for data and logs, left there")
+    parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
+    parser.add_argument("--keep", type=Path, help="new folder for data and logs, which stay")
     options = parser.parse_args(arguments)
     changed = {one.name: getattr(options, one.name) for one in fields(Plan)
                if getattr(options, one.name, None) is not None}  # fmt: skip
     if options.faults is not None:
-        try:
-            changed["faults"] = parse_faults(options.faults)
-        except argparse.ArgumentTypeError as error:
-            parser.error(str(error))
+        changed["faults"] = dict(options.faults)
     return max(
         _run(name, replace(PLANS[name], **changed), options.page, options.keep)
         for name in options.plans

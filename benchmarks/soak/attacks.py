@@ -1,7 +1,7 @@
-"""Attacks of one tenant, and how long others wait meanwhile.
+"""Attack a service as one tenant, and measure how long others wait meanwhile.
 
-Attacks run in a process of their own, which stands for other machines: within the process of the
-other clients they would take turns at its interpreter.
+Attacks run in a process of their own, which stands for other machines: in the process of the other
+clients they would compete for its interpreter.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.synchronize import Event
 from typing import Any
 
@@ -30,12 +31,12 @@ from benchmarks.soak.recordings import Shot
 PATIENCE_S = 60.0
 #: Session of the frames of `noisy` that have poses.
 SESSION = "run"
-#: Connections that an attack has in all, whatever the number of its keys.
+#: Connections of an attack, whatever the number of its keys.
 _CONNECTIONS = 40
-#: A client sends for little, a service works for much: else the attacker's own work would be
-#: what its victim waits for, as all share the processors here.
+#: The attacker's own work must not delay its victims, as all share the processors of one machine.
 _NICENESS = 5
 _PNG = {"Content-Type": "image/png"}
+_FRAMES, _MAP = "/v1/maps/noisy/frames", "/v1/maps/noisy"
 
 
 @dataclass
@@ -44,8 +45,7 @@ class Attack:
 
     Parameters
     ----------
-    name : of the attack
-    url : of the service
+    name, url : of the attack, and of the service
     secrets : keys of the attacker, all of one tenant
     shots : frames to upload to the map `noisy`, which has some
     """
@@ -69,14 +69,14 @@ class Attack:
 
 @dataclass(frozen=True)
 class AttackFigures:
-    """The other tenants just before an attack, and during it.
+    """The waits of the other tenants just before an attack, and during it.
 
     Parameters
     ----------
     name : of the attack
     calm_s, under_s : 99th percentiles of requests, and of frames until they are signed, seconds
     victim_refused : requests of the other tenants that had to be repeated
-    sent, refused : requests of the attacker, and those that were sent away
+    sent, refused : requests of the attacker, and those that were refused
     """
 
     name: str
@@ -97,7 +97,7 @@ def _prepare(stop: Event) -> None:
 
 
 def _attack(attack: Attack) -> tuple[int, int]:
-    """Attack until the event is set; return the requests sent and refused."""
+    """Return attack until the event is set; return the requests sent and refused."""
     ATTACKS[attack.name](attack)
     return attack.sent, attack.refused
 
@@ -118,25 +118,25 @@ def run_attacks(
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     with ProcessPoolExecutor(1, spawn, _prepare, (stop,)) as pool:
-        pool.submit(os.getpid).result()  # its code is loaded
+        pool.submit(os.getpid).result()  # the process has started
         for name in ATTACKS:
             stop.clear()
             begun = time.monotonic()
             time.sleep(seconds)
             running = pool.submit(_attack, Attack(name, url, secrets, shots))
-            time.sleep(min(seconds / 4, 1.0))  # so that it has begun
+            time.sleep(min(seconds / 4, 1.0))  # until the attack has begun
             middle = time.monotonic()
             time.sleep(seconds)
             stop.set()
             sent, refused = running.result()
-            drain()  # what others sent meanwhile is answered then
+            drain()  # the requests of others are answered then
             calm, under = (_percentiles(log, one, one + seconds) for one in (begun, middle))
             repeated = sum(one.tries - 1 for one in _between(log, middle, middle + seconds))
             yield AttackFigures(name, calm, under, repeated, sent, refused)
 
 
 def _between(log: RequestLog, first: float, last: float) -> list[Exchange]:
-    """Return the requests that were on their way at some time."""
+    """Return the requests that were open at some time of an interval."""
     with log.lock:
         return [one for one in log.exchanges if one.begun <= last and one.answered >= first]
 
@@ -169,99 +169,82 @@ def attack_table(found: Sequence[AttackFigures]) -> list[str]:
     return lines
 
 
-# Connections that are held.
-
-
-def hold_two_headers(attack: Attack) -> None:
-    """Queries whose bodies never end, each with a second, made-up Authorization header."""
-    _hold(attack, "POST /v1/maps/noisy/queries", "Content-Length: 5000\r\n", two=True)
-
-
-def hold_streams(attack: Attack) -> None:
-    """As many event streams as connections, as dashboards and listeners hold."""
-    _hold(attack, "GET /v1/events", "Accept: text/event-stream\r\n", count=80)
-
-
-def hold_bodies(attack: Attack) -> None:
-    """Large bodies of which most comes, and the rest never does."""
-    head = "Content-Type: application/octet-stream\r\nContent-Length: 70000000\r\n"
-    _hold(attack, "POST /v1/maps/noisy/frames", head, body=bytes(8 << 20), count=16)
-
-
-# Requests again and again.
-
 Send = Callable[[Attack, httpx.Client, int], httpx.Response]
 
 
 def _frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """A new frame at the highest priority."""
+    """Upload a new frame at the highest priority."""
     shot = attack.shot(number)
     return client.put(
-        f"/v1/maps/noisy/frames/noise-{time.monotonic_ns()}-{number}", content=shot.png,
-        params={"meta": shot.meta.model_dump_json(), "priority": "10"}, headers=_PNG,
+        f"{_FRAMES}/noise-{time.monotonic_ns()}-{number}", content=shot.png, headers=_PNG,
+        params={"meta": shot.meta.model_dump_json(), "priority": "10"},
     )  # fmt: skip
 
 
 def _same_frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """A frame that is there, each time with another Idempotency-Key."""
+    """Upload a stored frame, each time with another Idempotency-Key."""
     shot = attack.shot(0)
     key = {"Idempotency-Key": f"{time.monotonic_ns()}-{number}"}
-    return client.post(
-        "/v1/maps/noisy/frames", content=shot.png, headers=_PNG | key,
-        params={"meta": shot.meta.model_dump_json()},
-    )  # fmt: skip
+    meta = {"meta": shot.meta.model_dump_json()}
+    return client.post(_FRAMES, content=shot.png, headers=_PNG | key, params=meta)
 
 
 def _archive(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """An archive of all frames, each time of other bytes."""
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w") as archive:
+    """Import an archive of all frames, each time of other bytes."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
         camera = attack.shot(0).meta.intrinsics
         assert camera is not None
         archive.writestr("run/intrinsics.json", json.dumps(camera.model_dump(mode="json")))
         archive.writestr("run/note.bin", f"{time.monotonic_ns()}-{number}".encode() * 100_000)
         for i, shot in enumerate(attack.shots):
             archive.writestr(f"run/{i}.png", shot.png)
-    return client.post(
-        "/v1/maps/noisy/imports", content=made.getvalue(),
-        headers={"Content-Type": "application/zip"},
-    )  # fmt: skip
+    kind = {"Content-Type": "application/zip"}
+    return client.post(f"{_MAP}/imports", content=file.getvalue(), headers=kind)
 
 
 def _query(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
     shot = attack.shot(number)
-    return client.post(
-        "/v1/maps/noisy/queries", content=shot.png, headers=_PNG,
-        params={"meta": shot.meta.model_dump_json()},
-    )  # fmt: skip
+    meta = {"meta": shot.meta.model_dump_json()}
+    return client.post(f"{_MAP}/queries", content=shot.png, headers=_PNG, params=meta)
 
 
 def _session(attack: Attack, client: httpx.Client, _number: int) -> httpx.Response:
-    """A whole session deleted, and restored."""
-    answer = client.delete("/v1/maps/noisy/sessions", params={"session": SESSION})
+    """Delete a whole session, and restore it."""
+    answer = client.delete(f"{_MAP}/sessions", params={"session": SESSION})
     attack.count(answer.status_code)
     if answer.status_code != 200:
         return answer
     deletion = (answer.json()["deletion"] or {}).get("deletion_id", "none")
-    return client.post(f"/v1/maps/noisy/deletions/{deletion}/restore")
+    return client.post(f"{_MAP}/deletions/{deletion}/restore")
 
 
 def _unknown_key(_attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    made_up = {"Authorization": f"Bearer made-up-{time.monotonic_ns()}-{number}"}
-    return client.get("/v1/keys/me", headers=made_up)
+    return client.get("/v1/keys/me", headers=bearer(f"made-up-{time.monotonic_ns()}-{number}"))
+
+
+def _rename(_attack: Attack, client: httpx.Client, _number: int) -> httpx.Response:
+    return client.patch(_MAP, json={"title": str(time.monotonic_ns())})
+
+
+def _surface(_attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
+    """Build the surface, and three of four times render a plan of it."""
+    if number % 4 == 0:
+        return client.post(f"{_MAP}/surface", json={})
+    return client.get(f"{_MAP}/surface/plan.png?width={256 + number % 1000}")
 
 
 def _gets(*paths: str) -> Send:
-    """One of some paths after the other; `FRAME` in them is an indexed frame of the map."""
-    known: list[str] = []
+    """Get some paths in turn; `FRAME` in them is an indexed frame of the map."""
+    indexed: list[str] = []
 
     def send(_attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-        if not known:
-            page = client.get("/v1/maps/noisy/frames", params={"state": "indexed", "limit": "1"})
+        if not indexed:
+            page = client.get(_FRAMES, params={"state": "indexed", "limit": "1"})
             if page.status_code != 200:
                 return page
-            known.append(page.json()["items"][0]["frame_id"])
-        return client.get(paths[number % len(paths)].replace("FRAME", known[0]))
+            indexed.append(page.json()["items"][0]["frame_id"])
+        return client.get(paths[number % len(paths)].replace("FRAME", indexed[0]))
 
     return send
 
@@ -271,91 +254,98 @@ def _posts(path: str, body: dict[str, Any]) -> Send:
 
 
 def _repeated(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack], None]:
-    """Requests on some connections, each after the answer to the last."""
+    """Return an attack by requests on some connections, each after the answer to the last."""
+
+    def work(attack: Attack, first: int) -> None:
+        number = first
+        headers = bearer(attack.secrets[first % len(attack.secrets)])
+        with httpx.Client(
+            base_url=attack.url, headers=headers, timeout=PATIENCE_S, trust_env=False
+        ) as client:
+            while not _stop[0].is_set():
+                try:
+                    attack.count(send(attack, client, number // connections).status_code)
+                except httpx.HTTPError:
+                    attack.count(503)
+                number += connections
 
     def repeat(attack: Attack) -> None:
-        secrets = attack.secrets
-
-        def go_on(first: int) -> None:
-            number = first
-            headers = bearer(secrets[first % len(secrets)])
-            with httpx.Client(
-                base_url=attack.url, headers=headers, timeout=PATIENCE_S, trust_env=False
-            ) as client:
-                while not _stop[0].is_set():
-                    try:
-                        attack.count(send(attack, client, number // connections).status_code)
-                    except httpx.HTTPError:
-                        attack.count(503)
-                    number += connections
-
         with ThreadPoolExecutor(connections) as pool:
-            list(pool.map(go_on, range(connections)))
+            list(pool.map(partial(work, attack), range(connections)))
 
     return repeat
 
 
-#: All of them, as the table names them.
+def _held(
+    line: str, head: str, *, body: bytes = b"", two: bool = False, count: int = _CONNECTIONS
+) -> Callable[[Attack], None]:
+    """Return an attack by requests that are begun and held, again and again if they are closed.
+
+    Parameters
+    ----------
+    line, head, body : of each request
+    two : whether each has a second, made-up Authorization header
+    count : number of connections
+    """
+
+    def connect(attack: Attack, wire: socket.socket, number: int) -> None:
+        url, secret = httpx.URL(attack.url), attack.secrets[number % len(attack.secrets)]
+        again = f"Authorization: Bearer made-up-{number}\r\n" if two else ""
+        wire.settimeout(1.0)
+        try:
+            wire.connect((url.host, url.port))
+            text = f"{line} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}"
+            wire.sendall(f"{text}\r\n{again}{head}\r\n".encode() + body)
+            attack.count(int(wire.recv(12)[9:12] or b"0"))
+        except TimeoutError:
+            attack.count(0)  # it is held
+        except OSError:
+            attack.count(503)
+
+    def hold(attack: Attack) -> None:
+        with ExitStack() as stack:
+            while not _stop[0].is_set():
+                for number in range(count):
+                    connect(attack, stack.enter_context(socket.socket()), number)
+                    if _stop[0].is_set():
+                        return
+                _stop[0].wait(2.0)
+                stack.close()
+
+    return hold
+
+
+#: By their names in the table.
 ATTACKS: dict[str, Callable[[Attack], None]] = {
-    "held queries, two headers": hold_two_headers,
-    "event streams": hold_streams,
-    "large slow bodies": hold_bodies,
+    # bodies that never end
+    "held queries, two headers": _held(
+        f"POST {_MAP}/queries", "Content-Length: 5000\r\n", two=True
+    ),
+    "event streams": _held("GET /v1/events", "Accept: text/event-stream\r\n", count=80),
+    # bodies of which most comes, and the rest never does
+    "large slow bodies": _held(
+        f"POST {_FRAMES}",
+        "Content-Type: application/octet-stream\r\nContent-Length: 70000000\r\n",
+        body=bytes(8 << 20), count=16,
+    ),
     "queue at priority 10": _repeated(_frame, 4),
     "one frame, many Idempotency-Keys": _repeated(_same_frame),
     "archives": _repeated(_archive, 4),
-    "pages of 1000 rows": _repeated(_gets("/v1/maps/noisy/frames?limit=1000")),
+    "pages of 1000 rows": _repeated(_gets(f"{_FRAMES}?limit=1000")),
     "all other lists": _repeated(
         _gets(
             "/v1/jobs?limit=1000", "/v1/events?after=0&limit=1000", "/v1/queries?limit=1000",
-            "/v1/maps/noisy/sessions?limit=1000", "/v1/maps/noisy/deletions?limit=1000",
+            f"{_MAP}/sessions?limit=1000", f"{_MAP}/deletions?limit=1000",
         )
     ),
     "queries": _repeated(_query),
     "clouds and pictures": _repeated(
-        _gets("/v1/maps/noisy/frames/FRAME/cloud.ply", "/v1/maps/noisy/frames/FRAME/preview.png")
+        _gets(f"{_FRAMES}/FRAME/cloud.ply", f"{_FRAMES}/FRAME/preview.png")
     ),
-    "edits, each audited": _repeated(
-        lambda _, client, __: client.patch(
-            "/v1/maps/noisy", json={"title": str(time.monotonic_ns())}
-        )
-    ),
+    "edits, each audited": _repeated(_rename),
     "unknown keys": _repeated(_unknown_key),
     "sessions deleted and restored": _repeated(_session, 4),
-    "coverage": _repeated(_posts("/v1/maps/noisy/coverage", {}), 4),
-    "associations": _repeated(_posts("/v1/maps/noisy/associations", {"sessions": [SESSION]}), 4),
-    "surface and its plan": _repeated(
-        lambda attack, client, number: (
-            _posts("/v1/maps/noisy/surface", {})(attack, client, number)
-            if number % 4 == 0
-            else client.get(f"/v1/maps/noisy/surface/plan.png?width={256 + number % 1000}")
-        )
-    ),
+    "coverage": _repeated(_posts(f"{_MAP}/coverage", {}), 4),
+    "associations": _repeated(_posts(f"{_MAP}/associations", {"sessions": [SESSION]}), 4),
+    "surface and its plan": _repeated(_surface),
 }  # fmt: skip
-
-
-def _hold(
-    attack: Attack, line: str, head: str, *, body: bytes = b"", two: bool = False,
-    count: int = _CONNECTIONS,
-) -> None:  # fmt: skip
-    """Connections that are begun and held, again and again where they are closed."""
-    url, secrets = httpx.URL(attack.url), attack.secrets
-    with ExitStack() as stack:
-        while not _stop[0].is_set():
-            for number in range(count):
-                secret = secrets[number % len(secrets)]
-                again = f"Authorization: Bearer made-up-{number}\r\n" if two else ""
-                wire = stack.enter_context(socket.socket())
-                wire.settimeout(1.0)
-                try:
-                    wire.connect((url.host, url.port))
-                    text = f"{line} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}"
-                    wire.sendall(f"{text}\r\n{again}{head}\r\n".encode() + body)
-                    attack.count(int(wire.recv(12)[9:12] or b"0"))
-                except TimeoutError:
-                    attack.count(0)  # it is held
-                except OSError:
-                    attack.count(503)
-                if _stop[0].is_set():
-                    return
-            _stop[0].wait(2.0)
-            stack.close()

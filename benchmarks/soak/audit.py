@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from types import MappingProxyType
@@ -39,24 +40,21 @@ CHANGES = ("map.created", "frame.received")
 
 @dataclass
 class Found:
-    """The state of the store in the end.
+    """The state of the store in the end, by numbers of frames.
 
     Parameters
     ----------
-    acknowledged : frames, but for those that were deleted
-    indexed, stated : of them, those that queries find, and those whose state says why they do not
-    aged : frames that retention deleted when it was due, with an event
+    acknowledged : without those that were deleted
+    indexed, stated : those that queries find, and those whose state says why they do not
+    aged : those that retention deleted when it was due, with an event
     looked_up, found : indexed frames that a query searched, and those that it found at distance 0
     missing : ids of acknowledged frames that are not stored
-    returned : deleted frames that are stored
-    stuck : frames that wait to be signed
-    doubled : frames beyond one of a content in a map
-    strangers : frames that are stored, and were not acknowledged
+    returned, stuck : deleted frames that are stored, and frames that wait to be signed
+    doubled, strangers : frames with the content of another, and those that were not acknowledged
     unheard, heard_twice : events of acknowledged frames that came never, or more than once
-    disagreeing : answers and lists that are not the same at every address
+    disagreeing : answers and lists that differ between addresses
     separated : changes whose event or line of the audit log is missing
-    searches : number of searches by readers and by this check
-    wrong : descriptions of their faults
+    searches, wrong : number of searches by readers and by this check, and their faults
     """
 
     acknowledged: int = 0
@@ -78,18 +76,16 @@ class Found:
     wrong: list[str] = field(default_factory=list)
 
 
-def is_idle(client: Client) -> bool:
-    """Return whether a service answers, and no job waits or runs."""
-    try:
-        jobs = client.status().jobs or {}
-    except SceneprintError:
-        return False
-    return not jobs.get("queued", 0) and not jobs.get("running", 0)
-
-
 def await_idle(client: Client) -> None:
-    """Return once no job waits or runs."""
-    until(lambda: is_idle(client), PATIENCE_S, 0.5)
+    """Return once a service answers, and no job waits or runs."""
+
+    def is_idle() -> bool:
+        with suppress(SceneprintError):
+            jobs = client.status().jobs or {}
+            return not jobs.get("queued", 0) and not jobs.get("running", 0)
+        return False
+
+    until(is_idle, PATIENCE_S, 0.5)
 
 
 def check(
@@ -131,19 +127,13 @@ def check(
         and at - expected[name].begun >= aging.get(expected[name].map_name, math.inf)
     }  # fmt: skip
     result = Found(
-        acknowledged=len(expected),
-        indexed=len(indexed),
-        stated=stated,
-        aged=len(aged),
-        looked_up=len(looked_up),
-        found=found,
-        missing=gone - aged,
+        len(expected), len(indexed), stated, len(aged), len(looked_up), found, gone - aged,
         returned=len(stored.keys() & ledger.deleted.keys()),
         stuck=len(present) - len(indexed) - stated,
         doubled=sum(contents.values()) - len(contents),
         strangers=len(stored.keys() - expected.keys() - ledger.deleted.keys()),
         disagreeing=sum(_plain(one, aging) != _plain(lists[0], aging) for one in lists[1:]),
-    )
+    )  # fmt: skip
     some = sorted(lasting, key=lambda one: one.frame_id)[:: max(len(lasting) // COMPARED, 1)]
     _compare_searches(result, ledger, stable, clients, some)
     _compare_events(result, [expected[name] for name in (*present, *sorted(aged))], listeners)
@@ -183,18 +173,12 @@ def _compare_searches(
         result.disagreeing += any(answer != answers[0] for answer in answers[1:])
         searches.append(Search(one.frame_id, answers[0], begun, time.monotonic()))
     result.searches = len(searches)
-    vectors = {name: signature(frames[name].shot) for name in _named(searches, stable, frames)}
+    names = {*stable, *(one.frame_id for one in searches)}
+    names |= {name for one in searches for name, _ in one.matches}
+    vectors = {name: signature(frames[name].shot) for name in names & frames.keys()}
     for search in searches:
         own = stable if frames[search.frame_id].map_name == frames[stable[0]].map_name else ()
         result.wrong += wrong_matches(search, ledger.deleted, own, vectors)
-
-
-def _named(
-    searches: Sequence[Search], stable: Sequence[str], known: Container[str]
-) -> set[str]:  # fmt: skip
-    """Return the ids of all frames of some searches, and of those that stay."""
-    found = {name for one in searches for name, _ in one.matches} | {*stable}
-    return {name for name in found | {one.frame_id for one in searches} if name in known}
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Uploads that are broken: none may crash a process, fail with 5xx, or cost much memory."""
+"""Send broken uploads: none may crash a process, fail with 5xx, or cost much memory."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ import httpx
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.machine import running_processes
 from benchmarks.soak.failover_client import bearer
-from benchmarks.soak.processes import Part, ended, peak_bytes
+from benchmarks.soak.processes import Part
 from benchmarks.soak.recordings import Shot
 from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.export import write_ply
 
-#: Bytes that parsers of binary formats stumble over.
+#: Bytes that break parsers of binary formats.
 _WORDS = (
     b"\x00" * 4, b"\xff" * 4, b"\x7f\xff\xff\xff", b"\x80\x00\x00\x00", b"\xff\xff\xff\x7f",
     b"\x00\x00\x00\x01", b"IDAT", b"IEND", b"IHDR", b"PK\x03\x04", b"\x93NUMPY",
@@ -60,7 +61,7 @@ def _zip(shot: Shot) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, data in _members(shot).items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # the present time would be other bytes
+            archive.writestr(zipfile.ZipInfo(name), data)  # without the present time
     return out.getvalue()
 
 
@@ -74,7 +75,7 @@ def _tar(shot: Shot) -> bytes:
     return out.getvalue()
 
 
-#: By kind, a sound file; the tests of the formats break files of all others.
+#: Sound files by kind; the tests of the formats break files of all other kinds.
 CLOUDS: dict[str, Callable[[Shot], bytes]] = {
     "ply": lambda _: write_ply(_POINTS),
     "kitti": lambda _: np.column_stack([_POINTS, np.ones(200, np.float32)]).tobytes(),
@@ -88,20 +89,13 @@ FILES: dict[str, Callable[[Shot], bytes]] = {
     **CLOUDS,
     **ARCHIVES,
 }
-#: How often each kind is broken.
+#: Relative frequencies of the kinds.
 _WEIGHTS = {**dict.fromkeys(FILES, 2.0), "json": 5.0, "png": 5.0}
 
 
 @dataclass(frozen=True)
 class BrokenUpload:
-    """What is sent.
-
-    Parameters
-    ----------
-    kind : of the file, or json: its metadata is broken
-    data : the file
-    meta : JSON text, or something like it
-    """
+    """A file and its metadata; of the kind "json" the metadata are broken, else the file."""
 
     kind: str
     data: bytes
@@ -131,7 +125,7 @@ class BrokenFigures:
 
 
 def mutated(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
-    """The upload of a number: a sound one, broken in one to four places; the same each time."""
+    """Return a sound upload that is broken in one to four places; the same for a number."""
     rng = random.Random(f"{seed} {number}")
     shot = rng.choice(shots)
     kind = rng.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0]
@@ -149,7 +143,7 @@ def mutated(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
 
 
 def _sealed(data: bytes) -> bytes:
-    """A broken PNG with the right check sums, so that what comes after them is reached."""
+    """Return a broken PNG with right checksums, so that parsers read beyond them."""
     at = data.find(b"\x89PNG") + 8
     out = bytearray(data)
     while 8 <= at <= len(data) - 12:
@@ -163,7 +157,7 @@ def _sealed(data: bytes) -> bytes:
 
 
 def _broken(data: bytes, rng: random.Random) -> bytes:
-    """Bytes with one thing wrong."""
+    """Return the bytes with one change."""
     if not data:
         return rng.choice(_WORDS)
     at = rng.randrange(len(data)) if rng.random() < 0.5 else rng.randrange(min(len(data), 64))
@@ -186,7 +180,7 @@ def _broken(data: bytes, rng: random.Random) -> bytes:
 
 
 def _broken_text(text: str, rng: random.Random) -> str:
-    """JSON with a value, or a character, that is not what is expected."""
+    """Return JSON with an unexpected value or character."""
     if rng.random() < 0.5:
         known: dict[str, Any] = json.loads(text)
         place = known if rng.random() < 0.5 else known["intrinsics"]
@@ -212,7 +206,7 @@ def send_broken(
     seed : of the breaking
     threads : that send
     """
-    before = [pid for part in parts for pid in [part.pid, *part.children()]]
+    before = {pid for part in parts for pid in [part.pid, *part.children()]}
     statuses: Counter[int] = Counter()
     sent: Counter[str] = Counter()
     failed: list[str] = []
@@ -235,10 +229,10 @@ def send_broken(
     client = httpx.Client(base_url=url, timeout=60, trust_env=False, headers=bearer(key))
     with bar, client, ThreadPoolExecutor(threads) as pool:  # all threads may use the client
         list(pool.map(send, range(n)))
-    peak = max(peak_bytes(pid) for part in parts for pid in part.members())
+    ended = before - {pid for pid, _, _ in running_processes()}
     return BrokenFigures(
-        dict(sent), dict(sorted(statuses.items())), failed, ended(before), peak,
-        time.perf_counter() - start,
+        dict(sent), dict(sorted(statuses.items())), failed, len(ended),
+        max(part.peak_bytes() for part in parts), time.perf_counter() - start,
     )  # fmt: skip
 
 
@@ -263,14 +257,9 @@ def broken_table(found: BrokenFigures) -> list[str]:
     kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(found.sent.items()))
     answers = ", ".join(f"{n} of {status}" for status, n in found.statuses.items())
     return [
-        f"### {sum(found.sent.values())} broken uploads within {found.seconds:.0f} s",
-        "",
-        "| | |",
-        "|---|--:|",
-        f"| files | {kinds} |",
-        f"| answers | {answers} |",
+        f"### {sum(found.sent.values())} broken uploads within {found.seconds:.0f} s", "", "| | |",
+        "|---|--:|", f"| files | {kinds} |", f"| answers | {answers} |",
         f"| **5xx, or no answer** | **{len(found.failed)}** |",
         f"| **processes that ended** | **{found.crashed}** |",
-        f"| most memory of a process, decoders too | {found.peak_bytes / 2**20:.0f} MiB |",
-        "",
-    ]
+        f"| most memory of a process, decoders too | {found.peak_bytes / 2**20:.0f} MiB |", "",
+    ]  # fmt: skip

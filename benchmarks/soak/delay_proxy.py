@@ -1,4 +1,4 @@
-"""A network between two programs of one machine: what goes through comes later."""
+"""Delay the messages between two programs of one machine, as a network does."""
 
 from __future__ import annotations
 
@@ -15,48 +15,47 @@ from multiprocessing.connection import Connection as Pipe
 
 
 class DelayProxy:
-    """A process of its own that hands on what comes to its port.
+    """A process that forwards connections to a port, and delays each message.
 
     Parameters
     ----------
-    port : of this machine, that it hands on to
-    delay_s : that each message takes, in either direction
+    port : of this machine, to which connections are forwarded
+    delay_s : of each message, in either direction
     """
 
     def __init__(self, port: int, delay_s: float) -> None:
         context = get_context("spawn")
-        told, tell = context.Pipe(duplex=False)
-        self._process = context.Process(target=_hand_on, args=(tell, port, delay_s), daemon=True)
+        receiver, sender = context.Pipe(duplex=False)
+        self._process = context.Process(target=_serve, args=(sender, port, delay_s), daemon=True)
         self._process.start()
-        self.port: int = told.recv()
+        self.port: int = receiver.recv()
 
     def freeze(self) -> None:
-        """Let nothing through, and break nothing: as a network that loses everything."""
-        os.kill(self._pid, signal.SIGSTOP)
+        """Let nothing through, and close nothing, as a network that loses everything."""
+        self._send(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let it through again, with all that has come meanwhile."""
-        os.kill(self._pid, signal.SIGCONT)
+        """Let messages through again, with all that have arrived meanwhile."""
+        self._send(signal.SIGCONT)
 
-    @property
-    def _pid(self) -> int:
+    def _send(self, number: signal.Signals) -> None:
         assert self._process.pid is not None
-        return self._process.pid
+        os.kill(self._process.pid, number)
 
     def end(self) -> None:
-        """End it; connections break."""
+        """End the process, which closes the connections."""
         self._process.kill()
         self._process.join()
 
 
-def _hand_on(tell: Pipe, port: int, delay_s: float) -> None:
+def _serve(sender: Pipe, port: int, delay_s: float) -> None:
     with socket.create_server(("127.0.0.1", 0), backlog=256) as listener:
-        tell.send(listener.getsockname()[1])
+        sender.send(listener.getsockname()[1])
         while True:
             near, _ = listener.accept()
             try:
                 far = socket.create_connection(("127.0.0.1", port))
-            except OSError:  # nobody is there now
+            except OSError:  # nobody listens now
                 near.close()
                 continue
             for one in (near, far):
@@ -65,7 +64,7 @@ def _hand_on(tell: Pipe, port: int, delay_s: float) -> None:
 
 
 def _join(near: socket.socket, far: socket.socket, delay_s: float) -> None:
-    """Hand on in both directions, until both have ended."""
+    """Forward in both directions, until both have ended."""
     with near, far:
         back = threading.Thread(target=_pump, args=(far, near, delay_s), daemon=True)
         back.start()
@@ -74,12 +73,12 @@ def _join(near: socket.socket, far: socket.socket, delay_s: float) -> None:
 
 
 def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
-    """Hand on what comes, each message for itself: one that follows closely comes as closely."""
+    """Forward each message with its own delay."""
     coming, is_open = deque[tuple[float, bytes]](), True
     with suppress(OSError):
         while is_open or coming:
             wait_s = max(coming[0][0] - time.monotonic(), 0.0) if coming else None
-            # of `select` alone the time is not counted in whole milliseconds
+            # only `select` counts its time in less than milliseconds
             if is_open and select.select([source], [], [], wait_s)[0]:
                 data = source.recv(1 << 16)
                 is_open = bool(data)

@@ -1,12 +1,13 @@
-"""A client of several addresses of a service, of which one answers unless none does."""
+"""Send requests to several addresses of a service, of which one answers unless all are down."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import cycle
-from types import TracebackType
 from typing import Any
 
 import httpx
@@ -15,10 +16,8 @@ from sceneprint_client.http import retry_after_s
 
 #: Seconds before the addresses are tried again, once each has refused.
 PAUSE_S = 0.25
-#: Seconds after which a silent address counts as dead.
-SILENCE_S = 20.0
-#: Seconds after which a request is given up.
-PATIENCE_S = 180.0
+#: Seconds after which a silent address counts as dead, and after which a request is given up.
+SILENCE_S, PATIENCE_S = 20.0, 180.0
 #: Statuses after which a client tries again.
 LATER = (429, 503, 507)
 
@@ -29,14 +28,7 @@ class NoAnswer(Exception):
 
 @dataclass(frozen=True)
 class Exchange:
-    """A request that was answered; times of `time.monotonic`.
-
-    Parameters
-    ----------
-    kind : of the request
-    begun, answered : when
-    tries : how often it was sent
-    """
+    """A request that was answered, how often it was sent, and when, by `time.monotonic`."""
 
     kind: str
     begun: float
@@ -46,21 +38,11 @@ class Exchange:
 
 @dataclass
 class RequestLog:
-    """What the robots met with; shared by all."""
+    """Requests that were answered, and descriptions of faults; shared by all clients."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     exchanges: list[Exchange] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
-
-    def add(self, exchange: Exchange) -> None:
-        """Add a request that was answered."""
-        with self.lock:
-            self.exchanges.append(exchange)
-
-    def fault(self, text: str) -> None:
-        """Add something that must not happen."""
-        with self.lock:
-            self.faults.append(text)
 
 
 def bearer(key: str) -> dict[str, str]:
@@ -68,8 +50,8 @@ def bearer(key: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {key}"}
 
 
-class FailoverClient:
-    """A client that turns to the next address where one is silent or refuses.
+class FailoverClient(ExitStack):
+    """A client that turns to the next address if one is silent or refuses.
 
     Parameters
     ----------
@@ -78,24 +60,15 @@ class FailoverClient:
     first : number of the address that is tried first
     """
 
-    def __init__(self, urls: list[str], log: RequestLog, first: int = 0) -> None:
-        self._log = log
+    def __init__(self, urls: Sequence[str], log: RequestLog, first: int = 0) -> None:
+        super().__init__()
+        self._log, first = log, first % len(urls)
         self.clients = [
-            httpx.Client(base_url=url, timeout=SILENCE_S, trust_env=False)
-            for url in urls[first % len(urls) :] + urls[: first % len(urls)]
+            self.enter_context(httpx.Client(base_url=url, timeout=SILENCE_S, trust_env=False))
+            for url in (*urls[first:], *urls[:first])
         ]
         self._order = cycle(self.clients)
         self._current = next(self._order)
-
-    def __enter__(self) -> FailoverClient:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:  # fmt: skip
-        for client in self.clients:
-            client.close()
 
     def send(self, kind: str, method: str, path: str, **request: Any) -> httpx.Response:
         """Send a request that may be repeated, until any address answers it.
@@ -116,13 +89,15 @@ class FailoverClient:
             try:
                 response = self._current.request(method, path, **request)
             except httpx.TransportError:
-                pass  # killed, or not started yet
+                pass  # it was killed, or has not started yet
             else:
                 if response.status_code not in LATER:
-                    self._log.add(Exchange(kind, begun, time.monotonic(), tries))
+                    with self._log.lock:
+                        self._log.exchanges.append(Exchange(kind, begun, time.monotonic(), tries))
                     # 404 answers a deletion whose first answer was lost
                     if not response.is_success and (kind, response.status_code) != ("delete", 404):
-                        self._log.fault(f"{kind}: {response.status_code} {response.text:.300}")
+                        fault = f"{kind}: {response.status_code} {response.text:.300}"
+                        self._log.faults.append(fault)
                     return response
                 pause = min(retry_after_s(response.headers.get("Retry-After", "")), 1.0)
             self._current = next(self._order)

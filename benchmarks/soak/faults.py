@@ -1,20 +1,20 @@
-"""Injected faults: what is killed, frozen, cut off or filled at random, and when."""
+"""Inject faults at random moments: kill, freeze or cut off processes, and fill the disk."""
 
 from __future__ import annotations
 
 import os
 import random
 import signal
-import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 import httpx
 
 from benchmarks.soak.plan import Plan
-from benchmarks.soak.processes import Fleet, Part, await_service
+from benchmarks.soak.processes import Fleet, await_service
 
 #: How often a kill hits each, in proportion: the process that signs, and its supervisor.
 VICTIMS = {"service": 3, "worker": 2, "signing process": 2}
@@ -112,16 +112,12 @@ class FaultInjector:
 
     def _kill(self, victim: str) -> None:
         part = self.rng.choice(self.fleet.services if victim == "service" else self.fleet.workers)
-        signing = part.children() if victim == "signing process" else []
-        if not signing:
-            self._restart(part, "service" if victim == "service" else "worker")
+        if victim == "signing process" and (signing := part.children()):
+            self.kills.append(Kill(victim, time.monotonic()))
+            with suppress(ProcessLookupError):
+                os.kill(signing[0], signal.SIGKILL)
             return
-        self.kills.append(Kill(victim, time.monotonic()))
-        with suppress(ProcessLookupError):
-            os.kill(signing[0], signal.SIGKILL)
-
-    def _restart(self, part: Part, victim: str) -> None:
-        self.kills.append(Kill(victim, time.monotonic()))
+        self.kills.append(Kill("service" if victim == "service" else "worker", time.monotonic()))
         part.kill()
         time.sleep(self.rng.uniform(*AWAY_S))
         part.start()
@@ -156,19 +152,15 @@ class FaultInjector:
             time.sleep(STALL_S)
         killed = time.monotonic()
         self.kills[-1] = Kill(PRIMARY, killed)
-        pair.kill_primary()
+        pair.primary.kill()
         time.sleep(UNNOTICED_S)
         pair.promote()
         promoted = time.monotonic()
         resumed: dict[str, float] = {}
-        watching = [
-            threading.Thread(target=self._watch, args=(url, promoted, resumed)) for url in urls
-        ]
-        for one in watching:
-            one.start()
-        unreceived = pair.unreceived()
-        for one in watching:
-            one.join()
+        with ThreadPoolExecutor(len(urls)) as pool:
+            for url in urls:
+                pool.submit(self._watch, url, promoted, resumed)
+            unreceived = pair.unreceived()
         self.promotions.append(Promotion(killed, promoted, resumed, frozenset(unreceived)))
         pair.renew()
 

@@ -1,7 +1,4 @@
-"""For how long writers of a fleet exclude each other, sampled from the server's locks.
-
-LockSampler(server)  --look, every few milliseconds-->  LockShares
-"""
+"""Sample from the server's locks for how long writers of a fleet exclude each other."""
 
 from __future__ import annotations
 
@@ -14,11 +11,11 @@ import psycopg
 
 from sceneprint.store.postgres.connection import LOCKS, MAP_LOCKS, TURN
 
-#: Seconds between two looks, and until a server that does not answer is asked again.
+#: Seconds between two samples, and until a server that does not answer is tried again.
 EVERY_S, AGAIN_S = 0.02, 0.25
 #: Seconds for the last answer.
 PATIENCE_S = 10.0
-_ASKED = (
+_QUERY = (
     "SELECT count(*) FILTER (WHERE classid = %s AND objid = %s AND mode = 'ExclusiveLock'),"
     " count(*) FILTER (WHERE classid = %s AND mode = 'ExclusiveLock')"
     " FROM pg_locks WHERE locktype = 'advisory' AND granted"
@@ -27,12 +24,12 @@ _ASKED = (
 
 @dataclass
 class LockShares:
-    """What the samples say.
+    """The sums over all samples.
 
     Parameters
     ----------
-    samples : how many
-    seconds : that they stand for: of a server that did not answer none is taken
+    samples : their number
+    seconds : that they stand for; a server that does not answer is not sampled
     everybody, one_map : seconds in which all writers of the fleet had to wait for one, and those of
         a map for one of that map, maps added up
     """
@@ -44,11 +41,11 @@ class LockShares:
 
 
 class LockSampler(threading.Thread):
-    """Looks at the locks of whichever server is the primary.
+    """A thread that samples the locks of whichever server is the primary.
 
     Parameters
     ----------
-    url : tells where that is now
+    url : returns the address of the primary
     """
 
     def __init__(self, url: Callable[[], str]) -> None:
@@ -57,23 +54,23 @@ class LockSampler(threading.Thread):
         self.shares = LockShares()
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop sampling."""
         self._ending.set()
-        self.join(PATIENCE_S)  # a server that hangs answers nobody
+        self.join(PATIENCE_S)  # a frozen server never answers
 
     def run(self) -> None:
-        """Look until told to stop."""
+        """Sample until `stop`."""
         while not self._ending.wait(AGAIN_S):
             try:
                 with psycopg.connect(self._url(), autocommit=True, connect_timeout=3) as connection:
-                    self._look(connection)
-            except psycopg.Error:  # it fell
+                    self._sample(connection)
+            except psycopg.Error:  # the server was killed
                 continue
 
-    def _look(self, connection: psycopg.Connection[tuple[int, int]]) -> None:
+    def _sample(self, connection: psycopg.Connection[tuple[int, int]]) -> None:
         last = time.monotonic()
         while not self._ending.wait(EVERY_S):
-            row = connection.execute(_ASKED, (LOCKS, TURN, MAP_LOCKS)).fetchone()
+            row = connection.execute(_QUERY, (LOCKS, TURN, MAP_LOCKS)).fetchone()
             now = time.monotonic()
             # after a pause of the machine, or of the server, a sample stands for itself alone
             spent, last = min(now - last, 2 * EVERY_S), now

@@ -1,4 +1,4 @@
-"""Every operation of the OpenAPI document, called in allowed and in forbidden ways.
+"""Call every operation of the OpenAPI document, in allowed and in forbidden ways.
 
 schemathesis generates the requests. No answer may be 5xx, or other than the document declares.
 """
@@ -24,7 +24,7 @@ CHECKS = (
 )  # fmt: skip
 #: Of schemathesis.
 PHASES = "examples,coverage,fuzzing,stateful"
-#: Streams of events have no end: so many are read.
+#: Events that are read from a stream, which has no end.
 _EVENTS = 2
 _COUNTED = re.compile(r"(\d+) generated(?:, (\d+) found \d+ unique failures?)?(?:, (\d+) passed)?")
 
@@ -35,9 +35,9 @@ class OperationFigures:
 
     Parameters
     ----------
-    caller : whose key was shown, and what it named
-    operations : that were called
-    requests, passed : sent, and answered as the document says
+    caller : whose key was sent, and what the requests named
+    operations : number that were called
+    requests, passed : number sent, and answered as the document says
     report : of schemathesis
     """
 
@@ -49,27 +49,22 @@ class OperationFigures:
 
     @property
     def sound(self) -> bool:
-        """Return whether something was called, and nothing failed."""
+        """Return whether requests were sent, and none failed."""
         return self.requests > 0 and self.requests == self.passed
 
 
 def call_operations(
-    caller: str, url: str, folder: Path, *, key: str | None = None,
-    known: Mapping[str, str] | None = None,
-    examples: int = 20, seed: int = 1, phases: str = PHASES,
-) -> OperationFigures:  # fmt: skip
+    caller: str, url: str, folder: Path, options: Sequence[str], known: Mapping[str, str]
+) -> OperationFigures:
     """Call every operation of a service.
 
     Parameters
     ----------
     caller, url : see OperationFigures, and of the service
     folder : for the configuration
-    key : to show
-    known : parameters of paths and queries, such as map_name: what is there, so that more than
-        404 comes back. Nothing is deleted then
-    examples : requests of each operation, besides those of the edges of its schema
-    seed : of what is generated
-    phases : of schemathesis
+    options : more options of schemathesis
+    known : parameters of paths, such as path.map_name, of stored things, so that more than 404
+        comes back. Nothing is deleted then
     """
     lines = [f"max-stream-events = {_EVENTS}", "request-timeout = 30.0"]
     if known:
@@ -78,21 +73,17 @@ def call_operations(
     config.write_text("\n".join(lines) + "\n")
     command = [
         str(Path(sys.executable).parent / "schemathesis"), "--config-file", str(config),
-        "run", f"{url}/openapi.json", "--checks", ",".join(CHECKS), "--phases", phases,
-        "--max-examples", str(examples), "--seed", str(seed), "--generation-database", "none",
-        "--suppress-health-check", "all", "--no-color", "--warnings", "off", "--workers", "1",
-        "--continue-on-failure", "--no-shrink",
+        "run", f"{url}/openapi.json", "--checks", ",".join(CHECKS), "--seed", "1",
+        "--generation-database", "none", "--suppress-health-check", "all", "--no-color",
+        "--warnings", "off", "--workers", "1", "--continue-on-failure", "--no-shrink", *options,
+        *(("--exclude-method", "DELETE") if known else ()),
     ]  # fmt: skip
-    if key is not None:
-        command += ["--header", f"Authorization: Bearer {key}"]
-    if known:
-        command += ["--exclude-method", "DELETE"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     return read_report(caller, done.stdout + done.stderr, done.returncode)
 
 
 def read_report(caller: str, report: str, code: int) -> OperationFigures:
-    """Return what schemathesis counted; an exit code that it does not explain is a failure."""
+    """Return the counts of schemathesis; an exit code that it does not explain is a failure."""
     counted, tested = _COUNTED.search(report), re.search(r"Tested: (\d+)", report)
     if counted is None or tested is None:
         return OperationFigures(caller, 0, 0, 0, report)
@@ -113,7 +104,8 @@ def call_as_everybody(
     ----------
     folder : empty; of data and configuration
     frames : that each map holds
-    examples, phases : see `call_operations`
+    examples : requests of each operation, besides those of the edges of its schema
+    phases : of schemathesis
     """
     found = []
     plan = Plan("sqlite", services=1, workers=1)
@@ -121,9 +113,9 @@ def call_as_everybody(
         own = folder / caller
         own.mkdir()
         with Fleet(own, plan) as fleet:
-            operator = fleet.start()
+            key = fleet.start()
             url = fleet.urls[0]
-            with Client(url, operator) as client:
+            with Client(url, key) as client:
                 for name in ("siege", "other"):
                     client.create_map(name, model=MODEL)
                     for one in frames:
@@ -131,38 +123,27 @@ def call_as_everybody(
                 map_name = "other" if caller == "another map" else "siege"
                 frame = next(iter(client.frames(map_name)))
                 query = client.query(map_name, frame_id=frame.frame_id)
-                known = {
-                    "path.map_name": map_name, "path.frame_id": frame.frame_id,
-                    "path.job_id": frame.job_id, "path.query_id": query.query_id,
-                }  # fmt: skip
-                key = operator
                 if caller.endswith("map"):
                     key = client.create_key("fuzzer", {"siege": "write"}).secret
-            named = None if caller == "an operator" else known
-            found.append(
-                call_operations(
-                    caller, url, own, key=key, known=named, examples=examples, phases=phases
-                )
-            )
-            if (
-                caller == "another map"
-            ):  # all are refused, and the edges of schemas would take hours
-                few = max(examples // 5, 1)
-                found.append(
-                    call_operations(
-                        "nothing, without a key", url, own, examples=few, phases="fuzzing"
-                    )
-                )
+            known = {
+                "path.map_name": map_name, "path.frame_id": frame.frame_id,
+                "path.job_id": frame.job_id, "path.query_id": query.query_id,
+            }  # fmt: skip
+            options = ["--phases", phases, "--max-examples", str(examples)]
+            options += ["--header", f"Authorization: Bearer {key}"]
+            named = {} if caller == "an operator" else known
+            found.append(call_operations(caller, url, own, options, named))
+            if caller == "another map":
+                # all are refused, and the edges of schemas would take hours
+                options = ["--phases", "fuzzing", "--max-examples", str(max(examples // 5, 1))]
+                found.append(call_operations("nothing, without a key", url, own, options, {}))
     return found
 
 
 def operation_table(found: Sequence[OperationFigures]) -> list[str]:
     """Return the figures as lines of Markdown."""
     return [
-        f"### Every operation of the OpenAPI document ({found[0].operations})",
-        "",
-        "| called by, or for | answered as declared, none with 5xx |",
-        "|---|--:|",
-        *(f"| {one.caller} | {one.passed} of {one.requests} |" for one in found),
-        "",
-    ]
+        f"### Every operation of the OpenAPI document ({found[0].operations})", "",
+        "| called by, or for | answered as declared, none with 5xx |", "|---|--:|",
+        *(f"| {one.caller} | {one.passed} of {one.requests} |" for one in found), "",
+    ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a soak runs: a store, robots, and the faults that are injected; and the plans of `make`."""
+"""Define the plans of a soak: a store, robots, and the faults that are injected."""
 
 from __future__ import annotations
 
@@ -10,37 +10,36 @@ from typing import Literal
 from benchmarks.soak.failover_client import SILENCE_S
 
 #: Faults by their names on the command line. A kill hits a service, a worker or a process that
-#: signs; the numbers of `operation` and `attack` are requests of each, and seconds of each.
+#: signs. The number of `operation` counts requests of each, that of `attack` seconds of each.
 FAULTS = (
     "kill", "failover", "freeze", "partition", "full-disk", "offline-hour",
     "broken-upload", "attack", "operation",
 )  # fmt: skip
-#: The map that most robots share; every so many robots have one of their own, of so many.
+#: The map that most robots share. Every fourth robot has a map of its own, of 19.
 MAP, MODEL, OWN, OWN_MAPS = "fleet", "depth", 4, 19
-#: Robots that are so many that no surfaces are built for their maps.
+#: No surfaces are built for the maps of so many robots.
 CROWD = 100
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A run.
+    """The settings of a run.
 
     Parameters
     ----------
-    store : what holds the rows
-    faults : how often each is injected; of the offline hour, frames that a robot spools in it
-    seconds : for which the robots walk; attacks may end sooner
-    robots, rate : how many, and frames a second of each
+    store : of the rows
+    faults : number of each; for the offline hour, the number of frames that a robot spools
+    seconds : duration of the walks; attacks may end sooner
+    robots, rate : number of robots, and frames a second of each
     signed : whether robots wait until their frame is signed
-    readers : clients that repeat exact searches all the time
-    services, workers : processes
-    asynchronous : whether the standby may lack what is acknowledged
-    objects, delays : whether blobs are in an object store, and whether messages take their time
-    retention_s : for which maps of single robots keep a frame, while the shared one keeps all
-    most_turn_ms : of a frame, for which all writers may have to wait for one, beside the time for
+    readers : number of clients that repeat exact searches
+    services, workers : number of processes
+    asynchronous : whether the standby may lack acknowledged rows
+    objects, delays : whether blobs are in an object store, and whether messages are delayed
+    retention_s : seconds for which the maps of single robots keep a frame; the shared map keeps all
+    most_turn_ms : most time for which a frame may make all writers wait, beside the time for
         which hosts are cut off
-    most_query_ms : 99 of 100 queries are answered within it
-    most_bytes : of a process
+    most_query_ms, most_bytes : bounds of the 99th percentile of queries, and of a process's memory
     seed : of victims and moments
     data : folder of recordings; default: synthetic rooms
     """
@@ -81,7 +80,7 @@ class Plan:
     def map_of(self, robot: int) -> str:
         """Return the map that a robot sends to."""
         own = robot % OWN == OWN - 1
-        if self.retention_s is not None:  # as many frames are to go as come, but for a few
+        if self.retention_s is not None:  # so that most frames are deleted again
             own = not own
         return f"{MAP}-{robot % (OWN * OWN_MAPS)}" if own else MAP
 

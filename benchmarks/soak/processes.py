@@ -1,29 +1,25 @@
-"""The processes of a run on one machine: services, workers, and servers of their data."""
+"""Run the processes of a plan on one machine: services, workers, and servers of their data."""
 
 from __future__ import annotations
 
 import os
-import re
 import signal
-import socket
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import httpx
-
+from benchmarks.machine import peak_bytes, read_process, running_processes
 from benchmarks.s3 import ObjectServer
 from benchmarks.soak.delay_proxy import DelayProxy
 from benchmarks.soak.plan import Plan
 from benchmarks.soak.postgres_pair import Pair
-from benchmarks.waiting import until
+from benchmarks.waiting import answers, free_port, until
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 from sceneprint.store import Store, open_store
@@ -82,19 +78,19 @@ class Part:
         """Return whether the command has not ended."""
         return self._process is not None and self._process.poll() is None
 
-    def members(self) -> list[int]:
-        """Return the processes of the group that run."""
-        return [pid for pid, group, _ in _processes() if group == self.pid]
+    def peak_bytes(self) -> int:
+        """Return the most memory that a process of the group ever had."""
+        return max(peak_bytes(pid) for pid, group, _ in running_processes() if group == self.pid)
 
     def children(self) -> list[int]:
         """Return the workers that the command has started."""
         return [
-            pid for pid, _, parent in _processes()
-            if parent == self.pid and b"spawn_main" in _read(pid, "cmdline")
+            pid for pid, _, parent in running_processes()
+            if parent == self.pid and b"spawn_main" in read_process(pid, "cmdline")
         ]  # fmt: skip
 
     def kill(self) -> None:
-        """End the whole group at once, as a power cut would."""
+        """Kill the whole group at once, as a power cut would."""
         if self._process is not None:
             os.killpg(self.pid, signal.SIGKILL)
             self._process.wait()
@@ -106,30 +102,9 @@ class Part:
             self._process.terminate()
             try:
                 self._process.wait(60)
+                self._process = None
             except subprocess.TimeoutExpired:
                 self.kill()
-            self._process = None
-
-
-def _read(pid: int, name: str) -> bytes:
-    """Return a file of a process, which is empty once the process has ended."""
-    with suppress(OSError):
-        return Path(f"/proc/{pid}/{name}").read_bytes()
-    return b""
-
-
-def _processes() -> Iterator[tuple[int, int, int]]:
-    """Yield the number, group and parent of each process that runs."""
-    for path in Path("/proc").glob("[0-9]*"):
-        fields = _read(int(path.name), "stat").rpartition(b")")[2].split()
-        if fields and fields[0] != b"Z":
-            yield int(path.name), int(fields[2]), int(fields[1])
-
-
-def peak_bytes(pid: int) -> int:
-    """Return the most memory that a process ever had."""
-    found = re.search(rb"^VmHWM:\s+(\d+) kB", _read(pid, "status"), re.MULTILINE)
-    return 1024 * int(found[1]) if found else 0
 
 
 class Fleet:
@@ -145,14 +120,14 @@ class Fleet:
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
-        self.folder, self._plan = folder, plan
+        self.folder, self._plan, self._opened = folder, plan, ExitStack()
         self.services: list[Part] = []
         self.workers: list[Part] = []
         self.urls: list[str] = []
         self.pair: Pair | None = None
-        #: The disk of uploads, where it is one of its own.
+        #: The disk of uploads, if it is a file system of its own.
         self._disk: Path | None = None
-        #: By which each host reaches the servers, where it does not reach them itself.
+        #: The delayed connections of each host to the servers.
         self._networks: list[list[DelayProxy]] = []
         self._objects = ObjectServer() if plan.objects else None
         self._shared = dict(SETTINGS)
@@ -166,16 +141,7 @@ class Fleet:
         self, kind: type[BaseException] | None, error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:  # fmt: skip
-        for part in (*self.workers, *self.services):
-            part.kill()
-        if self.pair is not None:
-            self.pair.end()
-        for proxy in chain.from_iterable(self._networks):
-            proxy.end()
-        if self._objects is not None:
-            self._objects.kill()
-        if self._disk is not None:
-            subprocess.run(["umount", str(self._disk)], check=True)
+        self._opened.close()
 
     def start(self) -> str:
         """Start all processes, and return a key that may do everything."""
@@ -186,17 +152,19 @@ class Fleet:
             size = f"size={DISK_BYTES}"
             subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(disk)], check=True)
             self._disk = disk
+            self._opened.callback(subprocess.run, ["umount", str(disk)], check=True)
         if plan.store == "postgresql":
             (self.folder / "database").mkdir()
             self.pair = Pair(self.folder / "database", synchronous=not plan.asynchronous)
+            self._opened.callback(self.pair.end)
             self.pair.start()
             blobs = f"file://{self.folder / 'blobs'}"
             if self._objects is not None:
-                self._objects.start()
+                self._opened.enter_context(self._objects)
                 blobs = f"{self._objects.bucket('fleet')}/blobs"
                 self._shared |= self._objects.env
             self._shared |= {
-                "SCENEPRINT_DATABASE_URL": self.pair.url, "SCENEPRINT_BLOB_URL": blobs
+                "SCENEPRINT_DATABASE_URL": self.pair.url(), "SCENEPRINT_BLOB_URL": blobs
             }  # fmt: skip
         secret = subprocess.run(
             [sys.executable, "-c", _CREATE_KEY, str(self.folder / "host-1")], check=True, text=True,
@@ -212,6 +180,7 @@ class Fleet:
             command = ["work", "--workers", "1"]
             self.workers.append(self._part(f"worker-{number + 1}", command, number, hosts))
         for part in (*self.services, *self.workers):
+            self._opened.callback(part.kill)
             part.start()
         for url in self.urls:
             await_service(url)
@@ -231,21 +200,22 @@ class Fleet:
         if self.pair is None or not (self._plan.delays or self._plan.count("partition")):
             return self._shared
         database = [self._reached(port, DATABASE_S) for port in self.pair.ports]
-        own = self._shared | {"SCENEPRINT_DATABASE_URL": self.pair.url_at(database)}
+        own = self._shared | {"SCENEPRINT_DATABASE_URL": self.pair.url(database)}
         if self._objects is not None:
             port = self._reached(self._objects.port, STORE_S)
             own["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{port}"
         return own
 
     def _reached(self, port: int, delay_s: float) -> int:
-        """Return the port by which the newest host reaches a server."""
+        """Return the port at which the newest host reaches a server."""
         proxy = DelayProxy(port, delay_s if self._plan.delays else 0.0)
+        self._opened.callback(proxy.end)
         self._networks[-1].append(proxy)
         return proxy.port
 
     @contextmanager
     def partitioned(self, host: int) -> Iterator[None]:
-        """Cut a host off from the database and the object store; whoever calls it reaches it."""
+        """Cut a host off from the database and the object store; clients still reach it."""
         for proxy in self._networks[host]:
             proxy.freeze()
         try:
@@ -272,8 +242,7 @@ class Fleet:
     def memory(self) -> tuple[int, int]:
         """Return the most bytes that a process of services, and one of workers, ever had."""
         found = [
-            max(peak_bytes(pid) for part in parts for pid in part.members())
-            for parts in (self.services, self.workers)
+            max(part.peak_bytes() for part in parts) for parts in (self.services, self.workers)
         ]
         return found[0], found[1]
 
@@ -314,25 +283,6 @@ class Fleet:
             os.environ.update(before)
 
 
-def free_port() -> int:
-    """Return a port that nobody listens on now."""
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
 def await_service(url: str) -> None:
-    """Return once a service can work."""
-    until(partial(_is_ready, url), pause_s=0.1)
-
-
-def _is_ready(url: str) -> bool:
-    try:
-        return httpx.get(f"{url}/readyz", trust_env=False, timeout=5).is_success
-    except httpx.TransportError:
-        return False
-
-
-def ended(before: Sequence[int]) -> int:
-    """Return how many of some processes have ended."""
-    return len(set(before) - {pid for pid, _, _ in _processes()})
+    """Return once a service is ready."""
+    until(partial(answers, f"{url}/readyz"), pause_s=0.1)

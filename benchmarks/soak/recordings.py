@@ -1,7 +1,4 @@
-"""What the robots of the fleet replay: recorded walks, one of its own for each.
-
-folder of recordings  --walks-->  Walk, ... : one a sequence and grid of samples
-"""
+"""Return the walks that robots replay: frames of recordings, thinned by different grids."""
 
 from __future__ import annotations
 
@@ -21,22 +18,17 @@ from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.frame_files import meta_of
 from sceneprint_lab.cli.demo import write_building
 
-#: Every so many samples of a frame, so that signing costs little; there are as many walks in a
-#: recording as such grids, and no two of their frames have the same content.
+#: A grid has every fourth sample of a frame, so that signing is cheap. The frames of different
+#: grids of a recording have different content.
 STRIDE = 4
-#: Frames of a synthetic room's walks, and walks of it.
-ROOM_FRAMES, GRIDS = 30, STRIDE**2
+GRIDS = STRIDE**2
+#: Frames of a synthetic room.
+ROOM_FRAMES = 30
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame as a robot sends it.
-
-    Parameters
-    ----------
-    png : its file
-    meta : its camera and its pose
-    """
+    """A frame as a robot sends it: its file, and its camera and pose."""
 
     png: bytes
     meta: FrameMeta
@@ -44,25 +36,23 @@ class Shot:
 
 @contextmanager
 def recordings(data: Path | None, frames: int) -> Iterator[Path]:
-    """A folder of recordings: the one given, or synthetic rooms that hold so many frames."""
+    """Yield a folder of recordings, or of synthetic rooms that have so many frames."""
     if data is not None:
         yield data
         return
     with tempfile.TemporaryDirectory(prefix="sceneprint-walks-") as folder:
-        rooms = -(-frames // (ROOM_FRAMES * GRIDS))
-        for _ in write_building(Path(folder), rooms):
+        for _ in write_building(Path(folder), -(-frames // (ROOM_FRAMES * GRIDS))):
             pass
         yield Path(folder)
 
 
 def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
-    """`n` walks of up to `frames` frames; the same ones each time.
+    """Return `n` walks of `frames` frames each; the same ones each time.
 
     Parameters
     ----------
     data : folder of recordings
-    n : how many
-    frames : the most of each
+    n, frames : number of walks, and of the frames of each
 
     Raises
     ------
@@ -86,13 +76,13 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
             sequence, grid = places.pop(0)
             room = frames - len(walk)
             walk += [(one, grid) for one in sequence[:room]]
-            if len(sequence) > room:  # another robot goes on there, once all have begun
+            if len(sequence) > room:  # another robot continues there, once all have begun
                 places.append((sequence[room:], grid))
     return [[thinned(*one) for one in walk] for walk in found]
 
 
 def thinned(frame: FrameReference, grid: int) -> Shot:
-    """A frame with every STRIDE-th of its samples, from one of the grids of them."""
+    """Return a frame with the samples of one grid."""
     read, meta = _read(frame), meta_of(frame)
     k, (y, x) = read.intrinsics, divmod(grid, STRIDE)
     depth = np.ascontiguousarray(read.depth[y::STRIDE, x::STRIDE])
@@ -104,10 +94,10 @@ def thinned(frame: FrameReference, grid: int) -> Shot:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frame.png"
         write_depth_png(path, depth, 1000.0)
-        said = {"intrinsics": camera, "depth_scale": 1000.0, "depth_along_ray": False}
-        return Shot(path.read_bytes(), meta.model_copy(update=said))
+        lens = {"intrinsics": camera, "depth_scale": 1000.0, "depth_along_ray": False}
+        return Shot(path.read_bytes(), meta.model_copy(update=lens))
 
 
-@lru_cache(maxsize=128)  # robots of one recording take the same frames, one after the other
+@lru_cache(maxsize=128)  # robots of one recording use the same frames, one after the other
 def _read(frame: FrameReference) -> DepthFrame:
     return frame.read_depth()

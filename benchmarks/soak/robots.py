@@ -1,4 +1,4 @@
-"""Clients of a run: robots that replay walks, readers that search, and listeners to events."""
+"""Run the clients of a soak: robots that replay walks, readers that search, and listeners."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from heapq import heapify, heappop, heappush
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -25,10 +24,8 @@ from sceneprint_client.http import StreamPosition, frame_form, read_events
 
 #: Of so many uploads one is followed by a query, and one by the deletion of its frame.
 QUERY_EVERY, DELETE_EVERY = 5, 10
-#: Matches that an exact search lists.
-K = 20
-#: Seconds until a thread without a robot looks for one.
-LOOK_S = 0.1
+#: Matches that an exact search lists, and seconds between two searches of a reader.
+K, SEARCH_S = 20, 0.1
 #: Seconds that a robot that was offline may take to send everything.
 OFFLINE_PATIENCE_S = 600.0
 _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited)
@@ -36,14 +33,7 @@ _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited)
 
 @dataclass(frozen=True)
 class Acknowledged:
-    """A frame whose upload was acknowledged.
-
-    Parameters
-    ----------
-    frame_id, map_name : of the frame
-    shot : that was sent
-    begun : when it was sent for the first time, of `time.monotonic`
-    """
+    """A frame whose upload was acknowledged, and when it was sent first, by `time.monotonic`."""
 
     frame_id: str
     map_name: str
@@ -59,7 +49,7 @@ class Search:
     ----------
     frame_id : of that frame
     matches : ids and distances, in the order of the answer
-    begun, answered : when, of `time.monotonic`
+    begun, answered : by `time.monotonic`
     """
 
     frame_id: str
@@ -77,7 +67,7 @@ class Ledger:
     frames : acknowledged uploads
     deleted : when the deletion of a frame was sent and acknowledged
     searches : of the readers
-    queries : how many were answered
+    queries : number of answered queries
     """
 
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -89,15 +79,7 @@ class Ledger:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot that uploads a walk.
-
-    Parameters
-    ----------
-    number, name, key : of the robot
-    map_name : that it uploads to
-    walk : its frames
-    begins_s : seconds until its first frame
-    """
+    """A robot that uploads a walk with its key, from `begins_s` seconds after the start on."""
 
     number: int
     name: str
@@ -107,6 +89,31 @@ class Robot:
     begins_s: float
 
 
+class SoakThread(threading.Thread):
+    """A client in a thread of its own, whose failure is a fault of the run."""
+
+    def __init__(self, name: str, log: RequestLog) -> None:
+        super().__init__(name=name, daemon=True)
+        self._log = log
+
+    def run(self) -> None:
+        """Work until the run ends."""
+        try:
+            self.work()
+        except Exception as error:  # any failure ends the work of this client
+            self._log.faults.append(f"{self.name}: {type(error).__name__}: {error}")
+
+    def work(self) -> None:
+        """Do what the client is for."""
+        raise NotImplementedError
+
+    def finish(self, seconds: float) -> None:
+        """Wait for the end; one that takes longer is a fault."""
+        self.join(max(seconds, 0.0))
+        if self.is_alive():
+            self._log.faults.append(f"{self.name} does not end")
+
+
 def image_query(shot: Shot, **options: str) -> dict[str, Any]:
     """Return the arguments of a request that queries where a frame was taken."""
     sent = frame_form(shot.png, shot.meta.model_copy(update={"pose": None}))
@@ -114,76 +121,44 @@ def image_query(shot: Shot, **options: str) -> dict[str, Any]:
     return sent
 
 
-class RobotCrowd:
-    """Robots that a few threads drive: each thread takes the robot whose turn is next.
+class Driver(SoakThread):
+    """A thread that drives some robots, whose turns come one after the other.
 
     Parameters
     ----------
-    robots : all of them
+    robots : in the order in which they begin
     rate : frames a second of each
-    clients : of the service, one for each thread
+    client : of the service
     ledger, log : shared with others
     stop : ends the walks; a request that was sent is repeated until it is answered
     deletes, signed : whether robots delete frames, and wait until frames are signed
     """
 
     def __init__(
-        self, robots: Sequence[Robot], rate: float, clients: Sequence[FailoverClient],
-        ledger: Ledger, log: RequestLog, stop: threading.Event, *, deletes: bool, signed: bool,
+        self, robots: Sequence[Robot], rate: float, client: FailoverClient, ledger: Ledger,
+        log: RequestLog, stop: threading.Event, *, deletes: bool, signed: bool,
     ) -> None:  # fmt: skip
-        self._rate, self._ledger, self._log, self._stop = rate, ledger, log, stop
-        self._robots, self._lock, self._deletes = robots, threading.Lock(), deletes
+        super().__init__(f"driver of {robots[0].name}", log)
+        self._robots, self._rate, self._client = robots, rate, client
+        self._ledger, self._stop_walks, self._deletes = ledger, stop, deletes
         self._wait = {"Prefer": "wait=50"} if signed else {}
-        self._due: list[tuple[float, int, int]] = []  # when, robot, number of its frame
-        self._threads = [
-            threading.Thread(target=self._drive, args=(one,), name=f"robots-{i}", daemon=True)
-            for i, one in enumerate(clients)
-        ]
 
-    def start(self) -> None:
-        """Start all walks."""
-        now = time.monotonic()
-        self._due = [(now + one.begins_s, i, 0) for i, one in enumerate(self._robots)]
-        heapify(self._due)
-        for thread in self._threads:
-            thread.start()
+    def work(self) -> None:
+        """Send each frame when its turn has come."""
+        begun = time.monotonic()
+        with self._client:
+            for number in range(max(len(one.walk) for one in self._robots)):
+                for robot in self._robots:
+                    after, now = robot.begins_s + number / self._rate, time.monotonic()
+                    begun = max(begun, now - after)  # late robots go on at their rate
+                    if self._stop_walks.wait(begun + after - now):
+                        return
+                    if number < len(robot.walk):
+                        self._visit(robot, number)
 
-    def join(self, seconds: float) -> None:
-        """Wait until all requests are answered; one that takes longer is a fault."""
-        until = time.monotonic() + seconds
-        for thread in self._threads:
-            thread.join(max(until - time.monotonic(), 0.0))
-            if thread.is_alive():
-                self._log.fault(f"{thread.name} does not end")
-
-    def _drive(self, client: FailoverClient) -> None:
-        try:
-            with client:
-                while (turn := self._next()) is not None:
-                    due, i, number = turn
-                    robot = self._robots[i]
-                    self._visit(client, robot, number)
-                    if number + 1 < len(robot.walk):
-                        again = max(due + 1 / self._rate, time.monotonic())
-                        with self._lock:
-                            heappush(self._due, (again, i, number + 1))
-        except Exception as error:  # whatever it is, the robots of this thread stop
-            self._log.fault(f"{type(error).__name__}: {error}")
-
-    def _next(self) -> tuple[float, int, int] | None:
-        """Return whose turn is next, once it is; None at the end."""
-        while not self._stop.is_set():
-            with self._lock:
-                turn = self._due[0] if self._due else None
-                if turn is not None and turn[0] <= time.monotonic():
-                    return heappop(self._due)
-            # another thread may bring one that is due sooner
-            wait_s = LOOK_S if turn is None else min(turn[0] - time.monotonic(), LOOK_S)
-            self._stop.wait(max(wait_s, 0.0))
-        return None
-
-    def _visit(self, client: FailoverClient, robot: Robot, number: int) -> None:
+    def _visit(self, robot: Robot, number: int) -> None:
         """Upload a frame, and now and then query or delete it."""
+        client, ledger = self._client, self._ledger
         shot, key, begun = robot.walk[number], bearer(robot.key), time.monotonic()
         meta = shot.meta.model_copy(update={"robot": robot.name, "session": robot.name})
         path = f"/v1/maps/{robot.map_name}"
@@ -194,22 +169,20 @@ class RobotCrowd:
         if not response.is_success:
             return
         frame_id = Added.model_validate_json(response.content).frame_id
-        with self._ledger.lock:
-            self._ledger.frames.append(Acknowledged(frame_id, robot.map_name, shot, begun))
+        ledger.frames.append(Acknowledged(frame_id, robot.map_name, shot, begun))
         place = robot.number + number
         if place % QUERY_EVERY == QUERY_EVERY - 1:
-            sent = image_query(shot, k="1")
-            response = client.send("query", "POST", f"{path}/queries", headers=key, **sent)
-            with self._ledger.lock:
-                self._ledger.queries += response.is_success
+            query = image_query(shot, k="1")
+            response = client.send("query", "POST", f"{path}/queries", headers=key, **query)
+            with ledger.lock:
+                ledger.queries += response.is_success
         if self._deletes and place % DELETE_EVERY == 3:
             begun = time.monotonic()
             client.send("delete", "DELETE", f"{path}/frames/{frame_id}", headers=key)
-            with self._ledger.lock:
-                self._ledger.deleted[frame_id] = begun, time.monotonic()
+            ledger.deleted[frame_id] = begun, time.monotonic()
 
 
-class OfflineRobot(threading.Thread):
+class OfflineRobot(SoakThread):
     """A robot that spools its frames while it has no network, and then sends all of them.
 
     Parameters
@@ -225,37 +198,32 @@ class OfflineRobot(threading.Thread):
         self, robot: Robot, file: Path, offline_s: float, urls: Sequence[str], ledger: Ledger,
         log: RequestLog,
     ) -> None:  # fmt: skip
-        super().__init__(name=robot.name, daemon=True)
+        super().__init__(robot.name, log)
         self._robot, self._file, self._offline_s, self._urls = robot, file, offline_s, urls
-        self._ledger, self._log = ledger, log
+        self._ledger = ledger
         #: Frames that were sent twice, as an answer did not come.
         self.repeated = 0
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Spool, wait, send, and note under which ids the frames are stored."""
         begun = time.monotonic()
-        try:
-            with Spool(self._file) as spool:
-                for number, shot in enumerate(self._robot.walk):
-                    spool.add(shot.png, shot.meta.model_copy(update=self._names(number)))
-                time.sleep(max(begun + self._offline_s - time.monotonic(), 0.0))
-                self._try_each(lambda client: self._sync(spool, client))
-                left, refused = spool.status().waiting, spool.refusals()
-            if left or refused:
-                self._log.fault(f"{self.name}: {left} frames wait, refused: {refused[:3]}")
-            self._try_each(self._note_ids)
-        except Exception as error:  # whatever it is, the spool was not sent
-            self._log.fault(f"{self.name}: {type(error).__name__}: {error}")
-
-    def _names(self, number: int) -> dict[str, str]:
-        return {"robot": self.name, "session": self.name, "name": f"{self.name}-{number}"}
+        with Spool(self._file) as spool:
+            for number, shot in enumerate(self._robot.walk):
+                own = {"robot": self.name, "session": self.name, "name": f"{self.name}-{number}"}
+                spool.add(shot.png, shot.meta.model_copy(update=own))
+            time.sleep(max(begun + self._offline_s - time.monotonic(), 0.0))
+            self._try_each(lambda client: self._sync(spool, client))
+            left, refused = spool.status().waiting, spool.refusals()
+        if left or refused:
+            self._log.faults.append(f"{self.name}: {left} frames wait, refused: {refused[:3]}")
+        self._try_each(self._note_ids)
 
     def _try_each(self, do: Callable[[Client], bool]) -> None:
         """Do something at one address after the other, until it is done."""
-        until = time.monotonic() + OFFLINE_PATIENCE_S
+        end = time.monotonic() + OFFLINE_PATIENCE_S
         for url in cycle(self._urls):
             with Client(url, self._robot.key, timeout_s=SILENCE_S) as client, suppress(*_AWAY):
-                if do(client) or time.monotonic() > until:
+                if do(client) or time.monotonic() > end:
                     return
             time.sleep(PAUSE_S)
 
@@ -265,20 +233,16 @@ class OfflineRobot(threading.Thread):
 
     def _note_ids(self, client: Client) -> bool:
         """Note what is stored; a frame that was spooled and is not stored is missing for good."""
-        found = {one.name: one.frame_id for one in client.frames(self._robot.map_name)}
-        now = time.monotonic()
-        with self._ledger.lock:
-            self._ledger.frames += [
-                Acknowledged(
-                    found.get(f"{self.name}-{number}", f"never-came-{number}"),
-                    self._robot.map_name, shot, now,
-                )
-                for number, shot in enumerate(self._robot.walk)
-            ]  # fmt: skip
+        robot = self._robot
+        ids = {one.name: one.frame_id for one in client.frames(robot.map_name)}
+        for number, shot in enumerate(robot.walk):
+            frame_id = ids.get(f"{self.name}-{number}", f"never-came-{number}")
+            one = Acknowledged(frame_id, robot.map_name, shot, time.monotonic())
+            self._ledger.frames.append(one)
         return True
 
 
-class Reader(threading.Thread):
+class Reader(SoakThread):
     """A client that repeats exact searches for the neighbours of frames that stay.
 
     Parameters
@@ -286,59 +250,60 @@ class Reader(threading.Thread):
     key, map_name : of the reader
     stable : ids of the frames that stay
     client : of the service
-    ledger, stop : shared with others
+    ledger, log, stop : shared with others
+    seed : of the choice of frames
     """
 
     def __init__(
         self, key: str, map_name: str, stable: Sequence[str], client: FailoverClient,
-        ledger: Ledger, stop: threading.Event, seed: int,
+        ledger: Ledger, log: RequestLog, stop: threading.Event, seed: int,
     ) -> None:  # fmt: skip
-        super().__init__(name="reader", daemon=True)
+        super().__init__(f"reader-{seed}", log)
         self._key, self._map, self._stable, self._client = key, map_name, stable, client
         self._ledger, self._stop_event, self._rng = ledger, stop, random.Random(seed)
 
-    def run(self) -> None:
-        """Search until the run ends; a request that fails is in the log."""
-        with self._client as client:
-            while not self._stop_event.wait(LOOK_S):
+    def work(self) -> None:
+        """Search until the run ends."""
+        with self._client:
+            while not self._stop_event.wait(SEARCH_S):
                 frame_id, begun = self._rng.choice(self._stable), time.monotonic()
                 query = {"frame_id": frame_id, "stages": ["retrieve"], "exact": True, "k": K}
-                response = client.send(
+                response = self._client.send(
                     "search", "POST", f"/v1/maps/{self._map}/queries", headers=bearer(self._key),
                     json=query | {"keep": False},
                 )  # fmt: skip
                 if response.is_success:
                     found = [(m["frame_id"], m["distance"]) for m in response.json()["matches"]]
                     search = Search(frame_id, found, begun, time.monotonic())
-                    with self._ledger.lock:
-                        self._ledger.searches.append(search)
+                    self._ledger.searches.append(search)
 
 
-class Listener(threading.Thread):
-    """A listener to all events of a map, who takes up the stream elsewhere when it breaks.
+class Listener(SoakThread):
+    """A listener to all events of a map, which continues elsewhere when its stream breaks.
 
     Parameters
     ----------
     map_name : whose events
     key : of the listener
     client : of the service
+    log : shared with others
     """
 
-    def __init__(self, map_name: str, key: str, client: FailoverClient) -> None:
-        super().__init__(name=f"listener of {map_name}", daemon=True)
+    def __init__(self, map_name: str, key: str, client: FailoverClient, log: RequestLog) -> None:
+        super().__init__(f"listener of {map_name}", log)
         self.map_name = map_name
         self._key, self._client = key, client
         self._ending = threading.Event()
         #: How often each event was heard, by kind and frame.
         self.heard: Counter[tuple[str, str | None]] = Counter()
-        #: When retention was heard to have deleted a frame, of `time.monotonic`.
+        #: When retention was heard to have deleted a frame, by `time.monotonic`.
         self.retired: dict[str | None, float] = {}
 
     def stop(self) -> None:
         """Stop listening."""
         self._ending.set()
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Listen until `stop`."""
         place = StreamPosition("0")  # all that is stored
         with self._client:

@@ -1,4 +1,4 @@
-"""One run: clients, injected faults, and what came of it."""
+"""Run a plan: start the processes and clients, inject the faults, and collect the figures."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from benchmarks.soak.recordings import Shot, recordings, walks
 from benchmarks.soak.robots import (
     OFFLINE_PATIENCE_S,
     Acknowledged,
+    Driver,
     Ledger,
     Listener,
     OfflineRobot,
     Reader,
     Robot,
-    RobotCrowd,
     image_query,
 )
 from sceneprint.store.deletion import DAY_S
@@ -48,19 +48,19 @@ from sceneprint_client.errors import JobOver, UnknownJob
 OFFLINE_MAP, OFFLINE = "fleet-offline", 0.4
 #: Frames that are in the shared map all the time.
 STABLE = 24
-#: Seconds that a robot may take to have its last frame acknowledged.
+#: Seconds until the last frame of a robot has to be acknowledged.
 PATIENCE_S = 240.0
 #: Least part of the time for which locks have to be sampled.
 SAMPLED = 0.5
 #: Threads that drive the robots; keys of an attacker, frames of its map, and those with poses.
 DRIVERS, KEYS, ROWS, POSED = 32, 10, 1_000, 16
-#: How SQLite says that a writer gave up waiting, and how we do.
+#: Messages of SQLite, and ours, when a writer gives up waiting.
 LOCKED = ("database is locked", "have waited for long", "has been writing for long")
 
 
 @dataclass
 class SoakFigures:
-    """What came of a run.
+    """The figures of a run.
 
     Parameters
     ----------
@@ -70,16 +70,15 @@ class SoakFigures:
     promotions : of the standby
     waits_ms : median and 99th percentile of each kind of request
     memory : most bytes of a service's process, and of a worker's
-    deleted, queries, repeated : frames that robots deleted, queries that were answered, and
+    deleted, queries, repeated : numbers of frames that robots deleted, of answered queries, and of
         requests that were sent again
-    faults : answers that must not be
+    faults : descriptions of wrong answers and failed clients
     locked : lines of logs in which a writer gave up waiting
     damaged, leftovers : findings of `sceneprint fsck`
     lost : acknowledged frames that are missing, beyond those that a standby had not received
     window : acknowledged frames that the standbys had not received
-    locks : see LockShares
     spooled, spooled_twice : frames of the robot that was offline, and those that were sent again
-    attacks, broken, operations : see there
+    locks, attacks, broken, operations : see the classes
     seconds : of all
     """
 
@@ -120,14 +119,14 @@ class SoakFigures:
         # a host that is cut off may have the turn for as long
         cut_off_s = plan.count("partition") * CUT_OFF_S
         most_turn_ms = plan.most_turn_ms + 1e3 * cut_off_s / max(self.found.acknowledged, 1)
-        found = {
+        bounds = {
             "the turn of all writers takes": (self.turn_ms[0], most_turn_ms, "ms a frame"),
             "the 99th percentile of queries is": (query_ms, plan.most_query_ms, "ms"),
             "a process had": (max(self.memory) / 1e6, plan.most_bytes / 1e6, "MB"),
         }
         return [
             f"{what} {value:,.1f} {unit}, above {most:,.0f}"
-            for what, (value, most, unit) in found.items()
+            for what, (value, most, unit) in bounds.items()
             if value > most
         ]
 
@@ -145,18 +144,17 @@ class SoakFigures:
             0 if self.broken is None else len(self.broken.failed) + self.broken.crashed,
         )  # fmt: skip
         tried = found.acknowledged > 0 and self.window == len(found.missing)
-        if plan.store == "postgresql":  # a server that fell, or was frozen, is not sampled
+        if plan.store == "postgresql":  # a server that is down or frozen is not sampled
             tried &= self.locks.seconds >= SAMPLED * plan.seconds
         tried &= self.spooled == plan.count("offline-hour")
         return tried and not any(wrong) and (plan.asynchronous or not found.unheard)
 
 
 def drive(folder: Path, plan: Plan) -> SoakFigures:
-    """Run a plan in an empty folder; nothing of it runs afterwards."""
+    """Run a plan in an empty folder, and end all its processes."""
     begun = time.monotonic()
-    more = -(-plan.count("offline-hour") // plan.frames)  # walks, of the robot that is offline
-    more_stable = -(-STABLE // plan.frames)
-    n = plan.robots + more + more_stable
+    # besides the robots' walks, those of the offline robot and of the frames that stay
+    n = plan.robots + -(-plan.count("offline-hour") // plan.frames) + -(-STABLE // plan.frames)
     with recordings(plan.data, n * plan.frames) as data:
         walked = walks(data, n, plan.frames)
     shots = [shot for walk in walked[plan.robots :] for shot in walk]
@@ -181,10 +179,15 @@ class _Run:
         self._ledger, self._log, self._stop = Ledger(), RequestLog(), threading.Event()
         self._rng = random.Random(plan.seed)
         self._figures = SoakFigures(plan, Found(), faults=self._log.faults)
+        #: Seconds for which some maps keep a frame; the others keep all.
+        self._aging: dict[str, float] = {}
+        if plan.retention_s is not None:
+            own = {plan.map_of(i) for i in range(plan.robots)} - {MAP}
+            self._aging = dict.fromkeys(own, plan.retention_s)
 
     def figures(self) -> SoakFigures:
-        """Run it to its end."""
-        fleet, plan, log, figures = self._fleet, self._plan, self._log, self._figures
+        """Run the plan to its end."""
+        fleet, plan, figures = self._fleet, self._plan, self._figures
         key = fleet.start()
         locks = LockSampler(self._primary)
         with ExitStack() as opened:
@@ -194,22 +197,18 @@ class _Run:
             listeners = [self._listener(clients[0], name) for name in names]
             offline = self._offline_robot(clients[0])
             readers = self._readers(clients[0], ids)
-            others: list[threading.Thread] = [*listeners, *offline, *readers]
+            sampling = [locks] if plan.store == "postgresql" else []
             injector = FaultInjector(
                 fleet, plan, partial(_answers, key=key, shot=self._stable[0]), self._rng
             )  # fmt: skip
-            if plan.store == "postgresql":
-                others.append(locks)
-            self._walk(clients[0], key, others, injector)
+            self._walk(clients[0], key, [*listeners, *offline, *readers, *sampling], injector)
             for one in (*offline, *readers):
-                one.join(OFFLINE_PATIENCE_S)
-                if one.is_alive():
-                    log.fault(f"{one.name} does not end")
+                one.finish(OFFLINE_PATIENCE_S)
             for url in fleet.urls:
                 await_service(url)
             await_idle(clients[0])
-            if plan.store == "postgresql":
-                locks.stop()
+            for sampler in sampling:
+                sampler.stop()
             figures.found = check(self._ledger, ids, clients, listeners, self._aging)
             for listener in listeners:
                 listener.stop()
@@ -223,7 +222,7 @@ class _Run:
         return figures
 
     def _count(self, injector: FaultInjector) -> None:
-        """Add up what the injector, the ledger and the log have."""
+        """Add up the faults, the requests and the acknowledged frames."""
         figures, log, ledger = self._figures, self._log, self._ledger
         unreceived = {name for one in injector.promotions for name in one.unreceived}
         window = {one.frame_id for one in ledger.frames} & unreceived
@@ -231,35 +230,26 @@ class _Run:
         figures.outages = outages(injector.kills, log.exchanges)
         figures.promotions = injector.promotions
         for kind in sorted({one.kind for one in log.exchanges}):
-            taken = [1e3 * (one.answered - one.begun) for one in log.exchanges if one.kind == kind]
-            p50, p99 = np.quantile(taken, (0.5, 0.99)).tolist()
+            ms = [1e3 * (one.answered - one.begun) for one in log.exchanges if one.kind == kind]
+            p50, p99 = np.quantile(ms, (0.5, 0.99)).tolist()
             figures.waits_ms[kind] = p50, p99
         figures.repeated = sum(one.tries - 1 for one in log.exchanges)
         figures.deleted, figures.queries = len(ledger.deleted), ledger.queries
         figures.lost, figures.window = len(figures.found.missing - window), len(window)
         figures.spooled = sum(one.map_name == OFFLINE_MAP for one in ledger.frames)
         if self._plan.store == "sqlite":
-            figures.locked = sum(
-                sign in line for line in self._fleet.log_lines() for sign in LOCKED
-            )  # fmt: skip
+            lines = self._fleet.log_lines()
+            figures.locked = sum(sign in line for line in lines for sign in LOCKED)
 
     def _primary(self) -> str:
         assert self._fleet.pair is not None
         return self._fleet.pair.primary.url(DATABASE).replace("+psycopg", "")
 
-    @property
-    def _aging(self) -> dict[str, float]:
-        """Return the seconds for which maps keep a frame that keep none for long."""
-        kept_s, plan = self._plan.retention_s, self._plan
-        own = {plan.map_of(i) for i in range(plan.robots)} - {MAP}
-        return {} if kept_s is None else dict.fromkeys(own, kept_s)
-
     def _create_maps(self, client: Client) -> list[str]:
         """Create the maps of all robots."""
-        plan = self._plan
-        names = list(dict.fromkeys([MAP, *map(plan.map_of, range(plan.robots))]))
-        if self._spooled:
-            names.append(OFFLINE_MAP)
+        names = [MAP, *map(self._plan.map_of, range(self._plan.robots))]
+        names += [OFFLINE_MAP] if self._spooled else []
+        names = list(dict.fromkeys(names))
         for name in names:
             days = self._aging[name] / DAY_S if name in self._aging else None
             client.create_map(name, model=MODEL, retention_days=days)
@@ -270,33 +260,24 @@ class _Run:
         begun = time.monotonic()
         added = [client.upload(MAP, one.png, one.meta) for one in self._stable]
         client.wait([one.job_id for one in added])
-        ids = [one.frame_id for one in added]
         self._ledger.frames += [
-            Acknowledged(name, MAP, shot, begun)
-            for name, shot in zip(ids, self._stable, strict=True)
+            Acknowledged(one.frame_id, MAP, shot, begun)
+            for one, shot in zip(added, self._stable, strict=True)
         ]
-        return ids
+        return [one.frame_id for one in added]
 
     def _walk(
         self, client: Client, key: str, others: Sequence[threading.Thread], injector: FaultInjector
     ) -> None:
         """Start all clients, inject the faults, and stop the robots when it is time."""
-        plan, stop, fleet = self._plan, self._stop, self._fleet
-        clients = [
-            FailoverClient(fleet.urls, self._log, first=i) for i in range(min(plan.robots, DRIVERS))
-        ]
-        robots = self._robots(client)
-        crowd = RobotCrowd(
-            robots, plan.rate, clients, self._ledger, self._log, stop,
-            deletes=not plan.asynchronous, signed=plan.signed,
-        )  # fmt: skip
+        plan, stop = self._plan, self._stop
+        drivers = self._drivers(client)
         noisy = self._noisy(client) if plan.count("attack") else []
         with tqdm(total=plan.seconds, unit="s", disable=None, leave=False) as bar:
             showing = threading.Thread(target=_show, args=(bar, self._ledger, stop), daemon=True)
             begun = time.monotonic()
-            for one in (*others, showing):
+            for one in (*others, showing, *drivers):
                 one.start()
-            crowd.start()
             try:
                 due = schedule(plan.seconds, plan.faults, self._rng)
                 injector.run(due, bar.set_postfix_str)
@@ -305,18 +286,18 @@ class _Run:
                     stop.wait(max(begun + plan.seconds - time.monotonic(), 0.0))
             finally:
                 stop.set()
-        crowd.join(PATIENCE_S)
+        end = time.monotonic() + PATIENCE_S
+        for driver in drivers:
+            driver.finish(end - time.monotonic())
 
     def _besiege(self, client: Client, key: str, noisy: Sequence[str]) -> None:
-        """Send broken uploads, and let a tenant attack the others."""
+        """Let a tenant attack the others, and send broken uploads."""
         plan, fleet, figures = self._plan, self._fleet, self._figures
         if plan.count("attack"):
-            drain = partial(self._empty_queue, client)
-            seconds = float(plan.count("attack"))
-            for one in run_attacks(
-                fleet.urls[0], noisy, self._stable[:8], seconds, self._log, drain
-            ):
-                figures.attacks.append(one)
+            figures.attacks += run_attacks(
+                fleet.urls[0], noisy, self._stable[:8], float(plan.count("attack")), self._log,
+                partial(self._empty_queue, client),
+            )  # fmt: skip
         if plan.count("broken-upload"):
             client.create_map("siege", model=MODEL)
             figures.broken = send_broken(
@@ -342,40 +323,52 @@ class _Run:
             matrix = [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
             pose = {"parent_frame": "map", "matrix": matrix}
             meta = one.meta.model_dump() | {"session": SESSION, "sequence": i, "pose": pose}
-            posed = FrameMeta.model_validate(meta)
-            client.put_frame("noisy", f"posed-{i}", one.png, posed)
+            client.put_frame("noisy", f"posed-{i}", one.png, FrameMeta.model_validate(meta))
         await_idle(client)
         return keys
 
     def _empty_queue(self, client: Client) -> None:
-        """Cancel what waits for the attacker, and wait for the rest."""
+        """Cancel the jobs of the attacker that wait, and wait for the rest."""
         for job in list(client.jobs(JobState.QUEUED)):
             if job.map == "noisy":
                 with suppress(JobOver, UnknownJob):
                     client.cancel_job(job.job_id)
         await_idle(client)
 
-    def _robots(self, client: Client) -> list[Robot]:
-        """Return the robots, each with a key of its own; they start one after the other."""
+    def _drivers(self, client: Client) -> list[Driver]:
+        """Return the threads of the robots, each with a key of its own; they start in turn."""
         plan, robots = self._plan, []
         for i, walk in enumerate(self._walked):
             name, map_name = f"robot-{i}", plan.map_of(i)
             key = client.create_key(name, {map_name: "write"}).secret
             robots.append(Robot(i, name, map_name, key, walk, i / plan.robots / plan.rate))
-        return robots
+        return [
+            Driver(
+                robots[i::DRIVERS], plan.rate, FailoverClient(self._fleet.urls, self._log, i),
+                self._ledger, self._log, self._stop, deletes=not plan.asynchronous,
+                signed=plan.signed,
+            )
+            for i in range(min(plan.robots, DRIVERS))
+        ]  # fmt: skip
 
     def _listener(self, client: Client, map_name: str) -> Listener:
         secret = client.create_key(f"listener-of-{map_name}", {map_name: "read"}).secret
-        return Listener(map_name, secret, FailoverClient(self._fleet.urls, self._log))
+        failover = FailoverClient(self._fleet.urls, self._log)
+        return Listener(map_name, secret, failover, self._log)
 
     def _readers(self, client: Client, ids: Sequence[str]) -> list[Reader]:
         """Return the readers of the shared map."""
-        found = []
-        for i in range(self._plan.readers):
-            secret = client.create_key(f"reader-{i}", {MAP: "read"}).secret
-            failover = FailoverClient(self._fleet.urls, self._log, first=i)
-            found.append(Reader(secret, MAP, ids, failover, self._ledger, self._stop, i))
-        return found
+        secrets = [
+            client.create_key(f"reader-{i}", {MAP: "read"}).secret
+            for i in range(self._plan.readers)
+        ]
+        return [
+            Reader(
+                secret, MAP, ids, FailoverClient(self._fleet.urls, self._log, i), self._ledger,
+                self._log, self._stop, i,
+            )
+            for i, secret in enumerate(secrets)
+        ]  # fmt: skip
 
     def _offline_robot(self, client: Client) -> list[OfflineRobot]:
         """Return the robot that is offline, if there is one."""

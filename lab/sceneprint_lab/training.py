@@ -73,7 +73,7 @@ PRESET_WHITENINGS = {
 
 
 def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
-    """Parameters of a preset.
+    """Return parameters of a preset.
 
     `depth` suits depth cameras indoors, and is what to take by default. `lidar` has longer
     lengths, for scanners that see tens of metres. `paper` has the sizes of Sec. III-F.
@@ -92,7 +92,7 @@ def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
 
 
 def preset_whitening(preset: str) -> tuple[tuple[int, ...], WhiteningParameters, int]:
-    """Levels of psi that stored signatures are made of, how, and the scenes that teach it.
+    """Return levels of psi that stored signatures are made of, how, and the scenes that teach it.
 
     No scenes where psi itself is stored.
     """
@@ -102,7 +102,7 @@ def preset_whitening(preset: str) -> tuple[tuple[int, ...], WhiteningParameters,
 
 
 def preset_scenes(preset: str) -> tuple[Scenes, int]:
-    """What a preset learns from, and how many frames are taken in each."""
+    """Return what a preset learns from, and how many frames are taken in each."""
     return ("sites", 3) if preset == "lidar" else ("rooms", 6)
 
 
@@ -112,16 +112,9 @@ _MOST_VIOLATIONS = 0.08
 #: Of scans planes and free space decide, as what two of them share may be small. A corridor looks
 #: like others: six distinct planes have to agree, and hardly any lie in another's free space.
 _SCAN_ACCEPTANCE = AcceptanceParameters(
-    residual_m=0.2,
-    residual_rad=math.radians(3.0),
-    violation_weight=0.0,
-    evidence=0.0,
-    plane_overlap=0.0,
-    strong=0.0,
-    net_strong=0.15,
-    planes=6.0,
-    plane_violations=_MOST_VIOLATIONS,
-)
+    residual_m=0.2, residual_rad=math.radians(3.0), violation_weight=0.0, evidence=0.0,
+    plane_overlap=0.0, strong=0.0, net_strong=0.15, planes=6.0, plane_violations=_MOST_VIOLATIONS,
+)  # fmt: skip
 #: The world of a scanner beside that of a depth camera.
 _FACTOR = 5.0
 #: How the noise of a laser changes what its refinements weigh.
@@ -129,7 +122,7 @@ _SCAN_NOISE: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_dep
 
 
 def _lidar() -> ModelParameters:
-    """`paper` in a world five times as large, but with a scanner's reach and noise.
+    """Return `paper` in a world five times as large, but with a scanner's reach and noise.
 
     How far patches reach, and that large ones count no more than small ones, was found best on
     synthetic halls that training does not know (docs/evaluation.md). The noise of a laser does
@@ -153,38 +146,26 @@ def _lidar() -> ModelParameters:
     depth = replace(p.depth, minimum_depth=0.6, maximum_depth=60.0)
     v = p.validation
     validation = replace(
-        v,
-        acceptance=_SCAN_ACCEPTANCE,
+        v, acceptance=_SCAN_ACCEPTANCE,
         alignment=replace(
-            v.alignment,
-            matching=replace(v.alignment.matching, n_sources=200),
+            v.alignment, matching=replace(v.alignment.matching, n_sources=200),
             consensus=replace(v.alignment.consensus, n_seeds=80),
             coarse=replace(v.alignment.coarse, first_gate=0.6, last_gate=0.2, **noise),
             fine=replace(v.alignment.fine, first_gate=0.3, last_gate=0.1, **noise),
         ),
         rivals=replace(
-            v.rivals,
-            refuted=_MOST_VIOLATIONS,
-            first=replace(v.rivals.first, **noise),
+            v.rivals, refuted=_MOST_VIOLATIONS, first=replace(v.rivals.first, **noise),
             then=replace(v.rivals.then, **noise),
         ),
         agreement=replace(
-            v.agreement,
-            surface_tolerance=0.12,
-            point_tolerance=0.5,
-            free_space_margin=0.4,
-            reference_depth=10.0,
-            growth=1,
+            v.agreement, surface_tolerance=0.12, point_tolerance=0.5, free_space_margin=0.4,
+            reference_depth=10.0, growth=1,
         ),
-    )
+    )  # fmt: skip
     return replace(
-        p,
-        depth=depth,
-        weights=replace(p.weights, size_exponent=0.0),
-        properties=replace(p.properties, radius=30.0),
-        cloud=cloud,
-        validation=validation,
-    )
+        p, depth=depth, weights=replace(p.weights, size_exponent=0.0),
+        properties=replace(p.properties, radius=30.0), cloud=cloud, validation=validation,
+    )  # fmt: skip
 
 
 def preset_answer(preset: str) -> AnswerParameters:
@@ -246,14 +227,10 @@ class Draw:
 
 
 def train(
-    name: str,
-    model_p: ModelParameters,
-    mixture_p: MixtureParameters,
-    p: TrainingParameters,
-    references: Sequence[tuple[str, FrameReference]] = (),
-    jobs: int = 1,
+    name: str, model_p: ModelParameters, mixture_p: MixtureParameters, p: TrainingParameters,
+    references: Sequence[tuple[str, FrameReference]] = (), jobs: int = 1,
     report: Report | None = None,
-) -> Model:
+) -> Model:  # fmt: skip
     """Learn a model; the same arguments give the same model, however many processes help.
 
     Parameters
@@ -312,7 +289,7 @@ def train(
 
 
 def _written(p: TrainingParameters) -> dict[str, Any]:
-    """As provenance has them: of defaults that came later nothing is said, as before them."""
+    """Return the parameters for provenance, without defaults that came later."""
     written = asdict(p)
     if p.scenes == "rooms":
         del written["scenes"]
@@ -327,7 +304,7 @@ def _silent(stage: str, done: int, total: int) -> None:
 
 
 def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -> Model:
-    """The model with its quantiser step and d0 fixed, from one frame of each place.
+    """Return the model with its quantiser step and d0 fixed, from one frame of each place.
 
     Parameters
     ----------
@@ -350,7 +327,7 @@ def whitened(
     model: Model, p: TrainingParameters, references: Sequence[tuple[str, FrameReference]],
     jobs: int, report: Report,
 ) -> Model:  # fmt: skip
-    """The model with a whitening, fitted to more rooms than the rest, and frames of one's own.
+    """Return the model with a whitening, fitted to more rooms, and to frames of one's own.
 
     Parameters
     ----------
@@ -410,7 +387,7 @@ def _own_psi(reference: tuple[str, FrameReference]) -> tuple[str, list[Ints16]]:
 
 
 def _psi(frame: AnyFrame) -> list[Ints16]:
-    """psi of some levels of a frame; of a frame that cannot be signed, none."""
+    """Return psi of some levels of a frame; of a frame that cannot be signed, none."""
     (signer, levels), p = _signing[0], _signing[0][0].model.parameters
     try:
         patches = hierarchy_of(see(frame, p), p).levels
@@ -426,7 +403,7 @@ def _median_distance(stored: Bytes, metric: Metric) -> float:
 
 
 def _helpers(jobs: int, begin: Callable[..., None] | None = None, *arguments: Any) -> Executor:
-    """So many processes, each of which begins with a call; for one, a thread of this process."""
+    """Return a pool of processes that begin with a call; for one job, a thread of this process."""
     if jobs == 1:
         return ThreadPoolExecutor(1, "training", begin, arguments)
     return ProcessPoolExecutor(jobs, get_context("spawn"), begin, arguments)
@@ -460,7 +437,7 @@ def _room_lessons(
 
 
 def _scene(p: TrainingParameters, index: int) -> tuple[str, Sequence[AnyFrame]]:
-    """The frames of one synthetic scene, and what it is called."""
+    """Return the frames of one synthetic scene, and what it is called."""
     if p.scenes == "sites":
         survey = synthesise_survey(p.seed, index, p.views)
         return survey.name, survey.clouds

@@ -157,19 +157,19 @@ class AnswerScene:
 
 
 def space_name(map_name: str, parent_frame: str, *, several: bool) -> str:
-    """What the space of a parent frame is called; of several maps, with the map's name."""
+    """Return what the space of a parent frame is called; of several maps, with the map's name."""
     return f"{map_name}: {parent_frame}" if several else parent_frame
 
 
 def short_name(frame_id: str, name: str | None = None) -> str:
-    """What a stored frame is called in labels: its file, else the start of its id."""
+    """Return what a stored frame is called in labels: its file, else the start of its id."""
     if name:
         return name.rpartition("/")[2]
     return frame_id[:SHORT_ID] if _MADE_ID.fullmatch(frame_id) else frame_id
 
 
 def placed(matches: Sequence[Match]) -> list[Match]:
-    """Matches whose transform the evidence supports."""
+    """Return matches whose transform the evidence supports."""
     return [one for one in matches if one.validation.status in ("accepted", "ambiguous")]
 
 
@@ -195,7 +195,7 @@ class _Drawing:
         return found
 
     def axes(self) -> list[SceneEntity]:
-        """Which way is up in the query's space, where that is a sensor's own frame."""
+        """Return which way is up in the query's space, where that is a sensor's own frame."""
         if self._answer.location is not None:
             return []
         space, _ = self._query_space()
@@ -225,7 +225,7 @@ class _Drawing:
         return [SceneEntity(path, Placement(np.array(pose.matrix), pose.child_frame)), *found]
 
     def _alternatives(self) -> list[SceneEntity]:
-        """The poses of an ambiguous answer, none of which is the answer."""
+        """Return the poses of an ambiguous answer, none of which is the answer."""
         found: list[SceneEntity] = []
         some = self._points[:: max(len(self._points) // self._limits.match, 1)]
         for number, one in enumerate(self._answer.alternatives, start=1):
@@ -238,7 +238,7 @@ class _Drawing:
         return found
 
     def _match(self, match: Match, name: str) -> list[SceneEntity]:
-        """A match where the map has it, with the pose of the query that it votes for.
+        """Return a match where the map has it, with the pose of the query that it votes for.
 
         It is called after its place in the answer: so paths stay few over many answers.
         """
@@ -276,7 +276,7 @@ class _Drawing:
 
 
 def _look_of_match(match: Match) -> tuple[Colour, str]:
-    """Colour and label of a match: rank, name, strength or status, overlap."""
+    """Return colour and label of a match: rank, name, strength or status, overlap."""
     v = match.validation
     colour = STRONG if v.strength == "strong" else WEAK
     if v.status == "ambiguous":
@@ -291,7 +291,7 @@ def _look_of_match(match: Match) -> tuple[Colour, str]:
 def _sensor(
     path: EntityPath, points: Floats, camera: CameraIntrinsics | None, colour: Colour, label: str
 ) -> list[SceneEntity]:
-    """Points, outline and label of a sensor, in its own frame."""
+    """Return points, outline and label of a sensor, in its own frame."""
     colours = plain_colours(len(points), colour)
     base_m = QUERY_POINT_M if colour == QUERY else MATCH_POINT_M
     size_m = point_size(base_m, cameras=camera is not None)
@@ -310,7 +310,7 @@ MOST_EDGES = 20_000
 
 
 def association_scene(client: Client, told: Association, text: str, most: int) -> Moment:
-    """What an association that has succeeded came to, at all times.
+    """Return what an association that has succeeded came to, at all times.
 
     Frames lie where the pose graph has them: in one space where the sessions are joined, else each
     session in its own, and then edges between the two cannot be drawn.
@@ -358,14 +358,14 @@ def _runs(client: Client, told: Association, vertices: list[Vertex]) -> list[Pos
 
 
 def _names(told: Association) -> list[str]:
-    """What the sessions are called, the first that was asked first."""
+    """Return what the sessions are called, the first that was asked first."""
     robots: Sequence[str | None] = told.request.robots or [None] * len(told.request.sessions)
     pairs = zip(robots, told.request.sessions, strict=True)
     return [session if robot is None else f"{robot}/{session}" for robot, session in pairs]
 
 
 def _session_of(told: Association, vertex: Vertex) -> str:
-    """What the session of a vertex is called."""
+    """Return what the session of a vertex is called."""
     names, known = _names(told), (vertex.session, f"{vertex.robot}/{vertex.session}")
     return next((name for name in names if name in known), names[0])
 
@@ -373,7 +373,7 @@ def _session_of(told: Association, vertex: Vertex) -> str:
 def _run_entities(
     client: Client, run: PosedRun, up: Floats, colour: Colour, most: int, *, alone: bool
 ) -> list[SceneEntity]:
-    """Points and line of a session: by height where there is no other to tell it from."""
+    """Return points and line of a session: by height where there is no other to tell it from."""
     chosen = evenly_taken([run], most)
     path = (run.parent_frame, "sessions", run.name)
     entities = []
@@ -388,7 +388,7 @@ def _run_entities(
 
 
 def _edge_entities(edges: itertools.islice[Edge], vertices: list[Vertex]) -> list[SceneEntity]:
-    """Lines between frames that edges join: confirmed, outvoted and unchecked ones apart."""
+    """Return lines between frames that edges join: confirmed, outvoted and unchecked ones apart."""
     poses = {one.frame_id: one.pose for one in vertices if one.pose is not None}
     kinds = {
         True: ("confirmed", CONFIRMED),

@@ -73,7 +73,7 @@ class PosedRun:
 
 
 def map_runs(client: Client, map_name: str) -> list[PosedRun]:
-    """The runs of a map with poses, each through at most TRACK_POSES of them.
+    """Return the runs of a map with poses, each through at most TRACK_POSES of them.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def _runs_of_session(client: Client, map_name: str, session: Session) -> list[Po
 
 
 def listed_runs(frames: Iterable[Frame]) -> list[PosedRun]:
-    """Runs of the posed frames of a list, in its order."""
+    """Return runs of the posed frames of a list, in its order."""
     found: defaultdict[tuple[str, str, str, bool], list[Frame]] = defaultdict(list)
     for one in frames:
         if one.pose is not None:
@@ -134,7 +134,7 @@ def _run_name(robot: str | None, session: str | None) -> str:
 
 
 def _pose_of_row(row: Sequence[float]) -> Floats:
-    """T (4, 4) of a line of a TUM file."""
+    """Return T (4, 4) of a line of a TUM file."""
     T = np.eye(4)
     T[:3, 3] = row[1:4]
     T[:3, :3] = rotation_of(np.array(row[4:8]))
@@ -144,7 +144,7 @@ def _pose_of_row(row: Sequence[float]) -> Floats:
 def map_entities(
     client: Client, runs: Sequence[PosedRun], space: str, up: Floats | None, most: int
 ) -> list[SceneEntity]:
-    """What a scene shows of runs in one space at all times.
+    """Return what a scene shows of runs in one space at all times.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def map_entities(
 
 
 def points_of_each(frames: int) -> int:
-    """How many points are drawn of each of so many frames."""
+    """Return how many points are drawn of each of so many frames."""
     return min(max(MAP_POINTS // frames, 1), MOST_DRAWN)
 
 
@@ -202,7 +202,7 @@ def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Fl
 
 
 def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit: int) -> Floats:
-    """At most so many points (N, 3) of an indexed frame, moved by its pose."""
+    """Return at most so many points (N, 3) of an indexed frame, moved by its pose."""
     try:
         return moved(T, client.frame_points(map_name, frame_id, limit=limit).points)
     except (NotFound, NotIndexed):
@@ -237,7 +237,7 @@ def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
 
 
 def frame_scene(client: Client, frame: Frame) -> Moment:
-    """One frame of a map at all times, in its parent frame, or its own where it has no pose.
+    """Return one frame of a map at all times, in its parent frame, or its own where it has no pose.
 
     Raises
     ------

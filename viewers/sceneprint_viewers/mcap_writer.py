@@ -137,7 +137,7 @@ class McapWriter:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was written."""
+        """Return whether nothing was written."""
         return not self._started and not self._waiting
 
     def finish(self) -> None:
@@ -294,7 +294,7 @@ class McapWriter:
 
 
 def upright(up: Floats) -> Floats:
-    """T (4, 4) that turns a unit vector (3,) to z, which Foxglove draws upwards."""
+    """Return T (4, 4) that turns a unit vector (3,) to z, which Foxglove draws upwards."""
     level = np.zeros(3)
     level[int(np.argmin(np.abs(up)))] = 1.0
     level -= (level @ up) * up
@@ -305,5 +305,5 @@ def upright(up: Floats) -> Floats:
 
 
 def _topic(path: EntityPath) -> str:
-    """A path as a topic: names may hold blanks and slashes, which topics have too."""
+    """Return a path as a topic: names may hold blanks and slashes, which topics have too."""
     return "/" + "/".join(part.strip("/").replace(" ", "_") for part in path)

@@ -171,7 +171,7 @@ class SceneStream:
 
 
 def space_of(path: EntityPath) -> str:
-    """The space that an entity lies in."""
+    """Return the space that an entity lies in."""
     return path[0]
 
 
@@ -221,24 +221,24 @@ def frustum(camera: CameraIntrinsics, colour: Colour, depth_m: float = FRUSTUM_M
 
 
 def sensor_axes(length_m: float = AXES_M) -> LineSet:
-    """The axes of a sensor that is no camera: x red, y green, z blue."""
+    """Return the axes of a sensor that is no camera: x red, y green, z blue."""
     strips = [np.array([np.zeros(3), length_m * axis]) for axis in np.eye(3)]
     return LineSet(strips, [(230, 60, 60), (70, 190, 70), (70, 110, 240)])
 
 
 def sensor_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
-    """A camera's frustum, or the axes of another sensor."""
+    """Return a camera's frustum, or the axes of another sensor."""
     return sensor_axes() if camera is None else frustum(camera, colour)
 
 
 def small_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
-    """As `sensor_outline`, of one sensor of many."""
+    """Return as `sensor_outline`, of one sensor of many."""
     drawn = sensor_axes(SMALL_M) if camera is None else frustum(camera, colour, SMALL_M)
     return replace(drawn, width_px=THIN_PX)
 
 
 def point_size(base_m: float, *, cameras: bool) -> float:
-    """The diameter of points of cameras, or of scanners, metres."""
+    """Return the diameter of points of cameras, or of scanners, metres."""
     return base_m if cameras else _SCANNERS_TIMES * base_m
 
 
@@ -254,12 +254,12 @@ def height_colours(points: Floats, up: Floats) -> Bytes:
 
 
 def plain_colours(count: int, colour: Colour) -> Bytes:
-    """One colour (count, 3)."""
+    """Return one colour (count, 3)."""
     return np.tile(np.array(colour, np.uint8), (count, 1))
 
 
 def nearest_axis(direction: Floats) -> Floats:
-    """The axis (3,), positive or negative, that is nearest to a direction."""
+    """Return the axis (3,), positive or negative, that is nearest to a direction."""
     axis = np.zeros(3)
     largest = int(np.argmax(np.abs(direction)))
     axis[largest] = 1.0 if direction[largest] >= 0 else -1.0

@@ -117,7 +117,7 @@ class Choice:
 
 
 def choose_frames(path: Path) -> Choice:
-    """Database and queries, by split files where the scene has them.
+    """Return database and queries, by split files where the scene has them.
 
     Parameters
     ----------
@@ -159,21 +159,16 @@ def add_demo(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint demo`."""
     command.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR")
     command.add_argument(
-        "--dataset",
-        type=Path,
-        metavar="PATH",
+        "--dataset", type=Path, metavar="PATH",
         help="your own frames, in any layout that `sign` reads",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--model", choices=PRESETS, default=PRESETS[0], help=f"default: {PRESETS[0]}"
     )
     command.add_argument(
-        "--workers",
-        type=positive,
-        default=os.cpu_count() or 1,
-        metavar="N",
+        "--workers", type=positive, default=os.cpu_count() or 1, metavar="N",
         help="number of worker processes",
-    )
+    )  # fmt: skip
     command.add_argument("--rooms", type=positive, default=3, help=argparse.SUPPRESS)
     command.set_defaults(run=run_demo)
 
@@ -293,7 +288,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
 
 def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
-    """Look every query up, without and with diversification."""
+    """Query every frame, without and with diversification."""
     asked, begun = [], time.perf_counter()
     for one in tqdm(choice.queries, desc="query", unit="frame", disable=None):
         meta = meta_of(one.reference, with_pose=False)  # a lost robot knows none
@@ -356,7 +351,7 @@ def report(known: Mapping[str, DemoFrame], asked: Sequence[DemoQuery]) -> None:
 
 
 def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The rows as lines to read; figures as `answer_rows` gives them."""
+    """Return the rows as lines to read; figures as `answer_rows` gives them."""
     lines = [
         f"{'first answer within':26}{'5cm/5deg':>10}{'10cm/10deg':>12}{'median cm':>11}{'deg':>7}"
         f"{'first five: m from the query':>32}"
@@ -401,7 +396,7 @@ def draw(
 
 
 def place_of(one: DemoFrame) -> FramePlace | None:
-    """Where a frame was taken, where that is known."""
+    """Return where a frame was taken, where that is known."""
     pose = one.reference.pose
     return None if pose is None else FramePlace(one.parent, pose)
 
@@ -438,11 +433,9 @@ def serving(data: Path, workers: int) -> Iterator[str]:
     arguments = ["--port", "0", "--data", str(data), "--workers", str(workers)]
     with log.open("wb") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sceneprint", "serve", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            bufsize=0,
-        )
+            [sys.executable, "-m", "sceneprint", "serve", *arguments], stdout=subprocess.PIPE,
+            stderr=errors, bufsize=0,
+        )  # fmt: skip
     try:
         line = "" if process.stdout is None else _first_line(process.stdout)
         if not line.startswith(_READY):
@@ -465,7 +458,7 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 
 
 def _first_line(pipe: IO[bytes]) -> str:
-    """The first line; what there is of it where the other end is closed.
+    """Return the first line; what there is of it where the other end is closed.
 
     Raises
     ------

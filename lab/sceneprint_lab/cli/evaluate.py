@@ -51,14 +51,11 @@ def add_evaluate(command: argparse.ArgumentParser) -> None:
         "paths", nargs="*", metavar="PATH", help="PATH or PATH@db=RANGES,queries=RANGES"
     )
     command.add_argument(
-        "--7scenes",
-        type=Path,
-        dest="seven_scenes",
-        metavar="DIR",
+        "--7scenes", type=Path, dest="seven_scenes", metavar="DIR",
         help="evaluate the scenes of 7-Scenes in this folder by their official splits, and print "
         "the paper's table beside its figures; without intrinsics.json the Kinect's camera is "
         "taken (585 pixels, centre 320, 240)",
-    )
+    )  # fmt: skip
     add_model_options(command)
     _add_frames(command)
     _add_method(command)
@@ -72,41 +69,28 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
     command.add_argument("--queries", metavar="RANGES", help="query frames, such as 650:1000")
     for option, what in (("--db-step", "database"), ("--query-step", "query")):
         command.add_argument(
-            option,
-            type=positive,
-            default=1,
-            metavar="N",
+            option, type=positive, default=1, metavar="N",
             help=f"use every N-th {what} frame where a range has no step (default: 1)",
-        )
+        )  # fmt: skip
     command.add_argument(
-        "--max-overlap",
-        type=_share,
-        metavar="X",
+        "--max-overlap", type=_share, metavar="X",
         help="hide from a query the frames that overlap it by more than this, 0 to 1",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--distractors",
-        type=Path,
-        nargs="+",
-        default=[],
-        metavar="PATH",
+        "--distractors", type=Path, nargs="+", default=[], metavar="PATH",
         help="use all frames of these in the database",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--gap-m",
-        type=positive_number,
-        metavar="METRES",
+        "--gap-m", type=positive_number, metavar="METRES",
         help="use each frame as query and as database frame (--db and --queries may overlap, "
         "and default to all frames); a query finds only frames taken more than this distance of "
         "travel before it",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--within",
-        type=positive_number,
-        metavar="METRES",
+        "--within", type=positive_number, metavar="METRES",
         help="recall: count a frame as the query's place if its pose is this near (default: if "
         "the two overlap by half)",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--absent",
         action="store_true",
@@ -116,12 +100,10 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
 
 def _add_method(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--signature",
-        choices=("stored", "psi"),
-        default="stored",
+        "--signature", choices=("stored", "psi"), default="stored",
         help="rank by the signature that a service stores, or by psi as in the paper, from the "
         "given model or else the preset paper (default: stored)",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--metric", choices=("l1", "l2"), help="default: l2; for psi l1, as in the paper"
     )
@@ -130,49 +112,37 @@ def _add_method(command: argparse.ArgumentParser) -> None:
     )
     _add_judging(command)
     command.add_argument(
-        "--baselines",
-        nargs="*",
-        metavar="NAME",
+        "--baselines", nargs="*", metavar="NAME",
         help="also rank by these baselines: thumbnail_l1, thumbnail_zncc, fpfh_vlad, rings "
         "(give it after the PATHs; without names: all, with a notice for those that do not "
         "support the frames)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--candidates",
-        type=positive,
-        default=10,
-        metavar="N",
+        "--candidates", type=positive, default=10, metavar="N",
         help="size of C, and number of frames of R to validate (default: 10)",
-    )
+    )  # fmt: skip
     command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
     command.add_argument(
-        "--jobs",
-        type=positive,
-        default=os.cpu_count() or 1,
-        metavar="N",
+        "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N",
         help="number of processes; results do not depend on it",
-    )
+    )  # fmt: skip
 
 
 def _add_judging(command: argparse.ArgumentParser) -> None:
     """Add `--mode` and `--matching`."""
     command.add_argument(
-        "--mode",
-        choices=("full", "paper"),
-        default="full",
+        "--mode", choices=("full", "paper"), default="full",
         help="accept on all evidence, or on the residual alone as in the paper (default: full)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--matching",
-        choices=("histograms", "sequence"),
-        default="histograms",
+        "--matching", choices=("histograms", "sequence"), default="histograms",
         help="find correspondences by histograms, or by aligned sequences of neighbours as in "
         "the paper, which is slower (default: histograms)",
-    )
+    )  # fmt: skip
 
 
 def _share(text: str) -> float:
-    """A number above 0, up to 1."""
+    """Return a number above 0, up to 1."""
     return number_within(text, lambda number: 0 < number <= 1, "a share above 0, up to 1")
 
 
@@ -200,20 +170,11 @@ def run_evaluate(options: argparse.Namespace) -> int:
         )
     _make_room(options.json)
     settings = EvaluationSettings(
-        metric=options.metric,
-        levels=options.levels,
-        mode=options.mode,
-        matching=options.matching,
-        candidates=options.candidates,
-        max_overlap=options.max_overlap,
-        absent=options.absent,
-        gap_m=options.gap_m,
-        within_m=options.within,
-        baselines=baselines,
-        seed=options.seed,
-        jobs=options.jobs,
-        cache_dir=own.cache_dir,
-    )
+        metric=options.metric, levels=options.levels, mode=options.mode, matching=options.matching,
+        candidates=options.candidates, max_overlap=options.max_overlap, absent=options.absent,
+        gap_m=options.gap_m, within_m=options.within, baselines=baselines, seed=options.seed,
+        jobs=options.jobs, cache_dir=own.cache_dir,
+    )  # fmt: skip
     with TemporaryDirectory(prefix="sceneprint-") as folder:
         store = FrameStore(Path(folder))
         evaluation = evaluate(protocol, signer, store, settings, _watch)
@@ -269,19 +230,15 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
             "some. Leave them out."
         )
     return choose(
-        parts,
-        options.distractors,
-        database=parse_ranges(options.db) if both[0] else None,
-        queries=parse_ranges(options.queries) if both[1] else None,
-        database_step=options.db_step,
-        query_step=options.query_step,
-        shared=options.gap_m is not None,
+        parts, options.distractors, database=parse_ranges(options.db) if both[0] else None,
+        queries=parse_ranges(options.queries) if both[1] else None, database_step=options.db_step,
+        query_step=options.query_step, shared=options.gap_m is not None,
         find=partial(sequences_at, options=options),
-    )
+    )  # fmt: skip
 
 
 def _seven_scenes(options: argparse.Namespace) -> list[Path]:
-    """Folders of the scenes that are there; those that are missing are told on standard error."""
+    """Return the folders of the scenes; name missing ones on standard error."""
     from sceneprint_lab.evaluation.report import PAPER
 
     for given, name in (
@@ -309,7 +266,7 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
 
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
-    """The baselines to ask, in the order of BASELINES."""
+    """Return the baselines to ask, in the order of BASELINES."""
     from sceneprint_lab.evaluation.baselines import BASELINES
 
     if names is None:
@@ -324,28 +281,14 @@ def _baselines(names: list[str] | None) -> tuple[str, ...]:
 
 
 def _settings_of(options: argparse.Namespace, model: Model) -> dict[str, Any]:
-    """Everything that is needed to repeat the evaluation."""
+    """Return everything that is needed to repeat the evaluation."""
     from sceneprint import __version__
 
     keys = (
-        "paths",
-        "db",
-        "queries",
-        "db_step",
-        "query_step",
-        "max_overlap",
-        "absent",
-        "gap_m",
-        "within",
-        "baselines",
-        "signature",
-        "metric",
-        "levels",
-        "mode",
-        "matching",
-        "candidates",
+        "paths", "db", "queries", "db_step", "query_step", "max_overlap", "absent", "gap_m",
+        "within", "baselines", "signature", "metric", "levels", "mode", "matching", "candidates",
         "seed",
-    )
+    )  # fmt: skip
     asked = {key: getattr(options, key) for key in keys}
     asked["metric"] = options.metric or model.metric
     return {
@@ -390,25 +333,18 @@ def add_evaluate_pairs(command: argparse.ArgumentParser) -> None:
     _add_drawing(command)
     _add_judging(command)
     command.add_argument(
-        "--right",
-        nargs=2,
-        type=_limit,
-        default=[0.1, 10.0],
-        metavar=("METRES", "DEGREES"),
+        "--right", nargs=2, type=_limit, default=[0.1, 10.0], metavar=("METRES", "DEGREES"),
         help="errors up to which a transform counts as correct (default: 0.1 10)",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--baselines",
         action="store_true",
         help="also register overlapping pairs with Open3D, at about a second each",
     )
     command.add_argument(
-        "--jobs",
-        type=positive,
-        default=os.cpu_count() or 1,
-        metavar="N",
+        "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N",
         help="number of processes; only the times depend on it",
-    )
+    )  # fmt: skip
     command.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
     command.set_defaults(run=run_evaluate_pairs)
 
@@ -418,21 +354,19 @@ def _add_drawing(command: argparse.ArgumentParser) -> None:
         ("--pairs", 120, positive, "pairs for each overlap bin of each scene"),
         ("--negatives", 400, whole_number, "pairs of two scenes, in total"),
         (
-            "--apart",
-            30,
-            whole_number,
+            "--apart", 30, whole_number,
             "minimum distance in the recording between two frames, in frames",
         ),
         ("--frames", 300, _frames, "maximum number of frames of each scene, evenly spread"),
         ("--seed", 0, whole_number, "random seed of sampling and validation"),
-    ):
+    ):  # fmt: skip
         command.add_argument(
             option, type=kind, default=default, metavar="N", help=f"{what} (default: {default})"
         )
 
 
 def _frames(text: str) -> int:
-    """A whole number from 2 to _MOST."""
+    """Return a whole number from 2 to _MOST."""
     number = positive(text)
     if not 2 <= number <= _MOST:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 2 to {_MOST}")
@@ -440,7 +374,7 @@ def _frames(text: str) -> int:
 
 
 def _limit(text: str) -> float:
-    """A number above 0, up to 180."""
+    """Return a number above 0, up to 180."""
     return number_within(text, lambda number: 0 < number <= 180, "a number above 0, up to 180")
 
 
@@ -458,15 +392,10 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
     signer = open_for(options, own)
     settings = PairSettings(
         drawing=Drawing(options.pairs, options.negatives, options.apart, options.seed),
-        frames=options.frames,
-        mode=options.mode,
-        matching=options.matching,
-        seed=options.seed,
-        limits=(options.right[0], options.right[1]),
-        baselines=options.baselines,
-        jobs=options.jobs,
+        frames=options.frames, mode=options.mode, matching=options.matching, seed=options.seed,
+        limits=(options.right[0], options.right[1]), baselines=options.baselines, jobs=options.jobs,
         cache_dir=own.cache_dir,
-    )
+    )  # fmt: skip
     with TemporaryDirectory(prefix="sceneprint-") as folder:
         store = FrameStore(Path(folder))
         evaluation = evaluate_pairs(options.paths, signer, store, settings, _watch)
@@ -479,20 +408,12 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
 
 
 def _pair_settings(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
-    """Everything that is needed to repeat the evaluation."""
+    """Return everything that is needed to repeat the evaluation."""
     from sceneprint import __version__
 
     keys = (
-        "pairs",
-        "negatives",
-        "apart",
-        "frames",
-        "seed",
-        "mode",
-        "matching",
-        "right",
-        "baselines",
-    )
+        "pairs", "negatives", "apart", "frames", "seed", "mode", "matching", "right", "baselines",
+    )  # fmt: skip
     return {
         "version": __version__,
         "model_id": model_id,

@@ -51,19 +51,13 @@ def add_synth(command: argparse.ArgumentParser) -> None:
         "and streets; sites: ordinary halls, storeys and blocks, which do not repeat",
     )
     command.add_argument(
-        "--rooms",
-        type=positive,
-        default=4,
-        metavar="N",
+        "--rooms", type=positive, default=4, metavar="N",
         help="number of rooms or sites (default: 4)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--views",
-        type=positive,
-        default=25,
-        metavar="M",
+        "--views", type=positive, default=25, metavar="M",
         help="number of views per room; with --lookalikes, of queries per site (default: 25)",
-    )
+    )  # fmt: skip
     command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
     command.add_argument(
         "--path",
@@ -151,7 +145,7 @@ def _write_sequence(sequence: Path, frames: Sequence[DepthFrame]) -> None:
 def _write_lookalike(
     out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
 ) -> None:
-    """A scene of two sequences, or two scenes where the queries' place is not in the map."""
+    """Write a scene of two sequences, or two scenes if the map lacks the queries' place."""
     from sceneprint_lab.synth import KinectNoise, synthesise_lookalike
 
     noise = None if perfect else KinectNoise()
@@ -166,7 +160,7 @@ def _write_lookalike(
 def _write_lookalike_survey(
     out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
 ) -> None:
-    """As `_write_lookalike`, of scans."""
+    """Write a site as `_write_lookalike`, of scans."""
     from sceneprint_lab.synth import synthesise_lookalike_survey
 
     site = synthesise_lookalike_survey(kind, seed, index, queries=queries, perfect=perfect)
@@ -176,7 +170,7 @@ def _write_lookalike_survey(
 
 
 def _split_scenes(out: Path, site: LookalikeSite[AnyFrame]) -> tuple[Path, Path]:
-    """Folders of the scenes of a site's map and of its queries, with the files of their splits."""
+    """Create the scenes of a site's map and of its queries, with the files of their splits."""
     of_map = of_queries = out / site.name
     if not site.same_frame:
         of_queries = out / f"{site.name}-elsewhere"

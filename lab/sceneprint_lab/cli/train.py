@@ -23,48 +23,32 @@ def add_train(command: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="FILE", help="model file to write"
     )
     command.add_argument(
-        "--preset",
-        choices=PRESETS,
-        default=PRESETS[0],
+        "--preset", choices=PRESETS, default=PRESETS[0],
         help=f"base of signature size, lengths and scenes (default: {PRESETS[0]})",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--rooms",
-        type=whole_number,
-        default=100,
-        metavar="N",
+        "--rooms", type=whole_number, default=100, metavar="N",
         help="number of synthetic rooms or sites (default: 100)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--whitening-rooms",
-        type=whole_number,
-        metavar="N",
+        "--whitening-rooms", type=whole_number, metavar="N",
         help="number of synthetic rooms or sites to fit the whitening of signatures; 0 stores "
         "psi itself (default: 500; lidar 400, paper 0)",
-    )
+    )  # fmt: skip
     command.add_argument("--seed", type=whole_number, default=0, metavar="S")
     command.add_argument(
-        "--frames",
-        type=Path,
-        nargs="+",
-        default=[],
-        metavar="DIR",
+        "--frames", type=Path, nargs="+", default=[], metavar="DIR",
         help="also train on your own frames, in any layout that `sceneprint sign` reads",
-    )
+    )  # fmt: skip
     command.add_argument("--projection", choices=("pca", "ica"), default="pca", help="default: pca")
     command.add_argument(
-        "--range",
-        type=metres,
-        nargs=2,
-        metavar=("MIN", "MAX"),
+        "--range", type=metres, nargs=2, metavar=("MIN", "MAX"),
         help="range of the sensor in metres (default: 0.3 9; lidar 0.6 60)",
-    )
+    )  # fmt: skip
     command.add_argument(
-        "--radius",
-        type=metres,
-        metavar="R",
+        "--radius", type=metres, metavar="R",
         help="neighbourhood radius of a patch in metres (default: 3; lidar 30)",
-    )
+    )  # fmt: skip
     command.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
     )
@@ -99,15 +83,9 @@ def run_train(options: argparse.Namespace) -> int:
     if options.whitening_rooms is not None:
         whitening_rooms = options.whitening_rooms
     p = TrainingParameters(
-        rooms=options.rooms,
-        views=views,
-        seed=options.seed,
-        projection=options.projection,
-        scenes=scenes,
-        whitening_rooms=whitening_rooms,
-        levels=levels,
-        whitening=whitening,
-    )
+        rooms=options.rooms, views=views, seed=options.seed, projection=options.projection,
+        scenes=scenes, whitening_rooms=whitening_rooms, levels=levels, whitening=whitening,
+    )  # fmt: skip
     model_p, mixture_p = preset_parameters(options.preset)
     if options.range is not None:
         model_p = _of_range(model_p, *options.range)
@@ -127,7 +105,7 @@ def run_train(options: argparse.Namespace) -> int:
 
 
 def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
-    """The same for a sensor of another range, of depth images and of clouds."""
+    """Return the same for a sensor of another range, of depth images and of clouds."""
     if least >= most:
         raise TrainingError(f"--range {least:g} {most:g}: give the smaller distance first.")
     return replace(

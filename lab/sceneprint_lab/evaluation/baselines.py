@@ -59,7 +59,7 @@ Comparison = Literal["l1", "zncc"]
 
 
 def thumbnail(depth: Floats32, rows: int = ROWS, columns: int = COLUMNS) -> Floats32:
-    """Mean inverse depth of the samples in each cell of a grid over the image.
+    """Return mean inverse depth of the samples in each cell of a grid over the image.
 
     Parameters
     ----------
@@ -94,11 +94,11 @@ class Thumbnails:
         self.name = f"thumbnail_{comparison}"
 
     def takes(self, frame: AnyFrame) -> bool:
-        """Whether the baseline is made for such a frame."""
+        """Return whether the baseline is made for such a frame."""
         return isinstance(frame, DepthFrame)
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """The thumbnail of a depth image."""
+        """Return the thumbnail of a depth image."""
         if not isinstance(frame, DepthFrame):
             raise UselessFrame(f"{frame.name}: A thumbnail is of a depth image. Send one.")
         return thumbnail(frame.depth)
@@ -110,7 +110,7 @@ class Thumbnails:
         """Nothing is learnt."""
 
     def finish(self, kept: Floats32) -> Floats32:
-        """The thumbnail; for correlation at mean 0 and length 1."""
+        """Return the thumbnail; for correlation at mean 0 and length 1."""
         if self.comparison == "l1":
             return kept
         filled = kept > 0
@@ -120,7 +120,7 @@ class Thumbnails:
         return (centred / length if length > 0 else centred).astype(np.float32)
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """Distance of one finished thumbnail to each of (N, rows, columns): (N,)."""
+        """Return distance of one finished thumbnail to each of (N, rows, columns): (N,)."""
         own = query.reshape(-1).astype(np.float64)
         others = database.reshape(len(database), -1).astype(np.float64)
         if self.comparison == "zncc":
@@ -144,7 +144,7 @@ WORDS, LEARNT_FROM = 64, 20_000
 
 
 def features(points: Floats, scale: float = 1.0) -> Floats32:
-    """FPFH of a cloud's voxels.
+    """Return FPFH of a cloud's voxels.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
 
 
 def vlad(local: Floats32, words: Floats) -> Floats32:
-    """Sums of what is left of features less their nearest word: VLAD, intra-normalised.
+    """Return sums of what is left of features less their nearest word: VLAD, intra-normalised.
 
     Parameters
     ----------
@@ -215,11 +215,11 @@ class FpfhVlad:
         open3d(_WHAT)
 
     def takes(self, frame: AnyFrame) -> bool:  # noqa: ARG002
-        """Whether the baseline is made for such a frame: always."""
+        """Return whether the baseline is made for such a frame: always."""
         return True
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """The local features of a frame.
+        """Return the local features of a frame.
 
         Raises
         ------
@@ -247,13 +247,13 @@ class FpfhVlad:
         self._words = np.asarray(means.cluster_centers_, np.float64)
 
     def finish(self, kept: Floats32) -> Floats32:
-        """The VLAD of a frame's features; after `learn`."""
+        """Return the VLAD of a frame's features; after `learn`."""
         if self._words is None:
             raise ValueError("the vocabulary has not been learnt")
         return vlad(kept, self._words)
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """Euclidean distance of one to each of (N, k * d): (N,)."""
+        """Return Euclidean distance of one to each of (N, k * d): (N,)."""
         found: Floats = np.linalg.norm(database.astype(np.float64) - query, axis=1)
         return found
 
@@ -275,15 +275,10 @@ RINGS, SECTORS, RADIUS, LIFT = 20, 60, 80.0, 2.0
 
 
 def ring_descriptor(
-    points: Floats32 | Floats,
-    *,
-    rings: int = RINGS,
-    sectors: int = SECTORS,
-    radius: float = RADIUS,
-    lift: float = LIFT,
-    pole: int = 2,
-) -> Floats32:
-    """The greatest height in each ring and sector about the sensor.
+    points: Floats32 | Floats, *, rings: int = RINGS, sectors: int = SECTORS,
+    radius: float = RADIUS, lift: float = LIFT, pole: int = 2,
+) -> Floats32:  # fmt: skip
+    """Return the greatest height in each ring and sector about the sensor.
 
     Parameters
     ----------
@@ -326,7 +321,7 @@ def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -
 def _best_shift(
     a: Floats, a_filled: NDArray[np.bool_], b: Floats, b_filled: NDArray[np.bool_]
 ) -> tuple[float, int]:
-    """Least distance over shifts, and the shift: column s of `a` against s + shift of `b`."""
+    """Return the least distance over shifts, and that shift of the columns of `b`."""
     sectors, rings = a.shape
     best, at = 2.0, 0
     for shift in range(sectors):
@@ -352,7 +347,7 @@ def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def ring_distance(a: Floats32, b: Floats32) -> tuple[float, int]:
-    """How unlike two scans are, whichever way they are turned about the upright axis.
+    """Return how unlike two scans are, whichever way they are turned about the upright axis.
 
     Parameters
     ----------
@@ -368,7 +363,7 @@ def ring_distance(a: Floats32, b: Floats32) -> tuple[float, int]:
 
 
 def ring_distances(query: Floats32, database: Floats32) -> Floats:
-    """Distance of one descriptor (rings, sectors) to each of (N, rings, sectors): (N,)."""
+    """Return distance of one descriptor (rings, sectors) to each of (N, rings, sectors): (N,)."""
     own = _columns(query)
     return np.array([_best_shift(*own, *_columns(other))[0] for other in database], float)
 
@@ -382,11 +377,11 @@ class Rings:
         self.radius = radius
 
     def takes(self, frame: AnyFrame) -> bool:
-        """Whether the baseline is made for such a frame."""
+        """Return whether the baseline is made for such a frame."""
         return isinstance(frame, Cloud) and frame.has_viewpoint
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """The descriptor of a cloud, its z axis taken as upright."""
+        """Return the descriptor of a cloud, its z axis taken as upright."""
         if not isinstance(frame, Cloud):
             raise UselessFrame(f"{frame.name}: A ring descriptor is of a point cloud. Send one.")
         return ring_descriptor(frame.points, radius=self.radius)
@@ -398,7 +393,7 @@ class Rings:
         """Nothing is learnt."""
 
     def finish(self, kept: Floats32) -> Floats32:
-        """The descriptor itself."""
+        """Return the descriptor itself."""
         return kept
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
@@ -419,11 +414,11 @@ class Baseline(Protocol):
         ...
 
     def takes(self, frame: AnyFrame) -> bool:
-        """Whether it is made for such a frame."""
+        """Return whether it is made for such a frame."""
         ...
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """What it keeps of a frame; UselessFrame where that is nothing."""
+        """Return what the descriptor is computed from; raise UselessFrame if there is nothing."""
         ...
 
     def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
@@ -431,11 +426,11 @@ class Baseline(Protocol):
         ...
 
     def finish(self, kept: Floats32) -> Floats32:
-        """The descriptor of what was kept of a frame; of one shape for all."""
+        """Return the descriptor of what `read` returned; of one shape for all frames."""
         ...
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """(N,) from one descriptor to each of a stack of N; infinite is farthest."""
+        """Return (N,) from one descriptor to each of a stack of N; infinite is farthest."""
         ...
 
 
@@ -449,7 +444,7 @@ BASELINES: dict[str, Callable[[float], Baseline]] = {
 
 
 def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
-    """Baselines by their names, ready to be asked.
+    """Return baselines by their names, ready to be asked.
 
     Parameters
     ----------
@@ -494,14 +489,9 @@ class Compared:
 
 
 def compare(
-    baseline: Baseline,
-    prepared: Prepared,
-    store: FrameStore,
-    allowed: NDArray[np.bool_],
-    signer: Signer,
-    seed: int,
-    watch: Watch = unwatched,
-) -> Compared:
+    baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
+    signer: Signer, seed: int, watch: Watch = unwatched,
+) -> Compared:  # fmt: skip
     """Rank the database for every query by a baseline.
 
     One process and one thread, in which the signature is timed as well.
@@ -533,13 +523,9 @@ def compare(
 
 
 def _compared(
-    baseline: Baseline,
-    prepared: Prepared,
-    store: FrameStore,
-    allowed: NDArray[np.bool_],
-    seed: int,
-    watch: Watch,
-) -> Compared:
+    baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
+    seed: int, watch: Watch,
+) -> Compared:  # fmt: skip
     def kept(member: SignedFrame) -> Path:
         return store.folder / f"{member.number}.{baseline.name}.npy"
 
@@ -564,12 +550,9 @@ def _compared(
 
 
 def registered(
-    judge: Judge,
-    rankings: Sequence[Sequence[int]],
-    prepared: Prepared,
-    overlap_mean: NDArray[np.float64],
-    overlap_least: NDArray[np.float64],
-) -> list[ValidatedPair | None]:
+    judge: Judge, rankings: Sequence[Sequence[int]], prepared: Prepared,
+    overlap_mean: NDArray[np.float64], overlap_least: NDArray[np.float64],
+) -> list[ValidatedPair | None]:  # fmt: skip
     """The nearest frame of each query validated as ours is: what R would be by this ranking."""
     found: list[ValidatedPair | None] = []
     for i, (query, ranking) in enumerate(zip(prepared.queries, rankings, strict=True)):

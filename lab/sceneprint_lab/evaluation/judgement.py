@@ -1,12 +1,10 @@
-"""Validate a query against its candidates, and judge the results by the true poses.
-
-Task  --judge-->  Judged: pairs, averaged poses
-"""
+"""Validate a query against its candidates, and judge the results by the true poses."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -72,8 +70,13 @@ class Candidate:
     number: int
     scene: str
     pose: Floats
-    overlap_mean: float
-    overlap_least: float
+    overlap_mean: float = 0.0
+    overlap_least: float = 0.0
+
+    @classmethod
+    def of(cls, frame: SignedFrame, match: int, mean: float = 0.0, least: float = 0.0) -> Candidate:
+        """Return the candidate that a frame of the database is, with its overlaps."""
+        return cls(match, frame.number, frame.scene, frame.pose, mean, least)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,68 +147,42 @@ class Judge:
 
 
 def open_judge(
-    store: FrameStore,
-    mode: Mode,
-    seed: int,
-    p: ValidationParameters,
-    matching: Matching = "histograms",
-    database: Sequence[SignedFrame] = (),
-    answer: AnswerParameters | None = None,
-    unrelated_distance: float = math.inf,
-) -> Judge:
-    """Make ready to validate frames of a store."""
-    # neighbouring queries have many candidates in common
-    geometry = lru_cache(128)(store.geometry)
+    store: FrameStore, mode: Mode, seed: int, p: ValidationParameters,
+    matching: Matching = "histograms", database: Sequence[SignedFrame] = (),
+    answer: AnswerParameters | None = None, unrelated_distance: float = math.inf,
+) -> Judge:  # fmt: skip
+    """Return a judge of the frames of a store."""
+    geometry = lru_cache(128)(store.geometry)  # neighbouring queries have common candidates
     return Judge(
         geometry, mode, seed, p, matching, database, answer or AnswerParameters(),
         unrelated_distance=unrelated_distance,
     )  # fmt: skip
 
 
-def voters(parents: Sequence[str], strong: Sequence[bool], most: int = 5) -> list[int]:
-    """Return the positions of the matches whose poses may be averaged: those of one parent frame.
-
-    The parent frame with most strong matches votes, and of equals the one with most matches; of
-    these, the one whose match comes first.
-
-    Parameters
-    ----------
-    parents : parent frames of accepted matches, in the order of `preferred`
-    strong : which of them are strong
-    most : votes that are taken, the first ones
-
-    Raises
-    ------
-    ValueError : not one for one.
-    """
-    votes: dict[str, tuple[int, int]] = {}
-    for parent, sure in zip(parents, strong, strict=True):
-        known = votes.get(parent, (0, 0))
-        votes[parent] = (known[0] + sure, known[1] + 1)
-    # the first of equals: dicts keep the order in which parents came
-    winner = max(votes, key=votes.__getitem__, default=None)
-    return [i for i, parent in enumerate(parents) if parent == winner][:most]
-
-
 def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
-    """Return the first accepted views of the scene with most of them, strong ones first.
+    """Return the first accepted views of one scene, strong ones first.
 
-    Poses are comparable within one scene only; see `voters`.
+    Poses are comparable within one scene only. The scene with most strong matches counts, of equals
+    the one with most matches, and of these the one whose match comes first.
 
     Parameters
     ----------
     pairs : of a query, in the order of R
     """
-    believed = in_preferred_order(pairs)
-    sure = [pair.validation.strength == "strong" for pair in believed]
-    return [believed[i] for i in voters([p.scene for p in believed], sure, VIEWS)]
+    accepted = in_preferred_order(pairs)
+    scenes = [pair.scene for pair in accepted]
+    strong = Counter(pair.scene for pair in accepted if pair.validation.strength == "strong")
+    winner = max(
+        dict.fromkeys(scenes), key=lambda one: (strong[one], scenes.count(one)), default=""
+    )
+    return [pair for pair in accepted if pair.scene == winner][:VIEWS]
 
 
 def judge(judging: Judge, task: QueryTask) -> Judged:
-    """Validate a query against each candidate, average its pose, and say how far off all are.
+    """Validate a query against each candidate, average its pose, and judge all by the true pose.
 
-    Where refinement from the true pose leads is worked out for the first answer and for the
-    averaged views of C: the bound that registration of these pairs can reach.
+    The bound that registration can reach, which is refinement from the true pose, is computed for
+    the first answer and for the averaged views of C.
     """
     of = {c.match: c for c in task.candidates}
     pairs = {c.match: validated(judging, task, c) for c in task.candidates}
@@ -224,13 +201,10 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
         pairs[match] = replace(pairs[match], bound=bound)
     ranked = views_to_average([pairs[match] for match in task.ranking])
     return Judged(
-        pairs,
-        average,
-        _average(task, of, {p.match: p.validation.T_match_query for p in ranked}),
-        _average(task, of, {p.match: refined.get(p.match) for p in views}),
-        spent,
+        pairs, average, _average(task, of, {p.match: p.validation.T_match_query for p in ranked}),
+        _average(task, of, {p.match: refined.get(p.match) for p in views}), spent,
         answer_of(judging, task),
-    )
+    )  # fmt: skip
 
 
 def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -> JudgedAnswer:
@@ -370,16 +344,11 @@ def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> Validate
     spent = 1e3 * (time.perf_counter() - start)
     same, T = candidate.scene == task.scene, validation.T_match_query
     return ValidatedPair(
-        match=candidate.match,
-        scene=candidate.scene,
-        validation=validation,
-        same_scene=same,
+        match=candidate.match, scene=candidate.scene, validation=validation, same_scene=same,
         error=pose_error(T, true_transform(task, candidate)) if same and T is not None else Error(),
-        bound=None,
-        overlap_mean=candidate.overlap_mean,
-        overlap_least=candidate.overlap_least,
+        bound=None, overlap_mean=candidate.overlap_mean, overlap_least=candidate.overlap_least,
         milliseconds=spent,
-    )
+    )  # fmt: skip
 
 
 def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) -> Floats | None:
@@ -399,12 +368,10 @@ def _average(
 
 
 # R and C of every query, by stored signatures alone.
-#
-# signatures, allowed  --rank-->  Ranked: R and C of each query
 
 #: Queries scanned at once.
 BLOCK = 64
-#: Queries whose distances within R are worked out anew, to time what a service would do.
+#: Queries whose distances within R are computed again, to time what a service does.
 TIMED = 3
 
 
@@ -417,8 +384,7 @@ class Ranked:
     ranking : R, database indices, nearest first
     distances : (|R|,) of R, as of `cross_distances`
     selection : C, in the order of R
-    milliseconds : of `rank` (scan and sort) and `diversify`, and of `compare_ranking` where it
-        was timed
+    milliseconds : of `rank` (scan and sort), `diversify`, and sometimes `compare_ranking`
     """
 
     ranking: list[int]
@@ -428,19 +394,14 @@ class Ranked:
 
     @property
     def retrieved(self) -> Ranking:
-        """R as `rival_rows` takes it; similarities take no part."""
+        """Return R as a Ranking without similarities."""
         return Ranking(np.array(self.ranking, np.intp), self.distances, np.zeros(len(self.ranking)))
 
 
 def rank(
-    queries: Bytes,
-    database: Bytes,
-    allowed: NDArray[np.bool_],
-    *,
-    metric: Metric,
-    candidates: int = 10,
-    watch: Watch = unwatched,
-) -> list[Ranked]:
+    queries: Bytes, database: Bytes, allowed: NDArray[np.bool_], *, metric: Metric,
+    candidates: int = 10, watch: Watch = unwatched,
+) -> list[Ranked]:  # fmt: skip
     """Rank the database for each query and select from the ranking.
 
     Parameters
@@ -450,7 +411,7 @@ def rank(
     allowed : (Q, N), which frames a query may find
     metric : l1 or l2
     candidates : size of C
-    watch : told of each query
+    watch : follows the queries
 
     Returns
     -------

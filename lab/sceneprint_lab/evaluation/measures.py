@@ -1,8 +1,4 @@
-"""Whether a place is among the first k of a ranking, and what diversification brings.
-
-rankings, which are relevant (Q, N)  --recall-->  figures
-Outcome, ...  --diversity-->  translations and covered voxels of R, DR, VR, VDR: the paper's figures
-"""
+"""Measure rankings, accuracy, acceptance, and what diversification brings."""
 
 from __future__ import annotations
 
@@ -34,7 +30,7 @@ OVERLAP = 0.5
 
 
 def metres_apart(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -> Floats:
-    """(Q, N) distance of the sensors by the true poses; infinite between scenes."""
+    """Return (Q, N) distance of the sensors by the true poses; infinite between scenes."""
     there = np.array([m.pose[:3, 3] for m in queries])
     here = np.array([m.pose[:3, 3] for m in database])
     same = np.array([m.scene for m in queries])[:, None] == np.array([m.scene for m in database])
@@ -45,7 +41,7 @@ def metres_apart(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]
 def recall(
     relevant: NDArray[np.bool_], allowed: NDArray[np.bool_], rankings: Sequence[Sequence[int]]
 ) -> dict[str, float | int | None]:
-    """Share of queries that have a relevant frame among the first k, of those that have one.
+    """Return share of queries that have a relevant frame among the first k, of those that have one.
 
     Parameters
     ----------
@@ -77,7 +73,7 @@ CURVE = 200
 
 
 def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | None:
-    """The rate above which so few would be seen with less than 1 - `confidence`.
+    """Return the rate above which so few would be seen with less than 1 - `confidence`.
 
     One-sided Clopper-Pearson. Of none seen it is 1 - (1 - confidence)^(1 / of), which for 95 % is
     about 3 / of: the rule of three. It holds for independent tries; pairs that share frames are
@@ -103,7 +99,7 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
 
 
 def _at_most(seen: int, of: int, rate: float) -> float:
-    """Chance of at most `seen` hits in `of` independent tries."""
+    """Return chance of at most `seen` hits in `of` independent tries."""
     if rate in (0.0, 1.0):
         return float(rate == 0 or seen == of)
     hit, miss = math.log(rate), math.log1p(-rate)
@@ -131,11 +127,11 @@ class Roc:
     thresholds: Floats
 
     def true_at(self, false: float) -> float:
-        """The most right ones that pass while no more than this share of the wrong ones does."""
+        """Return the most right ones that pass while at most this share of the wrong ones does."""
         return float(self.true[self.false <= false].max())
 
     def thinned(self, most: int = CURVE) -> list[list[float]]:
-        """At most so many points (false, true, threshold), the ends among them."""
+        """Return at most so many points (false, true, threshold), the ends among them."""
         n = len(self.true)
         kept = np.arange(n)
         if n > most:
@@ -151,7 +147,7 @@ class Roc:
 
 
 def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
-    """The curve of one number that should be high for right ones.
+    """Return the curve of one number that should be high for right ones.
 
     Parameters
     ----------
@@ -185,7 +181,7 @@ OVERLAPS = 0.3
 
 
 def rows(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """Each way to answer, over the queries whose scene is in the database.
+    """Return each way to answer, over the queries whose scene is in the database.
 
     R: the first of the ranking, registered and refined, accepted or not. VR: the first that is
     accepted among the first of R, strong before weak. DR, VDR: the same of C. `pose_average`:
@@ -205,7 +201,7 @@ def rows(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def bound(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """What registration of the same pairs could reach: refinement started at the true pose.
+    """Return what registration of the same pairs could reach: refinement started at the true pose.
 
     `VDR` for the first pair of VDR, `pose_average` for the views that are averaged. A query
     without such a pair is a failure here as it is there.
@@ -218,13 +214,13 @@ def bound(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def bound_of(outcome: QueryOutcome) -> Error:
-    """Where refinement from the true pose ends for the pair VDR answers with."""
+    """Return where refinement from the true pose ends for the pair VDR answers with."""
     first = outcome.views("VDR")[:1]
     return first[0].bound or Error() if first else Error()
 
 
 def accuracy(errors: Sequence[Error]) -> Figures:
-    """Shares of errors within the two thresholds, and medians; null where there is none.
+    """Return shares of errors within the two thresholds, and medians; null where there is none.
 
     A failure is infinitely far off; a median that falls on one is null.
     """
@@ -239,53 +235,49 @@ def accuracy(errors: Sequence[Error]) -> Figures:
     }
 
 
-def retrieval(outcomes: Sequence[QueryOutcome], of: str) -> Figures:
-    """How much the first match and the first five see of what the query sees.
+def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
+    """Return how much the first match and the first five see of what the query sees.
 
-    Overlap is that of retrieval. `right_scene`: share of queries whose first match is of their
-    scene.
+    Parameters
+    ----------
+    five : of each query, the overlap of retrieval of its first five matches
     """
-    five = [[p.overlap_mean for p in o.views(of)[:5]] for o in outcomes]
-    first = [overlap[0] for overlap in five]
+    first = [overlaps[0] for overlaps in five]
     return {
         "top1_overlap_50": _share([f >= 0.5 for f in first]),
         "top5_overlap_50": _share([max(f) >= 0.5 for f in five]),
         "top1_overlap_30": _share([f >= OVERLAPS for f in first]),
         "mean_overlap": _mean(first),
-        "right_scene": _share([o.views(of)[0].same_scene for o in outcomes]),
     }
+
+
+def retrieval(outcomes: Sequence[QueryOutcome], of: str) -> Figures:
+    """Return `overlap_figures` of a row, and the share of first matches of the query's scene."""
+    figures = overlap_figures([[p.overlap_mean for p in o.views(of)[:5]] for o in outcomes])
+    return figures | {"right_scene": _share([o.views(of)[0].same_scene for o in outcomes])}
 
 
 def oracle_and_random(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """What the best and a random frame of the database would score.
-
-    `random` is an expectation, not a draw.
-    """
+    """Return the figures of the best frame of the database, and the expected ones of a random."""
     here = [o for o in outcomes if o.present]
-    best = [float(o.overlap_mean.max()) for o in here]
-    best_of = {
-        "top1_overlap_50": _share([b >= 0.5 for b in best]),
-        "top5_overlap_50": _share([b >= 0.5 for b in best]),
-        "top1_overlap_30": _share([b >= OVERLAPS for b in best]),
-        "mean_overlap": _mean(best),
-    }
-    of_any = {
+    of_any: Figures = {
         "top1_overlap_50": _mean([float((o.overlap_mean >= 0.5).mean()) for o in here]),
         "top5_overlap_50": _mean([_any_of_five(o) for o in here]),
         "top1_overlap_30": _mean([float((o.overlap_mean >= OVERLAPS).mean()) for o in here]),
         "mean_overlap": _mean([float(o.overlap_mean.mean()) for o in here]),
     }
-    return {"oracle": best_of, "random": of_any}
+    best = overlap_figures([[float(o.overlap_mean.max())] for o in here])
+    return {"oracle": best, "random": of_any}
 
 
 def _any_of_five(outcome: QueryOutcome) -> float:
-    """Chance that five different frames hold one that overlaps by half."""
+    """Return chance that five different frames hold one that overlaps by half."""
     n, good = len(outcome.overlap_mean), int((outcome.overlap_mean >= 0.5).sum())
     return 1.0 - math.comb(n - good, 5) / math.comb(n, 5) if n >= 5 else float(good > 0)
 
 
 def validation(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
-    """Whether acceptance can be trusted, over all pairs that were validated.
+    """Return whether acceptance can be trusted, over all pairs that were validated.
 
     `precision`: accepted pairs whose transform is right to 10 cm and 10 degrees, over accepted.
     `recall`: the same over all pairs whose transform is right. `recall_overlap_30`: over those
@@ -298,7 +290,7 @@ def validation(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None
 
 
 def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | None]:
-    """The same of some pairs; precision is null where none of them was accepted."""
+    """Return the same of some pairs; precision is null where none of them was accepted."""
     accepted = [p for p in pairs if p.accepted]
     right = [p for p in pairs if p.right]
     clear = [p for p in right if p.overlap_least >= OVERLAPS]
@@ -322,7 +314,7 @@ def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | Non
 
 
 def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
-    """How often a query is believed to be found where its scene is not in the database.
+    """Return how often a query is believed to be found where its scene is not in the database.
 
     `accepted_strong` and `accepted_weak` are shares of these queries by the strength of VDR's
     answer; null where there is no such query.
@@ -339,7 +331,7 @@ def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
 
 
 def answers(told: Sequence[JudgedAnswer]) -> dict[str, Any]:
-    """What robots are told, as shares of all queries; the first four add up to 1.
+    """Return what robots are told, as shares of all queries; the first four add up to 1.
 
     `found_right`: within 10 cm and 10 degrees, or the limits of the answers. `found_wrong`: found
     and not right, of absent scenes always; `grossly_wrong` of them are beyond 50 cm or 15 degrees,
@@ -420,7 +412,7 @@ def calibration(confidences: Sequence[float], right: Sequence[bool]) -> Calibrat
 
 
 def first_error(outcome: QueryOutcome, of: str) -> Error:
-    """How far off a row's first answer is; infinite where it has none."""
+    """Return how far off a row's first answer is; infinite where it has none."""
     views = outcome.views(of)
     return views[0].error if views else Error()
 
@@ -448,15 +440,9 @@ def _median(values: Sequence[float]) -> float | None:
 
 #: Every query ends in exactly one of these.
 PLACES = (
-    "found",
-    "near",
-    "wrongly_accepted",
-    "nothing_overlaps",
-    "not_in_r",
-    "not_in_c",
-    "ambiguous",
+    "found", "near", "wrongly_accepted", "nothing_overlaps", "not_in_r", "not_in_c", "ambiguous",
     "rejected",
-)
+)  # fmt: skip
 
 
 def lost(outcomes: Sequence[QueryOutcome]) -> dict[str, int]:
@@ -469,7 +455,7 @@ def lost(outcomes: Sequence[QueryOutcome]) -> dict[str, int]:
 
 
 def place_of(outcome: QueryOutcome) -> str:
-    """The first of these that is true of a query.
+    """Return the first of these that is true of a query.
 
     With an accepted match: `found`, VDR's answer is right to 10 cm and 10 degrees; `near`, to
     20 cm and 20 degrees; else `wrongly_accepted`. Without one: `nothing_overlaps`, no database
@@ -506,7 +492,7 @@ Voxels = NDArray[np.int64]
 def diversity(
     outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
-    """How far the first five lie from the query and from each other, and what they cover.
+    """Return how far the first five lie from the query and from each other, and what they cover.
 
     `translation` has, for each of R, DR, VR and VDR, the mean and the standard deviation (within
     the five) of the distance between the query and the match, metres, by true poses, averaged
@@ -548,7 +534,7 @@ def diversity(
 
 
 def equal_views(outcome: QueryOutcome) -> tuple[list[ValidatedPair], list[ValidatedPair]]:
-    """The first validated views of VR and VDR in the query's scene, as many of either."""
+    """Return the first validated views of VR and VDR in the query's scene, as many of either."""
     ranked, diverse = (_of_scene(outcome, of) for of in ("VR", "VDR"))
     n = min(len(ranked), len(diverse))
     return ranked[:n], diverse[:n]
@@ -557,7 +543,7 @@ def equal_views(outcome: QueryOutcome) -> tuple[list[ValidatedPair], list[Valida
 def coverage(
     outcomes: Sequence[QueryOutcome], database: Callable[[int], AnyFrame]
 ) -> list[tuple[int, int] | None]:
-    """Voxels covered by VR's and VDR's views of each query; None with fewer than two views."""
+    """Return the voxels that VR's and VDR's views of each query cover; None with fewer than two."""
 
     @lru_cache(256)
     def seen(match: int) -> Voxels:
@@ -574,7 +560,7 @@ def coverage(
 
 
 def voxels(frame: AnyFrame) -> Voxels:
-    """The voxels that a frame sees, each once, as numbers that are the same for all frames."""
+    """Return the voxels that a frame sees, as numbers that are the same for all frames."""
     points = points_of(frame, PIXELS, FARTHEST)
     if frame.pose is None:
         raise ValueError(f"{frame.name} has no pose")
@@ -586,7 +572,7 @@ def voxels(frame: AnyFrame) -> Voxels:
 
 
 def points_of(frame: AnyFrame, step: int, farthest: float) -> Floats:
-    """(N, 3) metres, sensor frame: every `step`-th pixel both ways that is nearer than that.
+    """Return (N, 3) metres, sensor frame: every `step`-th pixel both ways that is nearer than that.
 
     Of a cloud all points that are nearer than that to the sensor.
     """
@@ -602,7 +588,7 @@ def points_of(frame: AnyFrame, step: int, farthest: float) -> Floats:
 
 
 def _of_scene(outcome: QueryOutcome, of: str) -> list[ValidatedPair]:
-    """The first five, less those of other scenes: they lie nowhere in this one."""
+    """Return the first five, less those of other scenes: they lie nowhere in this one."""
     return [pair for pair in outcome.views(of)[:VIEWS] if pair.same_scene]
 
 

@@ -25,7 +25,7 @@ from sceneprint_lab.evaluation.measures import (
 )
 from sceneprint_lab.evaluation.pair_run import BINS, METHODS, PairEvaluation, Tried
 from sceneprint_lab.evaluation.protocol import Error, ValidatedPair
-from sceneprint_lab.evaluation.report import without_infinities
+from sceneprint_lab.evaluation.report import decimal, error_figures, without_infinities
 from sceneprint_lab.evaluation.run import PLANAR
 
 _COLUMNS = ("within_5cm_5deg", "right")
@@ -34,7 +34,7 @@ _HEAD = f"{'':24}" + "".join(f"{name + ' %':>16}" for name in BINS)
 
 
 def pair_table(found: dict[str, Any]) -> list[str]:
-    """Bins, negatives, statistics and baselines; figures as `pair_report.pair_figures` has them."""
+    """Return the figures of `pair_figures` as lines to read."""
     lines: list[str] = []
     for scene, own in found.get("scenes", {}).items():
         lines += [f"{scene}, alone", *_bins(own), ""]
@@ -46,24 +46,24 @@ def pair_table(found: dict[str, Any]) -> list[str]:
     lines += [*_negatives(found["negatives"]), "", *_statistics(found["roc"]), ""]
     v = found["validation"]
     lines.append(
-        f"acceptance    precision {_number(v['precision'])}, recall {_number(v['recall'])}, where "
-        f"overlap is 30 % {_number(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
+        f"acceptance    precision {decimal(v['precision'])}, recall {decimal(v['recall'])}, where "
+        f"overlap is 30 % {decimal(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
         f"accepted, {v['accepted_strong']} strong"
     )
     s = found["support"]
     lines.append(
         f"second pair   {s['supported']} accepted pairs have one that agrees: precision "
-        f"{_number(s['precision'])}; {s['contradicted']} have only others that disagree: "
-        f"{_number(s['precision_contradicted'])}; {s['alone']} have no other: "
-        f"{_number(s['precision_alone'])}"
+        f"{decimal(s['precision'])}; {s['contradicted']} have only others that disagree: "
+        f"{decimal(s['precision_contradicted'])}; {s['alone']} have no other: "
+        f"{decimal(s['precision_alone'])}"
     )
     kinds = [one["what"] for one in found["failures"]]
     counts = [f"{kinds.count(kind)} {kind.replace('_', ' ')}" for kind in dict.fromkeys(kinds)]
     lines.append(f"failures      {', '.join(counts) or 'none'}")
     times = found["milliseconds"]
     lines.append(
-        f"milliseconds  prepare {_number(times['prepare'], 1)}, validate "
-        f"{_number(times['validate'], 1)} (medians)"
+        f"milliseconds  prepare {decimal(times['prepare'], 1)}, validate "
+        f"{decimal(times['validate'], 1)} (medians)"
     )
     return lines
 
@@ -75,10 +75,10 @@ def _bins(found: dict[str, Any]) -> list[str]:
         (_LIMITS, lambda one: _two(one["success"])),
         ("  from the true pose", lambda one: _two(one["bound"])),
         ("accepted", lambda one: str(one["validation"]["accepted"])),
-        ("  precision", lambda one: _number(one["validation"]["precision"])),
-        ("  recall", lambda one: _number(one["validation"]["recall"])),
+        ("  precision", lambda one: decimal(one["validation"]["precision"])),
+        ("  recall", lambda one: decimal(one["validation"]["recall"])),
         ("with a second pair", lambda one: str(one["support"]["supported"])),
-        ("  precision", lambda one: _number(one["support"]["precision"])),
+        ("  precision", lambda one: decimal(one["support"]["precision"])),
     ]
     lines = [_HEAD]
     for name, cell in rows:
@@ -88,8 +88,8 @@ def _bins(found: dict[str, Any]) -> list[str]:
         same = found["same_scene"]
         lines.append(
             f"with {same['pairs']} pairs of it that see nothing of each other: precision "
-            f"{_number(v['precision'])}, recall {_number(v['recall'])}, where overlap is 30 % "
-            f"{_number(v['recall_overlap_30'])}"
+            f"{decimal(v['precision'])}, recall {decimal(v['recall'])}, where overlap is 30 % "
+            f"{decimal(v['recall_overlap_30'])}"
         )
     return lines
 
@@ -103,11 +103,11 @@ def _baselines(found: dict[str, Any]) -> list[str]:
             cells = [_two(own["bins"][b][step]) for b in BINS]
             lines.append(f"{method + name:24}" + "".join(f"{cell:>16}" for cell in cells))
     times = [
-        f"{method} + ICP {_number(own['milliseconds'], 0)} (ours / it {_number(own['time_ratio'])})"
+        f"{method} + ICP {decimal(own['milliseconds'], 0)} (ours / it {decimal(own['time_ratio'])})"
         for method, own in of["methods"].items()
     ]
     lines.append(
-        f"milliseconds  ours {_number(of['milliseconds'], 0)}, {', '.join(times)}; medians, one "
+        f"milliseconds  ours {decimal(of['milliseconds'], 0)}, {', '.join(times)}; medians, one "
         "thread, features of both frames counted"
     )
     return lines
@@ -125,7 +125,7 @@ def _negatives(found: dict[str, Any]) -> list[str]:
         if own["pairs"]:
             lines.append(
                 f"{name:36}{own['pairs']:>8}{own['accepted']:>10}{own['accepted_strong']:>8}"
-                f"{_number(own['upper'], 5):>10}"
+                f"{decimal(own['upper'], 5):>10}"
             )
     lines.append(
         f"(at most: the rate, with {found['confidence']:.0%} confidence, were pairs independent)"
@@ -138,30 +138,22 @@ def _statistics(found: dict[str, Any]) -> list[str]:
     for name, own in found.items():
         at = own["right_at"]
         lines.append(
-            f"{name:16}{_number(own['area']):>8}{_number(at['0']):>20}{_number(at['0.01']):>8}"
-            f"{_number(at['0.05']):>8}"
+            f"{name:16}{decimal(own['area']):>8}{decimal(at['0']):>20}{decimal(at['0.01']):>8}"
+            f"{decimal(at['0.05']):>8}"
         )
     return lines
 
 
 def _two(shares: dict[str, float | None]) -> str:
-    return " / ".join(_number(shares[name]) for name in _COLUMNS)
+    return " / ".join(decimal(shares[name]) for name in _COLUMNS)
 
-
-def _number(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-# What is told of a transform, and how well each number would decide alone.
-#
-# Pair, ...  --curves-->  figures
 
 #: Shares of wrong pairs at which a curve is read off.
 FALSE_RATES = (0.0, 0.01, 0.05)
 
 
 def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
-    """For less against, as acceptance weighs it; without its stiffness, which is not told."""
+    """Return the evidence as acceptance weighs it, without the stiffness."""
     told = Evidence(
         v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf
     )
@@ -169,7 +161,7 @@ def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
 
 
 def residual(v: PairValidation, p: AcceptanceParameters) -> float:
-    """Of the two directions: the greater of metres and radians, each over its own limit."""
+    """Return of the two directions: the greater of metres and radians, each over its own limit."""
     return max(v.residual_m / p.residual_m, v.residual_rad / p.residual_rad)
 
 
@@ -186,7 +178,7 @@ STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | N
 
 
 def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str, Any]:
-    """The receiver operating characteristic of each statistic, were it to decide alone.
+    """Return the receiver operating characteristic of each statistic, were it to decide alone.
 
     A pair is right where its transform is, whatever was decided. One without a transform, or of
     which a statistic is not known, has nothing to say for it. Of `ambiguity` only pairs are
@@ -224,7 +216,7 @@ SCHEMA_VERSION = 1
 
 
 def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[str, Any]:
-    """Every figure of an evaluation of pairs.
+    """Return every figure of an evaluation of pairs.
 
     Parameters
     ----------
@@ -256,7 +248,11 @@ def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[s
     found["support"] = support(tried, seconds)
 
     def within(scene: str) -> list[int]:
-        return [i for i, one in enumerate(tried) if _within(one, scene, scene_of)]
+        return [
+            i
+            for i, one in enumerate(tried)
+            if scene_of[one.drawn.query] == scene_of[one.drawn.match] == scene
+        ]
 
     if len(scenes) > 1:
         found["scenes"] = {
@@ -274,15 +270,11 @@ def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[s
     return cleaned
 
 
-def _within(one: Tried, scene: str, scene_of: Sequence[str]) -> bool:
-    return scene_of[one.drawn.query] == scene_of[one.drawn.match] == scene
-
-
 def _of_scene(
     own: Sequence[int], tried: Sequence[Tried], seconds: Sequence[Second | None],
     limits: tuple[float, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Figures of the pairs of one scene, its negatives among them."""
+    """Return figures of the pairs of one scene, its negatives among them."""
     pairs, theirs = [tried[i] for i in own], [seconds[i] for i in own]
     return {
         "bins": bins(pairs, theirs, limits),
@@ -329,7 +321,7 @@ def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
 
 
 def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[str, Any]:
-    """How many accepted pairs a second one supports, and how many of each kind are right."""
+    """Return how many accepted pairs a second one supports, and how many of each kind are right."""
     found: dict[str, Any] = {}
     kinds: tuple[Second, ...] = get_args(Second)
     for kind in kinds:
@@ -343,7 +335,7 @@ def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[st
 def bins(
     tried: Sequence[Tried], seconds: Sequence[Second | None], limits: tuple[float, float]
 ) -> dict[str, dict[str, Any]]:
-    """By true overlap: how often the transform is right, accepted or not, and whether believed.
+    """Return by true overlap how often the transform is right, and how often it is accepted.
 
     `success`: of the transform that validation found; `right`: to the limits of the evaluation.
     `bound`: of refinement started at the true pose. Without a transform a pair is a failure.
@@ -374,7 +366,7 @@ def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
 
 
 def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
-    """How many pairs that see nothing of each other were accepted, and how many may be.
+    """Return how many pairs that see nothing of each other were accepted, and how many may be.
 
     `planar`: the pairs of two scenes of which a frame is planar. `by_scenes`: of every two.
     """
@@ -395,7 +387,7 @@ def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
 
 
 def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
-    """Of pairs that ought not to be accepted: how many are; `upper`: see `upper_bound`."""
+    """Return of pairs that ought not to be accepted: how many are; `upper`: see `upper_bound`."""
     accepted = [one.pair for one in tried if one.pair.accepted]
     return {
         "pairs": len(tried),
@@ -407,7 +399,7 @@ def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
 
 
 def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
-    """Success of others by bin on the same pairs, and what ours costs beside them.
+    """Return success of others by bin on the same pairs, and what ours costs beside them.
 
     `start`: before refinement; `icp`: after their own; `ours`: after our refinement in its place.
     `time_ratio`: median over pairs of our time over theirs, features of both frames counted.
@@ -438,7 +430,7 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
 
 
 def why(one: Tried) -> str | None:
-    """What went wrong with a pair, None where nothing did.
+    """Return what went wrong with a pair, None where nothing did.
 
     `wrongly_accepted`; `not_believed`: a right transform that was not accepted; `near`: off by
     up to twice the limits, and not accepted; `not_found`: farther off or without a transform,
@@ -456,7 +448,7 @@ def why(one: Tried) -> str | None:
 
 
 def failures(evaluation: PairEvaluation) -> list[dict[str, Any]]:
-    """Every pair that went wrong, the worst kind first, and all that was told of it."""
+    """Return every pair that went wrong, the worst kind first, and all that was told of it."""
     order = ("wrongly_accepted", "not_believed", "near", "not_found")
     listed = [(why(one), number, one) for number, one in enumerate(evaluation.tried)]
     wrong = [(kind, number, one) for kind, number, one in listed if kind is not None]
@@ -471,7 +463,7 @@ def failures(evaluation: PairEvaluation) -> list[dict[str, Any]]:
             "planar": one.drawn.planar,
             "true_overlap": one.drawn.overlap_least,
             **_pair_record(one.pair, evaluation.acceptance),
-            "bound": None if one.pair.bound is None else _off(one.pair.bound),
+            "bound": None if one.pair.bound is None else error_figures(one.pair.bound),
         }
         for kind, number, one in wrong
     ]
@@ -480,7 +472,7 @@ def failures(evaluation: PairEvaluation) -> list[dict[str, Any]]:
 def _pair_record(pair: ValidatedPair, p: AcceptanceParameters) -> dict[str, Any]:
     v = pair.validation
     return {
-        **_off(pair.error),
+        **error_figures(pair.error),
         "status": v.status,
         "strength": v.strength,
         "reason": v.reason,
@@ -493,10 +485,6 @@ def _pair_record(pair: ValidatedPair, p: AcceptanceParameters) -> dict[str, Any]
         "ambiguity": v.ambiguity,
         "inliers": v.inliers,
     }
-
-
-def _off(error: Error) -> dict[str, float]:
-    return {"translation_m": error.metres, "rotation_deg": math.degrees(error.radians)}
 
 
 def _median(values: Sequence[float]) -> float | None:

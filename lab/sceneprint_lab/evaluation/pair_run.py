@@ -128,7 +128,7 @@ class Drawn:
 def draw(
     places: Sequence[FrameOrigin], truth: Overlaps, planar: NDArray[np.bool_], p: Drawing
 ) -> list[Drawn]:
-    """Pairs of every bin and of both kinds of negatives, each pair once; fewer where fewer exist.
+    """Return pairs of every bin and of both kinds of negatives, or fewer if fewer exist.
 
     The later frame is the query. Of pairs of two scenes, every two scenes have as many, and a
     quarter is drawn among those with a planar frame, so long as there are any.
@@ -154,13 +154,9 @@ def draw(
 
 
 def _of_one_scene(
-    own: NDArray[np.intp],
-    places: Sequence[FrameOrigin],
-    truth: Overlaps,
-    planar: NDArray[np.bool_],
-    p: Drawing,
-    scene: int,
-) -> list[Drawn]:
+    own: NDArray[np.intp], places: Sequence[FrameOrigin], truth: Overlaps,
+    planar: NDArray[np.bool_], p: Drawing, scene: int,
+) -> list[Drawn]:  # fmt: skip
     later, earlier = np.tril_indices(len(own), -1)
     later, earlier = own[later], own[earlier]
     _, runs = np.unique([place.run for place in places], return_inverse=True)
@@ -183,18 +179,15 @@ def _of_one_scene(
 
 
 def inside(least: Floats, name: str) -> NDArray[np.bool_]:
-    """Whether overlaps lie in a bin; the last one has its upper edge."""
+    """Return whether overlaps lie in a bin; the last one has its upper edge."""
     low, high = list(pairwise(EDGES))[BINS.index(name)]
     return (least >= low) & ((least < high) | (high == EDGES[-1]))
 
 
 def _of_two_scenes(
-    a: NDArray[np.intp],
-    b: NDArray[np.intp],
-    planar: NDArray[np.bool_],
-    n: int,
+    a: NDArray[np.intp], b: NDArray[np.intp], planar: NDArray[np.bool_], n: int,
     rng: np.random.Generator,
-) -> list[Drawn]:
+) -> list[Drawn]:  # fmt: skip
     flat = (planar[a][:, None] | planar[b]).ravel()
     first = _some(np.flatnonzero(flat), round(PLANAR_SHARE * n), rng)
     rest = np.setdiff1d(np.arange(len(flat)), first)
@@ -206,7 +199,7 @@ def _of_two_scenes(
 
 
 def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """At most n of some numbers, each once, rising."""
+    """Return at most n of some numbers, each once, rising."""
     return np.sort(rng.choice(of, min(n, len(of)), replace=False))
 
 
@@ -266,12 +259,12 @@ class Attempt:
 
     @property
     def milliseconds(self) -> float:
-        """Of all stages."""
+        """Return the sum of all stages."""
         return sum(self.stages.values())
 
 
 def points_of(frame: DepthFrame, minimum: float, maximum: float) -> Floats:
-    """All samples of a depth image within a range, (N, 3) metres."""
+    """Return all samples of a depth image within a range, (N, 3) metres."""
     k = frame.intrinsics
     y, x = np.nonzero((frame.depth >= minimum) & (frame.depth <= maximum))
     z = frame.depth[y, x].astype(np.float64)
@@ -279,15 +272,10 @@ def points_of(frame: DepthFrame, minimum: float, maximum: float) -> Floats:
 
 
 def register(
-    query: Floats,
-    match: Floats,
-    o3d: Any,
-    methods: Sequence[str] = METHODS,
-    *,
-    seed: int = 0,
+    query: Floats, match: Floats, o3d: Any, methods: Sequence[str] = METHODS, *, seed: int = 0,
     scale: float = 1.0,
-) -> dict[str, Attempt]:
-    """Each method on a pair of clouds; nothing where one of these is next to empty.
+) -> dict[str, Attempt]:  # fmt: skip
+    """Return each method on a pair of clouds; nothing where one of these is next to empty.
 
     Features are computed once, and counted for each method.
 
@@ -320,7 +308,7 @@ def register(
 
 
 def cloud_of(points: Floats, o3d: Any) -> Any:
-    """Open3D's cloud of (N, 3) points."""
+    """Return Open3D's cloud of (N, 3) points."""
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
 
 
@@ -331,18 +319,14 @@ def _searching(o3d: Any, scale: float) -> Callable[[float, int], Any]:
 def _ransac(thin: list[Any], features: list[Any], o3d: Any, scale: float) -> Floats:
     register = o3d.pipelines.registration
     found = register.registration_ransac_based_on_feature_matching(
-        *thin,
-        *features,
-        True,
-        scale * CORRESPONDENCE,
-        register.TransformationEstimationPointToPoint(False),
-        POINTS,
+        *thin, *features, True, scale * CORRESPONDENCE,
+        register.TransformationEstimationPointToPoint(False), POINTS,
         [
             register.CorrespondenceCheckerBasedOnEdgeLength(BASELINE_EDGES),
             register.CorrespondenceCheckerBasedOnDistance(scale * CORRESPONDENCE),
         ],
         register.RANSACConvergenceCriteria(HYPOTHESES, CONFIDENCE),
-    )
+    )  # fmt: skip
     return np.array(found.transformation, np.float64)
 
 
@@ -356,16 +340,13 @@ def _fgr(thin: list[Any], features: list[Any], o3d: Any, scale: float) -> Floats
 
 
 def _icp(clouds: list[Any], start: Floats, o3d: Any, scale: float) -> Floats:
-    """Point to plane; the finer clouds and the normals it asks for are its own."""
+    """Return point to plane; the finer clouds and the normals it asks for are its own."""
     register = o3d.pipelines.registration
     fine = [c.voxel_down_sample(scale * ICP_VOXEL) for c in clouds]
     fine[1].estimate_normals(_searching(o3d, scale)(*NORMALS))
     found = register.registration_icp(
-        *fine,
-        scale * ICP_CORRESPONDENCE,
-        start,
-        register.TransformationEstimationPointToPlane(),
-    )
+        *fine, scale * ICP_CORRESPONDENCE, start, register.TransformationEstimationPointToPlane(),
+    )  # fmt: skip
     return np.array(found.transformation, np.float64)
 
 
@@ -430,15 +411,9 @@ class Bench:
 
 
 def open_bench(
-    store: FrameStore,
-    model: Model,
-    mode: Mode,
-    seed: int,
-    limits: tuple[float, float],
-    *,
-    baselines: bool,
-    matching: Matching = "histograms",
-) -> Bench:
+    store: FrameStore, model: Model, mode: Mode, seed: int, limits: tuple[float, float], *,
+    baselines: bool, matching: Matching = "histograms",
+) -> Bench:  # fmt: skip
     """Make ready to try pairs of the frames of a store."""
     o3d = open3d("A baseline of registration") if baselines else None
     judging = open_judge(store, mode, seed, model.parameters.validation, matching)
@@ -467,37 +442,32 @@ def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried
 def _others(
     bench: Bench, query: AnyFrame, match: AnyFrame, true: Floats
 ) -> tuple[dict[str, Other], float]:
-    """What the baselines make of two frames, and the milliseconds of our geometry of both."""
+    """Return the results of the baselines, and the milliseconds of our geometry of both frames."""
     p = bench.model.parameters
     start = time.perf_counter()
     ours, its = (geometry_of(see(frame, p), bench.model) for frame in (query, match))
     spent = 1e3 * (time.perf_counter() - start)
     found = register(
-        peer_points(query, bench.model),
-        peer_points(match, bench.model),
-        bench.o3d,
-        seed=bench.judging.seed,
-        scale=scale_of(p),
-    )
+        peer_points(query, bench.model), peer_points(match, bench.model), bench.o3d,
+        seed=bench.judging.seed, scale=scale_of(p),
+    )  # fmt: skip
     others = {}
     for name, one in found.items():
         refined = refined_by_us(ours, its, one.start, bench.judging.p.alignment)
         others[name] = Other(
-            _error(one.start, true),
-            _error(one.refined, true),
-            _error(refined, true),
+            _error(one.start, true), _error(one.refined, true), _error(refined, true),
             one.milliseconds,
-        )
+        )  # fmt: skip
     return others, spent
 
 
 def scale_of(p: ModelParameters) -> float:
-    """How much longer the lengths of a model are than those for rooms, by its radius."""
+    """Return how much longer the lengths of a model are than those for rooms, by its radius."""
     return p.properties.radius / PropertyParameters().radius
 
 
 def peer_points(frame: AnyFrame, model: Model) -> Floats:
-    """What baselines are given: all points, of a depth image those within the model's range."""
+    """Return the points for baselines: all, of a depth image those within the model's range."""
     if isinstance(frame, Cloud):
         return frame.points.astype(np.float64)
     p = model.parameters.depth
@@ -507,7 +477,7 @@ def peer_points(frame: AnyFrame, model: Model) -> Floats:
 def refined_by_us(
     query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
 ) -> Floats | None:
-    """Our refinement of another's transform: with wide gates first, as our own hypotheses get."""
+    """Return our refinement of another's transform, with wide gates first as for our hypotheses."""
     coarse = refined_all(query.surface, match.surface, T[None], p.coarse)
     return refined_at(query, match, coarse[0] if len(coarse) else T, p.fine)
 
@@ -569,12 +539,9 @@ class PairEvaluation:
 
 
 def evaluate_pairs(
-    paths: Sequence[Path],
-    signer: Signer,
-    store: FrameStore,
-    settings: PairSettings,
+    paths: Sequence[Path], signer: Signer, store: FrameStore, settings: PairSettings,
     watch: Watch = unwatched,
-) -> PairEvaluation:
+) -> PairEvaluation:  # fmt: skip
     """Draw pairs by true overlap, validate each, and judge it by the true poses.
 
     Parameters
@@ -596,13 +563,8 @@ def evaluate_pairs(
     placed = spread(every_frame(paths), settings.frames)
     chosen = tuple(one for one, _ in placed)
     prepared = prepare_all(
-        chosen,
-        signer,
-        store,
-        jobs=settings.jobs,
-        cache_dir=settings.cache_dir,
-        watch=watch,
-    )
+        chosen, signer, store, jobs=settings.jobs, cache_dir=settings.cache_dir, watch=watch,
+    )  # fmt: skip
     members = [replace(m, signature=np.empty(0, np.uint8)) for m in prepared.queries]
     if len(members) < 2:
         raise DatasetError(_too_few(prepared))
@@ -620,30 +582,19 @@ def evaluate_pairs(
         )
     tasks = [(one, members[one.query], members[one.match]) for one in drawn]
     opening = partial(
-        open_bench,
-        store,
-        signer.model,
-        settings.mode,
-        settings.seed,
-        settings.limits,
-        baselines=settings.baselines,
-        matching=settings.matching,
-    )
+        open_bench, store, signer.model, settings.mode, settings.seed, settings.limits,
+        baselines=settings.baselines, matching=settings.matching,
+    )  # fmt: skip
     tried = map_over(tasks, attempt, opening, settings.jobs)
     return PairEvaluation(
-        members,
-        settings.limits,
-        parameters.validation.acceptance,
-        planes,
-        list(watch(tried, "validate", len(tasks))),
-        prepared.left_out,
-        prepared.milliseconds,
+        members, settings.limits, parameters.validation.acceptance, planes,
+        list(watch(tried, "validate", len(tasks))), prepared.left_out, prepared.milliseconds,
         signer.model.answer.map,
-    )
+    )  # fmt: skip
 
 
 def spread(chosen: Sequence[ProtocolFrame], most: int) -> list[tuple[ProtocolFrame, FrameOrigin]]:
-    """At most so many frames of each scene, evenly over its recordings, and where each is."""
+    """Return at most so many frames of each scene, evenly spread, and their origins."""
     counts: Counter[tuple[str, str]] = Counter()
     of: dict[str, list[tuple[ProtocolFrame, FrameOrigin]]] = {}
     for one in chosen:
@@ -679,7 +630,7 @@ def _plane_share(opened: tuple[FrameStore, float], member: SignedFrame) -> float
 
 
 def _overlaps(members: Sequence[SignedFrame], store: FrameStore, watch: Watch) -> Overlaps:
-    """Overlap of all with all; 0 between scenes."""
+    """Return overlap of all with all; 0 between scenes."""
     shape = len(members), len(members)
     mean, least = np.zeros(shape), np.zeros(shape)
     for scene in dict.fromkeys(member.scene for member in members):

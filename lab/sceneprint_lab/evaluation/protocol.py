@@ -93,7 +93,7 @@ class Error:
     radians: float = math.inf
 
     def within(self, metres: float, degrees: float) -> bool:
-        """Whether both parts are at most these."""
+        """Return whether both parts are at most these."""
         return self.metres <= metres and self.radians <= math.radians(degrees)
 
 
@@ -127,12 +127,12 @@ class ValidatedPair:
 
     @property
     def accepted(self) -> bool:
-        """Whether the match was accepted, strong or weak."""
+        """Return whether the match was accepted, strong or weak."""
         return self.validation.status == "accepted"
 
     @property
     def right(self) -> bool:
-        """Whether the transform is right to its limits, accepted or not."""
+        """Return whether the transform is right to its limits, accepted or not."""
         return self.error.within(*self.limits)
 
 
@@ -177,12 +177,12 @@ class JudgedAnswer:
 
     @property
     def right(self) -> bool:
-        """Whether it is found within its limits, 10 cm and 10 degrees by default."""
+        """Return whether it is found within its limits, 10 cm and 10 degrees by default."""
         return self.status == "found" and self.error.within(*self.limits)
 
     @property
     def grossly_wrong(self) -> bool:
-        """Whether it is found, but beyond 50 cm or 15 degrees; with other limits in proportion."""
+        """Return whether it is found beyond 50 cm or 15 degrees, or other limits in proportion."""
         gross = [g * limit / r for g, limit, r in zip(GROSS, self.limits, RIGHT, strict=True)]
         return self.status == "found" and not self.error.within(*gross)
 
@@ -249,7 +249,7 @@ class QueryOutcome:
 
 
 def in_preferred_order(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
-    """Accepted pairs, strong ones first: the order in which they are believed."""
+    """Return accepted pairs, strong ones first: the order in which they are believed."""
     return [pairs[i] for i in preferred([pair.validation for pair in pairs])]
 
 
@@ -350,7 +350,7 @@ def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
 
 @kernel
 def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int, int]:
-    """Of points in the parent frame, those that a frame sees where they are: both tolerances."""
+    """Count the points of the parent frame that a frame sees where they are: both tolerances."""
     height, width = depth.shape
     loose = strict = 0
     for i in range(len(points)):
@@ -370,7 +370,7 @@ def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int
 
 
 def _near(points: Floats, cloud: CloudView) -> tuple[int, int]:
-    """Of points in the parent frame, those that a cloud has a point at: both tolerances."""
+    """Return of points in the parent frame, those that a cloud has a point at: both tolerances."""
     wide = np.zeros(len(points))
     if cloud.viewpoint is not None:
         wide = RELATIVE_TOLERANCE * np.linalg.norm(points - cloud.viewpoint, axis=1)
@@ -436,7 +436,7 @@ def _run(member: SignedFrame) -> str:
 
 
 def _runs(members: Sequence[SignedFrame]) -> list[dict[str, float]]:
-    """Of each run, the place of each frame on its path, metres from the first."""
+    """Return of each run, the place of each frame on its path, metres from the first."""
     runs: dict[str, dict[str, SignedFrame]] = {}
     for member in members:
         runs.setdefault(_run(member), {})[member.name] = member
@@ -472,11 +472,8 @@ def unwatched(items: Iterable[T], stage: str, total: int) -> Iterable[T]:  # noq
 
 
 def map_over(
-    tasks: Sequence[T],
-    do: Callable[[S, T], R],
-    opening: Callable[[], S],
-    jobs: int,
-) -> Iterator[R]:
+    tasks: Sequence[T], do: Callable[[S, T], R], opening: Callable[[], S], jobs: int,
+) -> Iterator[R]:  # fmt: skip
     """Do every task with what `opening` returns, which each process calls once.
 
     Each process holds its libraries to one thread: sums then have one order, and processes
@@ -584,7 +581,7 @@ class ProtocolFrame:
     reference: FrameReference
 
     def is_for(self, use: Use) -> bool:
-        """Whether the frame takes part as this."""
+        """Return whether the frame takes part as this."""
         return self.use in (use, "both")
 
 
@@ -648,17 +645,12 @@ def parse_part(text: str) -> PathRanges:
 
 
 def choose(
-    parts: Sequence[PathRanges],
-    distractors: Sequence[Path] = (),
-    *,
-    database: Ranges | None = None,
-    queries: Ranges | None = None,
-    database_step: int = 1,
-    query_step: int = 1,
-    shared: bool = False,
+    parts: Sequence[PathRanges], distractors: Sequence[Path] = (), *,
+    database: Ranges | None = None, queries: Ranges | None = None, database_step: int = 1,
+    query_step: int = 1, shared: bool = False,
     find: Callable[[Path], tuple[Run, ...]] = find_sequences,
-) -> EvaluationProtocol:
-    """Assign the frames of each path to the database or the queries; no frame is read.
+) -> EvaluationProtocol:  # fmt: skip
+    """Return assign the frames of each path to the database or the queries; no frame is read.
 
     A path's own ranges go before `database` and `queries`, and these before the split files of
     its scenes.
@@ -866,15 +858,10 @@ class _Done:
 
 
 def prepare_all(
-    chosen: tuple[ProtocolFrame, ...],
-    signer: Signer,
-    store: FrameStore,
-    *,
-    levels: int | None = None,
-    jobs: int = 1,
-    cache_dir: Path | None = None,
+    chosen: tuple[ProtocolFrame, ...], signer: Signer, store: FrameStore, *,
+    levels: int | None = None, jobs: int = 1, cache_dir: Path | None = None,
     watch: Watch = unwatched,
-) -> Prepared:
+) -> Prepared:  # fmt: skip
     """Read, sign and store every frame.
 
     A frame without a pose cannot be judged, and is left out; but a database frame of a scene

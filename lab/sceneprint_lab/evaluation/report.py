@@ -1,7 +1,6 @@
-"""The figures of an evaluation as lines to read in a terminal.
+"""Report an evaluation: its figures as JSON, and as lines to read in a terminal.
 
-figures  --table-->  lines
-Evaluation  --recalls, baseline_rows-->  rows of the baselines, as the table has them for R
+Evaluation  --figures-->  dict  --to_json-->  bytes        dict  --table-->  lines
 """
 
 from __future__ import annotations
@@ -13,12 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneprint.geometry.rigid import inverse
 from sceneprint.types import AnyFrame, Floats
 from sceneprint_client.api import Answer, Match
-from sceneprint_lab.evaluation.baselines import Compared
 from sceneprint_lab.evaluation.measures import (
     FIRST,
     Figures,
@@ -29,6 +26,7 @@ from sceneprint_lab.evaluation.measures import (
     diversity,
     lost,
     oracle_and_random,
+    overlap_figures,
     place_of,
     recall,
     rows,
@@ -39,77 +37,50 @@ from sceneprint_lab.evaluation.run import Evaluation
 
 
 def recalls(evaluation: Evaluation) -> dict[str, Any]:
-    """Recall of R, of C, and of a random frame; see `recall`.
+    """Return the recall of R, of C, and of a random frame; see `recall`.
 
-    `within_m`: a frame is the query's place where it was taken within so many metres; null: where
-    the two overlap by half.
+    `within_m`: a frame is the query's place if it was taken within so many metres; null: if the two
+    overlap by half.
     """
     relevant, allowed = evaluation.relevant, evaluation.allowed
-    outcomes = evaluation.outcomes
+    good, n = (relevant & allowed).sum(axis=1), allowed.sum(axis=1)
+    shares = good[good > 0] / n[good > 0]
     return {
         "within_m": evaluation.within_m,
-        "R": recall(relevant, allowed, [o.ranking for o in outcomes]),
-        "DR": recall(relevant, allowed, [o.selection for o in outcomes]),
-        "random": _by_chance(relevant, allowed),
+        "R": recall(relevant, allowed, [o.ranking for o in evaluation.outcomes]),
+        "DR": recall(relevant, allowed, [o.selection for o in evaluation.outcomes]),
+        "random": {"queries": len(shares), "at_1": float(shares.mean()) if len(shares) else None},
     }
-
-
-def _by_chance(
-    relevant: NDArray[np.bool_], allowed: NDArray[np.bool_]
-) -> dict[str, float | int | None]:
-    """Expected share of queries that a random frame would answer rightly."""
-    good, n = (relevant & allowed).sum(axis=1), allowed.sum(axis=1)
-    able = good > 0
-    shares = good[able] / n[able]
-    return {"queries": int(able.sum()), "at_1": float(shares.mean()) if able.any() else None}
 
 
 def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
-    """Each baseline's figures by its name: those of R, by its ranking.
+    """Return the figures of each baseline by its name: those of R, by its ranking.
 
-    `milliseconds`: see Compared. `ratio`: to describe a query and to rank the database for it,
-    over the same by the signature.
-    `reason`: why the baseline could not be asked; then it has no figures.
+    `milliseconds`: see Compared. `ratio`: the time to describe a query and to rank the database for
+    it, over the same by the signature. `reason`: why the baseline cannot be used; it has no figures
+    then.
     """
-    ours = float(np.median([o.milliseconds["rank"] for o in evaluation.outcomes]))
-    return {
-        one.name: {"reason": one.reason} if one.reason else _row(one, evaluation, ours)
-        for one in evaluation.compared
-    }
-
-
-def _row(one: Compared, evaluation: Evaluation, ranking_ms: float) -> dict[str, Any]:
     outcomes = evaluation.outcomes
+    ours = float(np.median([o.milliseconds["rank"] for o in outcomes]))
     here = [i for i, o in enumerate(outcomes) if o.present]
-    firsts = [one.first[i] for i in here]
-    ms = one.milliseconds
-    return {
-        **accuracy([Error() if pair is None else pair.error for pair in firsts]),
-        **_overlaps([outcomes[i] for i in here], [one.rankings[i] for i in here]),
-        "recall": recall(evaluation.relevant, evaluation.allowed, one.rankings),
-        "milliseconds": ms,
-        "ratio": (ms["describe"] + ms["rank"]) / (ms["sign"] + ranking_ms),
-    }
-
-
-def _overlaps(
-    outcomes: Sequence[QueryOutcome], rankings: Sequence[Sequence[int]]
-) -> dict[str, float | None]:
-    """As `measures.retrieval`, of any ranking."""
-    if not outcomes:
-        names = ("top1_overlap_50", "top5_overlap_50", "top1_overlap_30", "mean_overlap")
-        return dict.fromkeys(names)
-    first = [
-        [o.overlap_of(match) for match in ranking[: FIRST[1]]]
-        for o, ranking in zip(outcomes, rankings, strict=True)
-    ]
-    nearest = np.array([five[0] for five in first])
-    return {
-        "top1_overlap_50": float((nearest >= 0.5).mean()),
-        "top5_overlap_50": float(np.mean([max(five) >= 0.5 for five in first])),
-        "top1_overlap_30": float((nearest >= 0.3).mean()),
-        "mean_overlap": float(nearest.mean()),
-    }
+    found: dict[str, dict[str, Any]] = {}
+    for one in evaluation.compared:
+        if one.reason:
+            found[one.name] = {"reason": one.reason}
+            continue
+        firsts = [one.first[i] for i in here]
+        five = [
+            [outcomes[i].overlap_of(match) for match in one.rankings[i][: FIRST[1]]] for i in here
+        ]
+        ms = one.milliseconds
+        found[one.name] = {
+            **accuracy([Error() if pair is None else pair.error for pair in firsts]),
+            **overlap_figures(five),
+            "recall": recall(evaluation.relevant, evaluation.allowed, one.rankings),
+            "milliseconds": ms,
+            "ratio": (ms["describe"] + ms["rank"]) / (ms["sign"] + ours),
+        }
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,35 +107,32 @@ class Judgement:
 
 
 def judge_answers(
-    truth: FramePlace, ranked: Answer, diverse: Answer, known: Mapping[str, FramePlace]
+    truth: FramePlace, ranked: Answer, diverse: Answer, places: Mapping[str, FramePlace]
 ) -> Judgement:
     """Judge two answers to one query.
 
     Parameters
     ----------
     truth : of the query
-    ranked : asked without diversification, for as many matches as are validated
-    diverse : asked with all stages, likewise
-    known : places of the database frames by their id
+    ranked : without diversification, with as many matches as are validated
+    diverse : of all stages, likewise
+    places : of the database frames by their id
     """
-    first = {
-        "R": _first(_by_rank(ranked), truth, known),
-        "VR": _first(_accepted(ranked), truth, known),
-        "DR": _first(_by_rank(diverse), truth, known),
-        "VDR": _first(_accepted(diverse), truth, known),
-        "pose_average": _located(diverse, truth),
-    }
-    spread = {
-        "R": _spread(_by_rank(ranked), truth, known),
-        "VR": _spread(_accepted(ranked), truth, known),
-        "DR": _spread(_by_rank(diverse), truth, known),
-        "VDR": _spread(_accepted(diverse), truth, known),
-    }
+    rows: dict[str, list[Match]] = {}
+    for answer, names in ((ranked, ("R", "VR")), (diverse, ("DR", "VDR"))):
+        rows[names[0]] = sorted(answer.matches, key=lambda match: match.rank)
+        rows[names[1]] = [m for m in answer.matches if m.validation.status == "accepted"]
+    first = {row: _first(matches, truth, places) for row, matches in rows.items()}
+    first["pose_average"] = Error()
+    if diverse.location is not None and diverse.location.pose.parent_frame == truth.parent:
+        T = np.array(diverse.location.pose.matrix)
+        first["pose_average"] = pose_error(T, truth.pose)
+    spread = {row: _spread(matches, truth, places) for row, matches in rows.items()}
     return Judgement(first, spread)
 
 
 def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
-    """The figures of each row over queries, as `measures.rows` defines them.
+    """Return the figures of each row over queries, as `measures.rows` defines them.
 
     `spread_mean_m` and `spread_std_m`: as in Judgement, averaged over the queries that have them.
     """
@@ -172,52 +140,31 @@ def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
     for row in ("R", "VR", "DR", "VDR", "pose_average"):
         spreads = [found for one in judged if (found := one.spread.get(row)) is not None]
         mean = np.mean(spreads, axis=0).tolist() if spreads else (None, None)
-        rows[row] = accuracy([one.first[row] for one in judged]) | {
-            "spread_mean_m": mean[0],
-            "spread_std_m": mean[1],
-        }
+        rows[row] = accuracy([one.first[row] for one in judged])
+        rows[row] |= {"spread_mean_m": mean[0], "spread_std_m": mean[1]}
     return rows
 
 
-def _by_rank(answer: Answer) -> list[Match]:
-    return sorted(answer.matches, key=lambda match: match.rank)
-
-
-def _accepted(answer: Answer) -> list[Match]:
-    return [match for match in answer.matches if match.validation.status == "accepted"]
-
-
-def _first(matches: Sequence[Match], truth: FramePlace, known: Mapping[str, FramePlace]) -> Error:
-    if not matches:
-        return Error()
-    match = matches[0]
-    place = known[match.frame_id]
-    if match.transform is None or place.parent != truth.parent:
-        return Error()
-    return pose_error(np.array(match.transform.matrix), inverse(place.pose) @ truth.pose)
-
-
-def _located(answer: Answer, truth: FramePlace) -> Error:
-    if answer.location is None or answer.location.pose.parent_frame != truth.parent:
-        return Error()
-    return pose_error(np.array(answer.location.pose.matrix), truth.pose)
+def _first(matches: Sequence[Match], truth: FramePlace, places: Mapping[str, FramePlace]) -> Error:
+    """Return the error of the first match."""
+    for match in matches[:1]:
+        place = places[match.frame_id]
+        if match.transform is not None and place.parent == truth.parent:
+            return pose_error(np.array(match.transform.matrix), inverse(place.pose) @ truth.pose)
+    return Error()
 
 
 def _spread(
-    matches: Sequence[Match], truth: FramePlace, known: Mapping[str, FramePlace]
+    matches: Sequence[Match], truth: FramePlace, places: Mapping[str, FramePlace]
 ) -> tuple[float, float] | None:
-    places = [known[match.frame_id] for match in matches[:VIEWS]]
+    near = [places[match.frame_id] for match in matches[:VIEWS]]
     metres = [
         float(np.linalg.norm(place.pose[:3, 3] - truth.pose[:3, 3]))
-        for place in places
+        for place in near
         if place.parent == truth.parent
     ]
     return (float(np.mean(metres)), float(np.std(metres))) if len(metres) >= 2 else None
 
-
-# The figures of an evaluation, as JSON and as a table to read.
-#
-# Evaluation  --figures-->  dict  --to_json-->  bytes        dict  --table-->  lines
 
 #: Of JSON: raised when a key changes its meaning.
 SCHEMA_VERSION = 1
@@ -226,11 +173,9 @@ ROWS = ("R", "VR", "DR", "VDR", "pose_average", "pose_average_vr")
 
 
 def figures(
-    evaluation: Evaluation,
-    database: Callable[[int], AnyFrame],
-    settings: dict[str, Any],
+    evaluation: Evaluation, database: Callable[[int], AnyFrame], settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Every figure of an evaluation, ready for JSON.
+    """Return every figure of an evaluation, ready for JSON.
 
     At the top, all queries against the whole database (of several scenes, the paper's
     `Combine`). `by_scene` has the same for the queries of each scene, where there are several;
@@ -240,41 +185,35 @@ def figures(
     Parameters
     ----------
     evaluation : see Evaluation
-    database : gives the frame of a database index, with its pose
+    database : returns the frame of a database index, with its pose
     settings : all that is needed to repeat it
     """
-    prepared = evaluation.prepared
+    prepared, outcomes = evaluation.prepared, evaluation.outcomes
     poses = [member.pose for member in prepared.database]
+    names = [member.name for member in prepared.database]
+
+    def of(some: Sequence[QueryOutcome]) -> dict[str, Any]:
+        return measured(some, poses, database)
+
     found: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
     found["counts"] = {
-        "queries": len(prepared.queries),
-        "database": len(prepared.database),
+        "queries": len(prepared.queries), "database": len(prepared.database),
         "left_out": len(prepared.left_out),
-    }
+    }  # fmt: skip
     found["left_out"] = [{"name": n, "reason": why} for n, why in prepared.left_out]
-    found |= measured(evaluation.outcomes, poses, database)
+    found |= of(outcomes)
     found["recall"] = recalls(evaluation)
     if evaluation.compared:
         found["baselines"] = baseline_rows(evaluation)
-    scenes = list(dict.fromkeys(o.scene for o in evaluation.outcomes))
+    scenes = list(dict.fromkeys(o.scene for o in outcomes))
     if len(scenes) > 1:
-        found["by_scene"] = {
-            scene: measured([o for o in evaluation.outcomes if o.scene == scene], poses, database)
-            for scene in scenes
-        }
+        found["by_scene"] = {one: of([o for o in outcomes if o.scene == one]) for one in scenes}
     if evaluation.alone:
-        found["scenes"] = {
-            scene: measured(outcomes, poses, database)
-            for scene, outcomes in evaluation.alone.items()
-        }
-        found["average"] = average([found["scenes"][scene] for scene in found["scenes"]])
-    found["milliseconds"] = {
-        "prepare": prepared.milliseconds,
-        **milliseconds(evaluation.outcomes),
-    }
-    names = [member.name for member in prepared.database]
-    found["per_query"] = [per_query(outcome, names) for outcome in evaluation.outcomes]
-    found["mistakes"] = mistakes(evaluation.outcomes, names)
+        found["scenes"] = {scene: of(some) for scene, some in evaluation.alone.items()}
+        found["average"] = average(list(found["scenes"].values()))
+    found["milliseconds"] = {"prepare": prepared.milliseconds, **milliseconds(outcomes)}
+    found["per_query"] = [per_query(outcome, names) for outcome in outcomes]
+    found["mistakes"] = mistakes(outcomes, names)
     cleaned: dict[str, Any] = without_infinities(found)
     return cleaned
 
@@ -282,21 +221,17 @@ def figures(
 def measured(
     outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
-    """All figures of some queries."""
+    """Return all figures of some queries."""
     return {
-        **rows(outcomes),
-        "bound": bound(outcomes),
-        **oracle_and_random(outcomes),
-        "validation": validation(outcomes),
-        "diversity": diversity(outcomes, poses, database),
-        "lost": lost(outcomes),
-        "absent": absent(outcomes),
+        **rows(outcomes), "bound": bound(outcomes), **oracle_and_random(outcomes),
+        "validation": validation(outcomes), "diversity": diversity(outcomes, poses, database),
+        "lost": lost(outcomes), "absent": absent(outcomes),
         "answers": answers([outcome.answer for outcome in outcomes]),
-    }
+    }  # fmt: skip
 
 
 def average(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The mean of each figure of each row over scenes; null where a scene has none."""
+    """Return the mean of each figure of each row over scenes; null where a scene has none."""
     result: dict[str, Any] = {}
     for row in ROWS:
         columns = {key: [scene[row][key] for scene in scenes] for key in scenes[0][row]}
@@ -308,7 +243,7 @@ def average(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
-    """Median time of each stage: of a query, or under `validate` of one pair."""
+    """Return median time of each stage: of a query, or under `validate` of one pair."""
     stages: dict[str, list[float]] = {
         stage: [o.milliseconds[stage] for o in outcomes if stage in o.milliseconds]
         for stage in ("rank", "compare_ranking", "diversify", "average", "answer")
@@ -318,30 +253,29 @@ def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
 
 
 def per_query(outcome: QueryOutcome, names: Sequence[str]) -> dict[str, Any]:
-    """What one query came to: to look into what was lost, and to hold other answers to it.
+    """Return the results of one query, by which other answers can be compared with it.
 
     `ranking` has the first of R, `selection` all of C, `matches` all pairs of C in the order in
-    which `associate` gives them.
+    which `associate` returns them.
     """
     answers = outcome.views("VDR")
-    best = int(np.argmax(outcome.overlap_mean)) if len(outcome.overlap_mean) else None
+    overlaps = outcome.overlap_mean
     return {
         "name": outcome.name,
         "lost": place_of(outcome),
-        "best_overlap": None if best is None else float(outcome.overlap_mean[best]),
+        "best_overlap": float(overlaps.max()) if len(overlaps) else None,
         "R": _answer(outcome, outcome.ranking[:1], names),
         "VDR": _answer(outcome, [pair.match for pair in answers[:1]], names),
         "accepted": len(answers),
-        "pose_average": _error(outcome.average),
+        "pose_average": error_figures(outcome.average),
         "answer": {
-            "status": outcome.answer.status,
-            "strength": outcome.answer.strength,
-            **_error(outcome.answer.error),
+            "status": outcome.answer.status, "strength": outcome.answer.strength,
+            **error_figures(outcome.answer.error),
         },
         "ranking": [names[match] for match in outcome.ranking[: outcome.candidates]],
         "selection": [names[match] for match in outcome.selection],
         "matches": _matches(outcome, names),
-    }
+    }  # fmt: skip
 
 
 def _matches(outcome: QueryOutcome, names: Sequence[str]) -> list[dict[str, Any]]:
@@ -359,7 +293,7 @@ def _matches(outcome: QueryOutcome, names: Sequence[str]) -> list[dict[str, Any]
 
 
 def mistakes(outcomes: Sequence[QueryOutcome], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Pairs that were accepted with a wrong transform, or not accepted with a right one."""
+    """Return pairs that were accepted with a wrong transform, or not accepted with a right one."""
     return [
         {
             "query": outcome.name,
@@ -393,27 +327,26 @@ def _described(pair: ValidatedPair, names: Sequence[str]) -> dict[str, Any]:
         "strength": v.strength,
         "reason": v.reason,
         "ambiguity": v.ambiguity,
-        **_error(pair.error),
+        **error_figures(pair.error),
     }
 
 
-def _error(error: Error) -> dict[str, float]:
+def error_figures(error: Error) -> dict[str, float]:
+    """Return an error in metres and degrees."""
     return {"translation_m": error.metres, "rotation_deg": math.degrees(error.radians)}
 
 
 def without_infinities(value: Any) -> Any:
-    """The same with null for what JSON has no number for."""
+    """Return the value with null for numbers that JSON lacks."""
     if isinstance(value, dict):
         return {key: without_infinities(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
         return [without_infinities(one) for one in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def to_json(found: dict[str, Any]) -> bytes:
-    """Bytes of a JSON file."""
+    """Return bytes of a JSON file."""
     return (json.dumps(found, indent=1, allow_nan=False) + "\n").encode()
 
 
@@ -423,7 +356,7 @@ _OVERLAP_HEAD = f"{'overlap':>10}{'top1 @.5':>10}{'top5 @.5':>10}{'top1 @.3':>10
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """The rows and a line for each of the rest; figures as `report.figures` gives them."""
+    """Return the rows and a line for each of the rest; figures as `report.figures` gives them."""
     lines = []
     for scene, figures in found.get("scenes", {}).items():
         lines += [f"{scene}, alone", *_rows(figures), ""]
@@ -436,12 +369,9 @@ def table(found: dict[str, Any]) -> list[str]:
     lines += ["", *_recalls(found), "", *_answers(found), "", *_sentences(found), ""]
     for scene, figures in found.get("by_scene", {}).items():
         lines += [
-            f"queries of {scene}, among all",
-            *_rows(figures),
-            *_answers(figures),
-            _lost(figures),
+            f"queries of {scene}, among all", *_rows(figures), *_answers(figures), _lost(figures),
             "",
-        ]
+        ]  # fmt: skip
     if found["left_out"]:
         lines.append(_left_out(found))
     return [*lines, _times(found)]
@@ -456,7 +386,7 @@ PAPER_OVERALL = {"average": (84.8, 90.3), "combine": (84.8, 90.4)}
 
 
 def seven_scenes_table(found: dict[str, Any], scene: str) -> list[str]:
-    """Queries within 5 cm and 5 degrees by scene, in percent, beside the figures of the paper.
+    """Return the percentage of queries within 5 cm and 5 degrees by scene, beside the paper's.
 
     Average and Combine are of the scenes that are there. The paper prints no DR, as its first match
     is that of R.
@@ -495,9 +425,9 @@ def _rows(figures: dict[str, Any]) -> list[str]:
 def _accuracy(name: str, row: dict[str, Any]) -> str:
     metres = row["median_translation_m"]
     return (
-        f"{name:18}{_share(row['within_5cm_5deg']):>10}{_share(row['within_10cm_10deg']):>12}"
+        f"{name:18}{decimal(row['within_5cm_5deg']):>10}{decimal(row['within_10cm_10deg']):>12}"
         f"{'-' if metres is None else f'{100 * metres:.1f}':>11}"
-        f"{_share(row['median_rotation_deg'], 1):>7}"
+        f"{decimal(row['median_rotation_deg'], 1):>7}"
     )
 
 
@@ -505,13 +435,13 @@ def _overlap(row: dict[str, Any]) -> str:
     if "mean_overlap" not in row:
         return ""
     keys = ("mean_overlap", "top1_overlap_50", "top5_overlap_50", "top1_overlap_30")
-    return "".join(f"{_share(row[key]):>10}" for key in keys) + (
-        f"{_share(row['right_scene']):>8}" if "right_scene" in row else ""
+    return "".join(f"{decimal(row[key]):>10}" for key in keys) + (
+        f"{decimal(row['right_scene']):>8}" if "right_scene" in row else ""
     )
 
 
 def _recalls(found: dict[str, Any]) -> list[str]:
-    """Recall by every way to rank, and what a query costs beside the signature."""
+    """Return recall by every way to rank, and what a query costs beside the signature."""
     if "recall" not in found:  # of figures that were kept before there was one
         return []
     within = found["recall"]["within_m"]
@@ -527,13 +457,13 @@ def _recalls(found: dict[str, Any]) -> list[str]:
             lines.append(f"{name:18}not asked: {row['reason']}")
             continue
         spent = row["milliseconds"]["describe"] + row["milliseconds"]["rank"]
-        ratio = f"{spent:>10.1f}{_share(row['ratio'], 2):>8}"
+        ratio = f"{spent:>10.1f}{decimal(row['ratio'], 2):>8}"
         lines.append(_recall(name, row["recall"]) + ratio)
     return lines
 
 
 def _recall(name: str, row: dict[str, Any]) -> str:
-    return f"{name:58}" + "".join(f"{_share(row.get(f'at_{k}')):>10}" for k in FIRST)
+    return f"{name:58}" + "".join(f"{decimal(row.get(f'at_{k}')):>10}" for k in FIRST)
 
 
 def _chance(row: dict[str, Any], name: str) -> str:
@@ -549,19 +479,19 @@ _ANSWERS = {
 
 
 def _answers(found: dict[str, Any]) -> list[str]:
-    """A row for each thing that a robot may be told."""
+    """Return a row for each thing that a robot may be told."""
     if "answers" not in found:  # of figures that were kept before there were any
         return []
     told = found["answers"]
     lines = [f"{'answers':18}{'share':>10}"]
-    lines += [f"{name:18}{_share(told[key]):>10}" for key, name in _ANSWERS.items()]
+    lines += [f"{name:18}{decimal(told[key]):>10}" for key, name in _ANSWERS.items()]
     lines[2] += (
-        f"   beyond 50 cm or 15 deg {_share(told['grossly_wrong'])}, at most "
-        f"{_share(told['grossly_wrong_at_most'])}; called strong "
-        f"{_share(told['found_strong_wrong'])}; of what is found {_share(told['wrong_of_found'])}"
+        f"   beyond 50 cm or 15 deg {decimal(told['grossly_wrong'])}, at most "
+        f"{decimal(told['grossly_wrong_at_most'])}; called strong "
+        f"{decimal(told['found_strong_wrong'])}; of what is found {decimal(told['wrong_of_found'])}"
     )
     lines.append(
-        f"confidence    calibration error {_share(told['calibration_error'])}, of the likeliest "
+        f"confidence    calibration error {decimal(told['calibration_error'])}, of the likeliest "
         "pose of each query"
     )
     return lines
@@ -570,8 +500,8 @@ def _answers(found: dict[str, Any]) -> list[str]:
 def _sentences(found: dict[str, Any]) -> list[str]:
     v, d, a = found["validation"], found["diversity"], found["absent"]
     lines = [
-        f"acceptance    precision {_share(v['precision'])}, recall {_share(v['recall'])}, where "
-        f"overlap is 30 % {_share(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
+        f"acceptance    precision {decimal(v['precision'])}, recall {decimal(v['recall'])}, where "
+        f"overlap is 30 % {decimal(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
         f"accepted, {v['accepted_strong']} strong",
     ]
     if v["pairs_of_other_scenes"]:
@@ -580,7 +510,7 @@ def _sentences(found: dict[str, Any]) -> list[str]:
             f"accepted, {v['accepted_strong_of_other_scenes']} strong"
         )
     spread = ", ".join(
-        f"{row} {_share(of['mean_m'])} +- {_share(of['std_m'])}"
+        f"{row} {decimal(of['mean_m'])} +- {decimal(of['std_m'])}"
         for row, of in d["translation"].items()
     )
     lines.append(f"translation   {spread} m")
@@ -594,7 +524,7 @@ def _sentences(found: dict[str, Any]) -> list[str]:
     if a["queries"]:
         lines.append(
             f"absent        {a['queries']} queries whose scene is not in the database: "
-            f"{_share(a['accepted_strong'])} accepted strong, {_share(a['accepted_weak'])} weak"
+            f"{decimal(a['accepted_strong'])} accepted strong, {decimal(a['accepted_weak'])} weak"
         )
     return lines
 
@@ -622,5 +552,6 @@ def _times(found: dict[str, Any]) -> str:
     return f"milliseconds  {', '.join(times)} (medians; validate: of one pair)"
 
 
-def _share(value: float | None, digits: int = 3) -> str:
+def decimal(value: float | None, digits: int = 3) -> str:
+    """Return a number for a table, and "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"

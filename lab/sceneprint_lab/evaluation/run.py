@@ -59,8 +59,8 @@ _TRIES = 200
 def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
     """Return the share of samples in the plane that holds most; the same each time.
 
-    Found without normals and patches, so that the choice of frames owes nothing to the method
-    that is judged on them.
+    It uses no normals and patches: the choice of frames is independent of the method that is
+    judged on them.
 
     Parameters
     ----------
@@ -87,11 +87,7 @@ def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
     return float(max(fitted.mean(), inside.mean(axis=0).max()))
 
 
-# From a protocol to the outcome of every query.
-#
-# Protocol  --evaluate-->  Evaluation
-
-#: Depth images that are held in memory at once, of queries and of the database.
+#: Frames of queries, and of the database, that are in memory at once.
 BLOCK = 256
 
 
@@ -112,7 +108,7 @@ class EvaluationSettings:
         None for all
     within_m : a frame is the query's place where it was taken within so many metres; None: where
         the two overlap by half
-    baselines : names of other ways to rank, asked the same; see BASELINES
+    baselines : names of other ways to rank; see BASELINES
     seed : of every pair that is validated
     jobs : processes; no figure depends on it
     cache_dir : of derived files of the model; None for the user's
@@ -144,8 +140,8 @@ class Evaluation:
     alone : of a 7-Scenes table of several scenes, the outcomes of each scene with a database of
         its own; else empty
     allowed, relevant : (Q, N), whether a query may find a frame, and whether it shows its place
-    compared : of each baseline that was asked for
-    within_m : as in Settings
+    within_m : see EvaluationSettings
+    compared : of each baseline
     """
 
     prepared: Prepared
@@ -158,21 +154,18 @@ class Evaluation:
 
 
 def evaluate(
-    protocol: EvaluationProtocol,
-    signer: Signer,
-    store: FrameStore,
-    settings: EvaluationSettings,
+    protocol: EvaluationProtocol, signer: Signer, store: FrameStore, settings: EvaluationSettings,
     watch: Watch = unwatched,
-) -> Evaluation:
+) -> Evaluation:  # fmt: skip
     """Sign all frames, ask every query, and judge the answers by the true poses.
 
     Parameters
     ----------
     protocol : see `choose`
     signer : see `open_signer`
-    store : an empty one; its frames serve the pictures afterwards
-    settings : see Settings
-    watch : told of every step of every stage
+    store : empty
+    settings : see EvaluationSettings
+    watch : follows the steps of every stage
 
     Raises
     ------
@@ -181,16 +174,11 @@ def evaluate(
     """
     baselines = open_baselines(
         settings.baselines, signer.model.parameters.depth.maximum_depth
-    )  # what cannot be measured is said before the work
+    )  # before the work: a missing library must not cost it
     prepared = prepare_all(
-        protocol.frames,
-        signer,
-        store,
-        levels=settings.levels,
-        jobs=settings.jobs,
-        cache_dir=settings.cache_dir,
-        watch=watch,
-    )
+        protocol.frames, signer, store, levels=settings.levels, jobs=settings.jobs,
+        cache_dir=settings.cache_dir, watch=watch,
+    )  # fmt: skip
     _check_used(protocol, prepared)
     truth = overlaps_of(prepared, store, watch)
     allowed = _allowed(prepared, truth, settings)
@@ -218,12 +206,9 @@ def evaluate(
 
 
 def _check_used(protocol: EvaluationProtocol, prepared: Prepared) -> None:
-    """See that there is a query and a database frame; DatasetError."""
-    used: tuple[tuple[Use, list[SignedFrame]], ...] = (
-        ("query", prepared.queries),
-        ("database", prepared.database),
-    )
-    for use, members in used:
+    """Raise DatasetError unless a query and a database frame can be used."""
+    used: dict[Use, list[SignedFrame]] = {"query": prepared.queries, "database": prepared.database}
+    for use, members in used.items():
         if not members:
             own = {one.name for one in protocol.frames if one.is_for(use)}
             name, reason = next(left for left in prepared.left_out if left[0] in own)
@@ -264,13 +249,12 @@ def _allowed(
 
 def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched) -> Overlaps:
     """Return the overlap of every query with every database frame; 0 between scenes."""
-    shape = len(prepared.queries), len(prepared.database)
-    mean, least = np.zeros(shape), np.zeros(shape)
-    steps = _steps(prepared, store)
-    total = shape[0] * -(-shape[1] // BLOCK)
-    for i, own, begin, views in watch(steps, "overlap", total):
+    queries, database = prepared.queries, prepared.database
+    mean, least = np.zeros((2, len(queries), len(database)))
+    total = len(queries) * -(-len(database) // BLOCK)
+    for i, own, begin, views in watch(_steps(prepared, store), "overlap", total):
         for j, view in enumerate(views, begin):
-            if prepared.database[j].scene == prepared.queries[i].scene:
+            if database[j].scene == queries[i].scene:
                 mean[i, j], least[i, j] = overlap(own, view)
     return Overlaps(mean, least)
 
@@ -288,100 +272,46 @@ def _steps(
 
 
 def _evaluate_slice(
-    prepared: Prepared,
-    truth: Overlaps,
-    may: NDArray[np.bool_],
-    of_queries: NDArray[np.intp],
-    of_database: NDArray[np.intp],
-    store: FrameStore,
-    settings: EvaluationSettings,
-    watch: Watch,
-) -> list[QueryOutcome]:
-    """Ask some queries of some of the database."""
-    queries = [prepared.queries[i] for i in of_queries]
-    database = prepared.database
+    prepared: Prepared, truth: Overlaps, may: NDArray[np.bool_], of_queries: NDArray[np.intp],
+    of_database: NDArray[np.intp], store: FrameStore, settings: EvaluationSettings, watch: Watch,
+) -> list[QueryOutcome]:  # fmt: skip
+    """Return ask some queries of some of the database."""
+    queries, database = [prepared.queries[i] for i in of_queries], prepared.database
     same = np.array([q.scene for q in queries])[:, None] == np.array([d.scene for d in database])
     allowed = np.zeros(same.shape, np.bool_)
     allowed[:, of_database] = may[np.ix_(of_queries, of_database)]
     ranked = rank(
-        np.stack([q.signature for q in queries]),
-        np.stack([d.signature for d in database]),
-        allowed,
-        metric=settings.metric or prepared.metric,
-        candidates=settings.candidates,
+        np.stack([q.signature for q in queries]), np.stack([d.signature for d in database]),
+        allowed, metric=settings.metric or prepared.metric, candidates=settings.candidates,
         watch=watch,
-    )
-    local = Overlaps(truth.mean[of_queries], truth.least[of_queries])
-    tasks = [
-        _task(query, database, one, local, i, settings.candidates, allowed[i])
-        for i, (query, one) in enumerate(zip(queries, ranked, strict=True))
-    ]
+    )  # fmt: skip
+    mean, least = truth.mean[of_queries], truth.least[of_queries]
+
+    def task(i: int, of: Ranked) -> QueryTask:
+        first = of.ranking[: settings.candidates]
+        candidates = tuple(
+            Candidate.of(database[j], j, float(mean[i, j]), float(least[i, j]))
+            for j in sorted({*first, *of.selection})
+        )
+        return QueryTask(
+            queries[i].number, queries[i].scene, queries[i].pose, first, of.selection, candidates,
+            np.flatnonzero(allowed[i]), of.retrieved,
+        )  # fmt: skip
+
+    def outcome(i: int, of: Ranked, judged: Judged) -> QueryOutcome:
+        query, index = queries[i], np.flatnonzero(allowed[i])
+        spent = {"average": judged.milliseconds, "answer": judged.answer.milliseconds}
+        return QueryOutcome(
+            query.name, query.scene, query.pose, index, bool((allowed[i] & same[i]).any()),
+            mean[i, index], least[i, index], of.ranking, of.distances, of.selection, judged.pairs,
+            settings.candidates, judged.average, judged.average_of_ranking, judged.average_bound,
+            of.milliseconds | spent, judged.answer,
+        )  # fmt: skip
+
+    tasks = [task(i, one) for i, one in enumerate(ranked)]
     opening = partial(
         open_judge, store, settings.mode, settings.seed, prepared.validation, settings.matching,
         database, prepared.answer, prepared.unrelated_distance,
     )  # fmt: skip
     judged = watch(map_over(tasks, judge, opening, settings.jobs), "validate", len(tasks))
-    return [
-        _outcome(queries[i], ranked[i], one, allowed[i], same[i], local, i, settings.candidates)
-        for i, one in enumerate(judged)
-    ]
-
-
-def _task(
-    query: SignedFrame,
-    database: list[SignedFrame],
-    ranked: Ranked,
-    truth: Overlaps,
-    row: int,
-    first: int,
-    allowed: NDArray[np.bool_],
-) -> QueryTask:
-    ranking = ranked.ranking[:first]
-    candidates = tuple(
-        Candidate(
-            j,
-            database[j].number,
-            database[j].scene,
-            database[j].pose,
-            float(truth.mean[row, j]),
-            float(truth.least[row, j]),
-        )
-        for j in sorted({*ranking, *ranked.selection})
-    )
-    return QueryTask(
-        query.number, query.scene, query.pose, ranking, ranked.selection, candidates,
-        np.flatnonzero(allowed), ranked.retrieved,
-    )  # fmt: skip
-
-
-def _outcome(
-    query: SignedFrame,
-    ranked: Ranked,
-    judged: Judged,
-    allowed: NDArray[np.bool_],
-    same: NDArray[np.bool_],
-    truth: Overlaps,
-    row: int,
-    candidates: int,
-) -> QueryOutcome:
-    index = np.flatnonzero(allowed)
-    return QueryOutcome(
-        name=query.name,
-        scene=query.scene,
-        pose=query.pose,
-        allowed=index,
-        present=bool((allowed & same).any()),
-        overlap_mean=truth.mean[row, index],
-        overlap_least=truth.least[row, index],
-        ranking=ranked.ranking,
-        distances=ranked.distances,
-        selection=ranked.selection,
-        pairs=judged.pairs,
-        candidates=candidates,
-        average=judged.average,
-        average_of_ranking=judged.average_of_ranking,
-        average_bound=judged.average_bound,
-        milliseconds=ranked.milliseconds
-        | {"average": judged.milliseconds, "answer": judged.answer.milliseconds},
-        answer=judged.answer,
-    )
+    return [outcome(i, ranked[i], one) for i, one in enumerate(judged)]

@@ -143,16 +143,10 @@ def _is_of_scans(model: Model) -> bool:
 
 
 def ask_site(
-    signer: Signer,
-    work: tuple[str, int, int],
-    *,
-    seed: int,
-    candidates: int = 10,
-    prior: tuple[float, float] | None = None,
-    flaws: MapFlaws | None = None,
-    confidence: float | None = None,
-    as_surface: bool = False,
-) -> list[SiteAnswer]:
+    signer: Signer, work: tuple[str, int, int], *, seed: int, candidates: int = 10,
+    prior: tuple[float, float] | None = None, flaws: MapFlaws | None = None,
+    confidence: float | None = None, as_surface: bool = False,
+) -> list[SiteAnswer]:  # fmt: skip
     """Build one site and ask all its queries.
 
     Parameters
@@ -215,7 +209,7 @@ def answers_of(
     priors: Sequence[PosePrior | None] | None = None, confidence: float | None = None,
     rendered: bool = False,
 ) -> list[JudgedAnswer]:  # fmt: skip
-    """Answer queries on a map of some frames, as a service does.
+    """Return answer queries on a map of some frames, as a service does.
 
     Parameters
     ----------
@@ -242,10 +236,7 @@ def answers_of(
     )  # fmt: skip
     rows, answers = np.arange(len(database)), []
     for query, ranking, prior in zip(queries, ranked, priors or [None] * len(queries), strict=True):
-        among = tuple(
-            Candidate(j, j, database[j].scene, database[j].pose, 0.0, 0.0)
-            for j in ranking.selection
-        )
+        among = tuple(Candidate.of(database[j], j) for j in ranking.selection)
         task = QueryTask(
             query.number, query.scene, query.pose, [], ranking.selection, among, rows,
             ranking.retrieved,

@@ -32,27 +32,8 @@ from sceneprint_lab.synth.sensors import (
 from sceneprint_lab.synth.trajectories import scattered_poses, trajectory
 
 __all__ = [
-    "KINECT",
-    "KINECT_V1",
-    "Caster",
-    "KinectNoise",
-    "LookalikeSite",
-    "Room",
-    "Spinning",
-    "Survey",
-    "SynthRoom",
-    "cast_depth",
-    "corridor",
-    "kinect_noise",
-    "make_room",
-    "render",
-    "scan",
-    "scattered_poses",
-    "symmetric_box",
-    "synthesise_lookalike",
-    "synthesise_lookalike_survey",
-    "synthesise_room",
-    "synthesise_survey",
-    "take",
-    "trajectory",
-]
+    "KINECT", "KINECT_V1", "Caster", "KinectNoise", "LookalikeSite", "Room", "Spinning", "Survey",
+    "SynthRoom", "cast_depth", "corridor", "kinect_noise", "make_room", "render", "scan",
+    "scattered_poses", "symmetric_box", "synthesise_lookalike", "synthesise_lookalike_survey",
+    "synthesise_room", "synthesise_survey", "take", "trajectory",
+]  # fmt: skip

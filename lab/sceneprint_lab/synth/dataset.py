@@ -50,15 +50,9 @@ class SynthRoom:
 
 
 def synthesise_room(
-    seed: int,
-    index: int,
-    views: int,
-    *,
-    along_path: bool = False,
-    step: int = 1,
-    noise: KinectNoise | None = KINECT_V1,
-    intrinsics: Intrinsics = KINECT,
-) -> SynthRoom:
+    seed: int, index: int, views: int, *, along_path: bool = False, step: int = 1,
+    noise: KinectNoise | None = KINECT_V1, intrinsics: Intrinsics = KINECT,
+) -> SynthRoom:  # fmt: skip
     """Furnish a room and take depth frames in it.
 
     The outcome depends on the arguments only, so rooms can be made in any order and in
@@ -101,7 +95,7 @@ def synthesise_room(
 
 
 def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
-    """Room number `index` of collection `seed`, and the generator as it stands after it."""
+    """Return room number `index` of collection `seed`, and the generator as it stands after it."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     return make_room(rng), rng
 
@@ -109,18 +103,15 @@ def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
 def render(
     scene: Room | SyntheticMesh | Caster, T_world_camera: Floats, intrinsics: Intrinsics = KINECT
 ) -> Floats32:
-    """(H, W) float32 ideal depth in metres, 0 where nothing is met."""
+    """Return (H, W) float32 ideal depth in metres, 0 where nothing is met."""
     return cast_depth(_caster(scene), T_world_camera, intrinsics)[0]
 
 
 def take(
-    scene: Room | SyntheticMesh | Caster,
-    T_world_camera: Floats,
-    intrinsics: Intrinsics,
-    rng: np.random.Generator,
-    noise: KinectNoise = KINECT_V1,
-) -> Floats32:
-    """(H, W) float32 depth as a Kinect gives it: whole millimetres, in metres, 0 missing."""
+    scene: Room | SyntheticMesh | Caster, T_world_camera: Floats, intrinsics: Intrinsics,
+    rng: np.random.Generator, noise: KinectNoise = KINECT_V1,
+) -> Floats32:  # fmt: skip
+    """Return (H, W) float32 depth as a Kinect gives it: whole millimetres, in metres, 0 missing."""
     caster = _caster(scene)
     depth, cosine, face = cast_faces(caster, T_world_camera, intrinsics)
     loss = np.append(caster.mesh.loss, np.float32(0))[face]
@@ -135,16 +126,14 @@ def _caster(scene: Room | SyntheticMesh | Caster) -> Caster:
 
 
 def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Generator) -> KinectNoise:
-    """The sensor of one room: no two are quite equal."""
+    """Return the sensor of one room: no two are quite equal."""
     s = rng.uniform(0.8, 1.4)
     most = intrinsics.width // 18 if rng.random() < 0.4 else 0
     left, right, top, bottom = rng.integers(0, most + 1, 4).tolist()
     return replace(
-        noise,
-        disparity_sigma=noise.disparity_sigma * s,
-        warp=noise.warp * s,
+        noise, disparity_sigma=noise.disparity_sigma * s, warp=noise.warp * s,
         border=(left, right, top, bottom),
-    )
+    )  # fmt: skip
 
 
 # From a seed to the scans of a spinning laser in a hall, a storey or a block.
@@ -178,15 +167,9 @@ class Survey:
 
 
 def synthesise_survey(
-    seed: int,
-    index: int,
-    views: int,
-    *,
-    along_path: bool = False,
-    kind: str | None = None,
-    sensor: Spinning | None = None,
-    perfect: bool = False,
-) -> Survey:
+    seed: int, index: int, views: int, *, along_path: bool = False, kind: str | None = None,
+    sensor: Spinning | None = None, perfect: bool = False,
+) -> Survey:  # fmt: skip
     """Build a site and scan it.
 
     The outcome depends on the arguments only, so sites can be made in any order and in any
@@ -225,6 +208,6 @@ def synthesise_survey(
 def premises_and_rng(
     seed: int, index: int, kind: str | None = None
 ) -> tuple[Premises, np.random.Generator]:
-    """Site number `index` of collection `seed`, and the generator as it stands after it."""
+    """Return site number `index` of collection `seed`, and the generator as it stands after it."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
     return _MAKERS[kind or _ORDER[index % len(_ORDER)]](rng), rng

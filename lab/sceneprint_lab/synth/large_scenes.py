@@ -89,12 +89,12 @@ class Premises:
 
     @cached_property
     def caster(self) -> Caster:
-        """The mesh ready for rays; built at the first use."""
+        """Return the mesh ready for rays; built at the first use."""
         return Caster(self.mesh)
 
     @cached_property
     def walkable(self) -> NDArray[np.bool_]:
-        """(nx, ny) cells of the floor's grid that are clear and hang together."""
+        """Return (nx, ny) cells of the floor's grid that are clear and hang together."""
         clear = ndimage.distance_transform_edt(np.pad(~self.floor.claimed, 1))[1:-1, 1:-1]
         parts, n = ndimage.label(clear * self.floor.cell >= CLEARANCE)
         if n == 0:
@@ -121,7 +121,7 @@ _KINDS: tuple[tuple[Menu, Menu], ...] = (
 
 
 def make_hall(rng: np.random.Generator) -> Premises:
-    """A hall with columns, girders, galleries, doors and what stands about in it."""
+    """Return a hall with columns, girders, galleries, doors and what stands about in it."""
     outline = floor_plan(rng) * rng.uniform(4.5, 9.0)
     top = Ceiling(float(rng.uniform(3.5, 12.0)), np.zeros(2))
     walls = [hall_wall(wall, top, rng) for wall in walls_of(outline)]
@@ -142,7 +142,7 @@ def make_hall(rng: np.random.Generator) -> Premises:
 
 
 def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
-    """The wall with gates, doors and a row of windows, nothing above anything else."""
+    """Return the wall with gates, doors and a row of windows, nothing above anything else."""
     openings, u = [], float(rng.uniform(0.5, 4.0))
     high = min(top.height - 0.5, rng.uniform(3.0, 4.5))
     sill = rng.uniform(0.9, max(1.0, top.height - 2.2))
@@ -168,7 +168,7 @@ def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
 
 
 def _columns(site: Site, outline: Floats) -> list[SyntheticMesh]:
-    """A grid of columns, some left out."""
+    """Return a grid of columns, some left out."""
     rng = site.rng
     if rng.random() < 0.2:
         return []
@@ -188,7 +188,7 @@ def _columns(site: Site, outline: Floats) -> list[SyntheticMesh]:
 
 
 def _girders(site: Site, outline: Floats) -> list[SyntheticMesh]:
-    """Girders under the ceiling, ducts and lamps below them."""
+    """Return girders under the ceiling, ducts and lamps below them."""
     rng, height = site.rng, site.top.height
     low, high = outline.min(axis=0), outline.max(axis=0)
     size, middle = high - low, (low + high) / 2
@@ -208,7 +208,7 @@ def _girders(site: Site, outline: Floats) -> list[SyntheticMesh]:
 
 
 def _gallery(wall: Wall, site: Site) -> list[SyntheticMesh]:
-    """A floor half way up along part of a wall, on posts, with a rail."""
+    """Return a floor half way up along part of a wall, on posts, with a rail."""
     rng = site.rng
     start = rng.uniform(0.0, 0.4) * wall.length
     long = rng.uniform(0.4, 0.9) * (wall.length - start)
@@ -228,7 +228,7 @@ def _gallery(wall: Wall, site: Site) -> list[SyntheticMesh]:
 
 
 def _pilasters(wall: Wall, site: Site) -> list[SyntheticMesh]:
-    """Half columns along a wall, where no opening is."""
+    """Return half columns along a wall, where no opening is."""
     rng = site.rng
     if rng.random() < 0.5:
         return []
@@ -249,11 +249,9 @@ def _pilasters(wall: Wall, site: Site) -> list[SyntheticMesh]:
 
 #: what stands along the walls of a room, and how often
 _ROOMS: tuple[Menu, ...] = (
-    {desk: 3, shelf: 2, cupboard: 2},
-    {cupboard: 2, shelf: 2},
-    {rack: 3, pile: 2, machine: 1},
+    {desk: 3, shelf: 2, cupboard: 2}, {cupboard: 2, shelf: 2}, {rack: 3, pile: 2, machine: 1},
     {fridge: 2, cupboard: 3, counter: 1},
-)
+)  # fmt: skip
 #: what stands free in any room
 _OPEN: Menu = {
     desk: 2,
@@ -268,7 +266,7 @@ _OPEN: Menu = {
 
 
 def make_storey(rng: np.random.Generator) -> Premises:
-    """A storey with one corridor along it, perhaps one across, and rooms off them."""
+    """Return a storey with one corridor along it, perhaps one across, and rooms off them."""
     long, wide = float(rng.uniform(20.0, 70.0)), float(rng.uniform(9.0, 26.0))
     outline = _rectangle(0.0, long, 0.0, wide)
     top = Ceiling(float(rng.uniform(2.4, 4.2)), np.zeros(2))
@@ -296,7 +294,7 @@ def make_storey(rng: np.random.Generator) -> Premises:
 
 @contextmanager
 def _kept_free(floor: Floor, place: PiecePose, width: float, depth: float) -> Iterator[None]:
-    """For as long as it lasts nothing can be put into a rectangle."""
+    """Keep a rectangle free until the context ends."""
     before = floor.claimed.copy()
     floor.take(place, width, depth)
     kept = floor.claimed & ~before
@@ -311,7 +309,7 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:
 def _room(
     extent: tuple[float, float, float, float], side: float, site: Site
 ) -> list[SyntheticMesh]:
-    """One room: walls towards the next room and the corridor, a door, furniture."""
+    """Return one room: walls towards the next room and the corridor, a door, furniture."""
     x0, x1, y0, y1 = extent
     rng, t = site.rng, float(site.rng.uniform(0.1, 0.3))
     parts = _partition((x1, y0), (x1, y1), t, (), site)
@@ -338,7 +336,7 @@ def _partition(
     a: tuple[float, float], b: tuple[float, float], thick: float,
     gaps: tuple[tuple[float, float], ...], site: Site,
 ) -> list[SyntheticMesh]:  # fmt: skip
-    """A wall from a to b up to the ceiling; over its gaps there is a lintel."""
+    """Return a wall from a to b up to the ceiling; over its gaps there is a lintel."""
     length, yaw = math.dist(a, b), math.atan2(b[1] - a[1], b[0] - a[0])
     along, height = np.array([math.cos(yaw), math.sin(yaw)]), site.top.height
     parts, at = [], 0.0
@@ -367,7 +365,7 @@ _MENUS: tuple[Menu, ...] = (
 
 
 def make_block(rng: np.random.Generator) -> Premises:
-    """Buildings at right angles or not, on slightly uneven ground, and what stands between."""
+    """Return buildings on slightly uneven ground, and what stands between."""
     half = rng.uniform(25.0, 55.0, 2)
     outline = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
     sky = Ceiling(40.0, np.zeros(2))
@@ -384,7 +382,7 @@ def make_block(rng: np.random.Generator) -> Premises:
 
 
 def _ground(half: Floats, rng: np.random.Generator) -> SyntheticMesh:
-    """Ground to 60 m beyond the block, sunken here and there by up to 30 cm."""
+    """Return ground to 60 m beyond the block, sunken here and there by up to 30 cm."""
     n = 48
     x = np.linspace(-half[0] - 60, half[0] + 60, n)
     y = np.linspace(-half[1] - 60, half[1] + 60, n)
@@ -399,7 +397,7 @@ def _ground(half: Floats, rng: np.random.Generator) -> SyntheticMesh:
 
 
 def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
-    """One building with recessed windows and doors, or none where there is no room."""
+    """Return one building with recessed windows and doors, or none where there is no room."""
     rng = site.rng
     w, d, h = rng.uniform((6.0, 5.0, 3.0), (32.0, 16.0, 15.0))
     yaw = main + int(rng.integers(0, 2)) * math.pi / 2 + float(rng.normal(0, 0.02))
@@ -428,7 +426,7 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Generator) -> Wall:
-    """The wall with windows in rows, some missing, and doors below."""
+    """Return the wall with windows in rows, some missing, and doors below."""
     wide, gap = rng.uniform(0.8, 2.2), rng.uniform(0.6, 3.0)
     high, share = rng.uniform(1.0, 1.8), rng.uniform(0.3, 1.0)
     glass = float(rng.choice((0.3, 0.9)))
@@ -447,7 +445,7 @@ def facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Genera
 
 
 def roof(w: float, d: float, h: float, rng: np.random.Generator) -> SyntheticMesh:
-    """A flat roof with eaves, or a gable along x."""
+    """Return a flat roof with eaves, or a gable along x."""
     if rng.random() < 0.5:
         return box(w + 0.6, d + 0.6, 0.3, (0, 0, h))
     over, up = d / 2 + 0.4, d * rng.uniform(0.2, 0.5)
@@ -473,7 +471,7 @@ def _garden_wall(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
-    """A cube in the middle of the floor of an empty square hall, the origin under it.
+    """Return a cube in the middle of the floor of an empty square hall, the origin under it.
 
     Turned by 90 degrees about z the scene is the same: which side of the box a view shows
     cannot be told from the view.
@@ -490,7 +488,7 @@ def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
 
 
 def symmetric_hall(rng: np.random.Generator) -> Premises:
-    """A hall about the origin that half a turn about z maps onto itself, with all that is in it.
+    """Return a hall about the origin that half a turn about z maps onto itself, with its contents.
 
     The half with x > 0 is built as `make_hall` builds a hall; the other is that half, turned.
     """
@@ -523,7 +521,7 @@ def symmetric_hall(rng: np.random.Generator) -> Premises:
 
 
 def corridor(doors: int, pitch: float = 2.0, width: float = 1.8, height: float = 2.5) -> Room:
-    """A corridor along +x with identical doors in both long walls, one every `pitch` metres.
+    """Return a corridor along +x with identical doors in both long walls, one every `pitch` metres.
 
     A view shifted by a pitch sees the same doors; only the ends tell where it is. Wide and high it
     is a hall of equal bays.

@@ -103,7 +103,7 @@ class Stop(NamedTuple):
 
     @property
     def pose(self) -> Floats:
-        """(4, 4) T_world_sensor."""
+        """Return (4, 4) T_world_sensor."""
         T = self.T.copy()
         T[:3, 3] += self.origin
         return T
@@ -170,7 +170,7 @@ def synthesise_lookalike_survey(
 
 
 def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
-    """All but a stretch of a sixth, and but one in ten of the others."""
+    """Return all but a stretch of a sixth, and but one in ten of the others."""
     gap = len(stops) // 6
     start = int(rng.integers(1, len(stops) - gap))
     return [
@@ -181,7 +181,7 @@ def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
 
 
 def drifted(poses: Floats, rng: np.random.Generator) -> Floats:
-    """(n, 4, 4) the poses of a walk as odometry gives them: each step is a little off.
+    """Return (n, 4, 4) the poses of a walk as odometry gives them: each step is a little off.
 
     The first is true. Steps are off by a normal error whose standard deviation, 1 to 5 cm and .02
     to .1 degrees along and about each axis, the walk has in common.
@@ -198,14 +198,14 @@ def drifted(poses: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _in_map(T: Floats, true: Floats, recorded: Floats) -> Floats:
-    """The pose that the nearest scan of the map, as recorded, gives to a true one."""
+    """Return the pose that the nearest scan of the map, as recorded, gives to a true one."""
     nearest = int(np.linalg.norm(true[:, :3, 3] - T[:3, 3], axis=1).argmin())
     placed: Floats = recorded[nearest] @ inverse(true[nearest]) @ T
     return placed
 
 
 def told_apart(here: Stop, other: Premises, T: Floats, sensor: Scanner) -> float:
-    """Share of a scan that another place shows otherwise from an equal pose.
+    """Return share of a scan that another place shows otherwise from an equal pose.
 
     Of about a thousand rays within 40 m, those whose ranges differ by more than 30 cm + 2 %.
 
@@ -231,7 +231,7 @@ def _most_different(
     stops: Sequence[Stop], rivals: Callable[[Stop], list[tuple[Premises, Floats]]], n: int,
     sensor: Scanner,
 ) -> tuple[list[Stop], float]:  # fmt: skip
-    """n stops that differ from each rival by TOLD_SHARE, or the n that differ most.
+    """Return n stops that differ from each rival by TOLD_SHARE, or the n that differ most.
 
     Returns
     -------
@@ -284,7 +284,7 @@ class Unit:
 
 
 def bay(rng: np.random.Generator) -> Unit:
-    """A bay of a hall: two pillars, a girder, perhaps walls to the next; racks, machines, cars."""
+    """Return a bay of a hall: pillars, a girder, perhaps walls; racks, machines or cars."""
     pitch, half_way, side = rng.uniform((4.5, 1.5, 4.0), (10.0, 3.5, 12.0)).tolist()
     half, size = half_way + side, float(rng.uniform(0.25, 0.8))
     top = Ceiling(float(rng.uniform(3.0, 9.0)), np.zeros(2))
@@ -317,7 +317,7 @@ def bay(rng: np.random.Generator) -> Unit:
 
 
 def block(rng: np.random.Generator) -> Unit:
-    """A house on either side of a street, alone or in a terrace, and what stands before it."""
+    """Return a house on either side of a street, and what stands before it."""
     pitch, half_way, front, deep = rng.uniform((9.0, 2.5, 2.5, 8.0), (20.0, 5.0, 6.0, 14.0))
     gap = 0.0 if rng.random() < 0.5 else float(rng.uniform(1.5, 5.0))
     half, parts, things = half_way + front + deep, [], []
@@ -342,7 +342,7 @@ def block(rng: np.random.Generator) -> Unit:
 
 
 def _house(w: float, d: float, rng: np.random.Generator) -> SyntheticMesh:
-    """A house about the origin with windows, doors, and steps or porches before its front, -y."""
+    """Return a house about the origin, its front, with steps or porches, towards -y."""
     h, rise, deep = rng.uniform((4.0, 2.7, 0.1), (14.0, 3.8, 0.4)).tolist()
     corners = np.array([(-w, -d), (-w, d), (w, d), (w, -d)]) / 2  # clockwise: walls face outward
     top = Ceiling(h, np.zeros(2))
@@ -357,7 +357,7 @@ def _house(w: float, d: float, rng: np.random.Generator) -> SyntheticMesh:
 def stand_about(
     menu: Menu, floor: Floor, rng: np.random.Generator, tries: int
 ) -> list[PlacedPiece]:
-    """Pieces square to a floor, where there is room for them; it is claimed."""
+    """Return pieces square to a floor, where there is room for them; it is claimed."""
     makers, weights = list(menu), np.array(list(menu.values()), float)
     placed = []
     for _ in range(tries):
@@ -375,7 +375,7 @@ def stand_about(
 
 
 def row_of(unit: Unit, count: int, likeness: Likeness, rng: np.random.Generator) -> Premises:
-    """So many copies of a unit along +x from the origin; their way is the floor to walk on."""
+    """Return copies of a unit along +x from the origin; their way is the floor to walk on."""
     parts = [unit.around(count)]
     for k in range(count):
         things = furnish(unit.things, 0, likeness, rng)
@@ -397,7 +397,7 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:
 
 
 def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
-    """(4, 2) a rectangle on one side of the x axis, from `near` to `far` away from it."""
+    """Return (4, 2) a rectangle on one side of the x axis, from `near` to `far` away from it."""
     return _rectangle(x0, x1, *sorted((side * near, side * far)))
 
 
@@ -407,7 +407,7 @@ def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
 
 
 def _likeness(rng: np.random.Generator) -> Likeness:
-    """Copies that differ a little: by some centimetres, by what people move or have taken away."""
+    """Return how copies differ: by some centimetres, and by what people move or take away."""
     shift, missing = rng.uniform((0.0, 0.0), (0.1, 0.2)).tolist()
     return Likeness(shift, 0.02, float(rng.uniform(0.1, 0.6)), missing=missing)
 
@@ -426,7 +426,7 @@ class _Carrier:
         )
 
     def along(self, n: int) -> list[Floats]:
-        """n poses from end to end, winding a little."""
+        """Return n poses from end to end, winding a little."""
         x = np.linspace(1.5, self.length - 1.5, n)
         phase, waves = self.rng.uniform(0, 2 * math.pi), self.rng.uniform(0.5, 3.0)
         y = 0.5 * self.reach * np.sin(phase + 2 * math.pi * waves * x / self.length)
@@ -437,7 +437,7 @@ class _Carrier:
         ]
 
     def anywhere(self, n: int) -> list[Floats]:
-        """n poses on all of the way; some of them face back, where the scanner sees all around."""
+        """Return n poses on all of the way; of scanners that see all around, some face back."""
         rng = self.rng
         x = rng.uniform(1.5, self.length - 1.5, n)
         y = rng.uniform(-self.reach, self.reach, n)
@@ -471,12 +471,12 @@ def _streets(rng: np.random.Generator, index: int, queries: int, sensor: Scanner
 
 
 def _another(index: int) -> bool:
-    """Whether a site is of the second sort of its kind, whatever its scanner and its poses."""
+    """Return whether a site is of the second sort of its kind."""
     return index % 4 in (1, 2)
 
 
 def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:
-    """One of some equal rows is left out; it differs in sight from all that are in the map."""
+    """Leave one of some equal rows out, which differs in sight from all of the map."""
     street = _another(index)
     unit = block(rng) if street else bay(rng)
     rows, count = (2, int(rng.integers(4, 7))) if street else (3, int(rng.integers(2, 4)))
@@ -505,7 +505,7 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
 
 
 def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:
-    """All of a hall with one to three details; or one half of it, with as many as tell it apart."""
+    """Map a hall with one to three details, or one half with as many as tell it apart."""
     hall = _with_details(symmetric_hall(rng), rng)
     if not _another(index):
         return _walked(hall, rng, queries)
@@ -528,7 +528,7 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
-    """The hall with up to three things more; their places are taken on both sides of it."""
+    """Return the hall with up to three things more; their places are taken on both sides of it."""
     menu: Menu = {pile: 2, person: 1, cabin: 2, screen: 2, tank: 1, machine: 1}
     things = furnish(stand_about(menu, hall.floor, rng, 3), 0, Likeness(), rng)
     # whoever can walk somewhere can walk there after half a turn
@@ -537,7 +537,7 @@ def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
 
 
 def _walked(premises: Premises, rng: np.random.Generator, queries: int) -> Round:
-    """Every second to fourth scan of a walk for the map; others, or some beside it, as queries."""
+    """Map every second to fourth scan of a walk; query others, or some beside it."""
     step = int(rng.integers(2, 5))
     poses = walk(premises, step * MAP_SCANS, rng)
     others = [k for k in range(len(poses)) if k % step]
@@ -550,7 +550,7 @@ def _walked(premises: Premises, rng: np.random.Generator, queries: int) -> Round
 
 
 def _beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
-    """The pose 1 to 4 m aside, where one can walk, and turned by up to about 20 degrees."""
+    """Return the pose 1 to 4 m aside, where one can walk, and turned by up to about 20 degrees."""
     spots = premises.floor.points[premises.walkable]
     away = np.linalg.norm(spots - T[:2, 3], axis=1)
     spots = spots[(away > 1.0) & (away < 4.0)]
@@ -567,7 +567,7 @@ def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:  # noqa: ARG001
-    """Sites that have nothing to do with each other, 200 m apart."""
+    """Return sites that have nothing to do with each other, 200 m apart."""
     places = [(make(rng), (200.0 * k, 0.0, 0.0)) for k, make in enumerate((make_hall, make_block))]
     of_map = [
         Stop(premises, T, origin)

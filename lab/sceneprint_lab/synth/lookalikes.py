@@ -100,7 +100,7 @@ class LookalikeSite(Generic[F_co]):
 
     @property
     def same_frame(self) -> bool:
-        """Whether map and queries have one parent frame, so that poses can be compared."""
+        """Return whether map and queries have one parent frame, so that poses can be compared."""
         return self.kind not in APART
 
 
@@ -114,14 +114,9 @@ class Shoot:
 
 
 def synthesise_lookalike(
-    kind: str,
-    seed: int,
-    index: int,
-    *,
-    queries: int = 12,
-    noise: KinectNoise | None = KINECT_V1,
+    kind: str, seed: int, index: int, *, queries: int = 12, noise: KinectNoise | None = KINECT_V1,
     intrinsics: Intrinsics = KINECT,
-) -> LookalikeSite[DepthFrame]:
+) -> LookalikeSite[DepthFrame]:  # fmt: skip
     """Build a site that looks like itself or like another, and take depth frames of it.
 
     The outcome depends on the arguments only.
@@ -170,15 +165,13 @@ def synthesise_lookalike(
 
 
 def worn(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
-    """A worse one that sees less far, as depth cameras of other makes do."""
+    """Return a worse one that sees less far, as depth cameras of other makes do."""
     s = float(rng.uniform(1.0, 2.0))
     return replace(
-        sensor,
-        disparity_sigma=sensor.disparity_sigma * s,
-        warp=sensor.warp * s * 1.5,
+        sensor, disparity_sigma=sensor.disparity_sigma * s, warp=sensor.warp * s * 1.5,
         grazing_start=sensor.grazing_start - math.radians(rng.uniform(0.0, 8.0)),
         farthest=float(rng.uniform(3.0, 5.5)),
-    )
+    )  # fmt: skip
 
 
 # Objects that are the same from several sides, but for details.
@@ -203,12 +196,12 @@ class SymmetricObject:
 
     @property
     def mesh(self) -> SyntheticMesh:
-        """All of it."""
+        """Return body and details as one mesh."""
         return join([self.body, self.details])
 
 
 def cabinet(rng: np.random.Generator) -> SymmetricObject:
-    """A cabinet with the same doors on both long sides; one has a handle, a gap, a cable.
+    """Return a cabinet with the same doors on both long sides; one has a handle, a gap, a cable.
 
     On a plinth or on legs; most carry a narrower upper part.
     """
@@ -236,7 +229,7 @@ def cabinet(rng: np.random.Generator) -> SymmetricObject:
 
 
 def four_legs(rng: np.random.Generator) -> SymmetricObject:
-    """A square or rectangular table on four legs, with an apron; a cable, something left on it."""
+    """Return a table on four legs, with an apron; a cable, something left on it."""
     w, h = rng.uniform(0.6, 1.3), rng.uniform(0.45, 0.78)
     d = w if rng.random() < 0.5 else w * rng.uniform(0.5, 0.8)
     t, inset = rng.uniform(0.04, 0.09), rng.uniform(0.0, 0.05)
@@ -251,7 +244,7 @@ def four_legs(rng: np.random.Generator) -> SymmetricObject:
 
 
 def column(rng: np.random.Generator) -> SymmetricObject:
-    """A round or square column up to the ceiling on a wider foot; a duct, a socket, a dent."""
+    """Return a round or square column on a wider foot; a duct, a socket, a dent."""
     size, h, foot = rng.uniform(0.3, 0.65), 2.6, rng.uniform(0.05, 0.3)
     is_round, wider = rng.random() < 0.4, rng.uniform(0.02, 0.08)
     if is_round:
@@ -265,7 +258,7 @@ def column(rng: np.random.Generator) -> SymmetricObject:
 
 
 def double_sofa(rng: np.random.Generator) -> SymmetricObject:
-    """Seats on both sides of one back, arms at both ends; a blanket or cushion lies on one."""
+    """Return seats on both sides of one back; a blanket or cushion lies on one."""
     w, d, h = rng.uniform((0.9, 0.9, 0.36), (1.8, 1.3, 0.46))
     arm, rise, soft = rng.uniform(0.1, 0.2), rng.uniform(0.25, 0.45), rng.uniform(0.15, 0.4)
     seat = ellipsoid(((w - 2 * arm) / 2, d / 4, 0.09), soft, 20).moved((0, -d / 4, h - 0.14))
@@ -280,12 +273,12 @@ def double_sofa(rng: np.random.Generator) -> SymmetricObject:
 
 
 def small_flat(rng: np.random.Generator) -> SyntheticMesh:
-    """Something flat that was left lying: a book, a tablet, a pile of paper."""
+    """Return something flat that was left lying: a book, a tablet, a pile of paper."""
     return box(rng.uniform(0.12, 0.3), rng.uniform(0.1, 0.22), rng.uniform(0.008, 0.03))
 
 
 def _details(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticMesh:
-    """One to four things on one long side, y = -d / 2, of a cabinet, or on its top."""
+    """Return one to four things on one long side, y = -d / 2, of a cabinet, or on its top."""
     makers: list[Callable[[], SyntheticMesh]] = [
         lambda: box(0.14, 0.025, 0.02, (rng.uniform(-0.4, 0.4) * w, -d / 2, h * 0.6)),
         lambda: box(0.02, 0.006, h * 0.8, (rng.uniform(-0.4, 0.4) * w, -d / 2, h * 0.1)),
@@ -304,7 +297,7 @@ def _cable(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticM
 
 
 def _bump(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticMesh:
-    """A dent beaten outward: a flat cap of 4 to 10 mm."""
+    """Return a dent beaten outward: a flat cap of 4 to 10 mm."""
     out = rng.uniform(0.004, 0.01)
     cap = ellipsoid((rng.uniform(0.03, 0.1), out, rng.uniform(0.03, 0.1)), 1.0, 12)
     return cap.moved((rng.uniform(-0.3, 0.3) * w, -d / 2, h * rng.uniform(0.2, 0.7)))
@@ -315,12 +308,12 @@ _FREQUENCIES = (0.5, 0.15, 0.1, 0.25)
 
 
 def symmetric_object(rng: np.random.Generator) -> SymmetricObject:
-    """A cabinet, table, column or sofa; half of them are cabinets."""
+    """Return a cabinet, table, column or sofa; half of them are cabinets."""
     return OBJECTS[int(rng.choice(len(OBJECTS), p=_FREQUENCIES))](rng)
 
 
 def bare_floor(thing: SyntheticMesh, rng: np.random.Generator, half: float = 8.0) -> Room:
-    """A thing in the middle of a floor, dull or shiny, and nothing else."""
+    """Return a thing in the middle of a floor, dull or shiny, and nothing else."""
     outline = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     floor = mesh_of(np.c_[outline, np.zeros(4)], [(0, 1, 2), (0, 2, 3)])
     mesh = join([floor.with_loss(float(rng.uniform(0.0, 0.2))), thing])
@@ -341,7 +334,7 @@ def _circled_object(rng: np.random.Generator, index: int, queries: int) -> Shoot
 def _every_fourth(
     room: Room, poses: Sequence[Floats], queries: int, rng: np.random.Generator
 ) -> Shoot:
-    """Every fourth pose for the map, and so many of the others as queries."""
+    """Return every fourth pose for the map, and so many of the others as queries."""
     others = [k for k in range(len(poses)) if k % 4]
     chosen = sorted(rng.choice(others, min(queries, len(others)), replace=False).tolist())
     return Shoot([(room, T) for T in poses[::4]], [(room, poses[k]) for k in chosen])
@@ -389,7 +382,7 @@ def arrange(
     walls: Sequence[Wall], floor: Floor, pieces: Sequence[Piece], middle: Piece | None,
     rng: np.random.Generator,
 ) -> list[PlacedPiece]:  # fmt: skip
-    """Pieces side by side along the walls in turn, one in the middle, chairs and boxes about.
+    """Place pieces side by side along the walls, one in the middle, chairs and boxes about.
 
     The walls are those of a rectangle, counter-clockwise; what has no room is left out.
     """
@@ -431,7 +424,7 @@ def _loose(piece: Piece, at: Floats, yaw: float, floor: Floor) -> list[PlacedPie
 def furnish(
     placed: Sequence[PlacedPiece], seed: int, likeness: Likeness, rng: np.random.Generator
 ) -> SyntheticMesh:
-    """The pieces of one copy, each a little off its place, with what lies on them.
+    """Return the pieces of one copy, each a little off its place, with what lies on them.
 
     Parameters
     ----------
@@ -456,12 +449,12 @@ def furnish(
 
 
 def rectangle(width: float, depth: float) -> Floats:
-    """(4, 2) corners of a room from the origin, counter-clockwise, metres."""
+    """Return (4, 2) corners of a room from the origin, counter-clockwise, metres."""
     return np.array([(0, 0), (width, 0), (width, depth), (0, depth)], float)
 
 
 def _closed(outline: Floats, rng: np.random.Generator, height: float) -> tuple[SyntheticMesh, ...]:
-    """Shell, fittings and what hangs from the ceiling."""
+    """Return shell, fittings and what hangs from the ceiling."""
     top = Ceiling(height, np.zeros(2))
     walls = [pierced(wall, rng, 0.3) for wall in walls_of(outline)]
     fitted = [fittings(wall, top, rng) for wall in walls]
@@ -469,7 +462,7 @@ def _closed(outline: Floats, rng: np.random.Generator, height: float) -> tuple[S
 
 
 def equal_offices(count: int, likeness: Likeness, rng: np.random.Generator) -> list[Room]:
-    """Rooms of one plan, with one set of furniture, that differ in what people move."""
+    """Return rooms of one plan, with one set of furniture, that differ in what people move."""
     outline, height = rectangle(*rng.uniform((3.2, 3.6), (4.8, 5.2))), float(rng.uniform(2.4, 3.0))
     built = _closed(outline, rng, height)
     makers = [_OFFICE[k] for k in rng.permutation(len(_OFFICE))]
@@ -483,7 +476,7 @@ def equal_offices(count: int, likeness: Likeness, rng: np.random.Generator) -> l
 
 
 def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tuple[Room, float]:
-    """A hall of equal bays along +x, and the width of a bay, metres."""
+    """Return a hall of equal bays along +x, and the width of a bay, metres."""
     pitch, wide, height = rng.uniform((3.0, 4.0, 2.8), (4.5, 6.5, 4.0)).tolist()
     bay, outline = rectangle(pitch, wide), rectangle(pitch * count, wide)
     pieces = [make(rng) for make in _BAY]
@@ -499,7 +492,7 @@ def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tupl
 
 
 def _row(rng: np.random.Generator, index: int, queries: int) -> Shoot:
-    """All rooms of a row, or all bays of a hall, in the map."""
+    """Return all rooms of a row, or all bays of a hall, in the map."""
     likeness = Likeness(float(rng.uniform(0.0, 0.03)), float(rng.uniform(0.0, 0.02)))
     if index % 2:
         hall, _ = equal_bays(int(rng.integers(4, 7)), likeness, rng)
@@ -512,7 +505,7 @@ def _row(rng: np.random.Generator, index: int, queries: int) -> Shoot:
 
 
 def _in_a_row(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
-    """Where the world has each room: side by side, 0.2 m of wall between."""
+    """Return where the world has each room: side by side, 0.2 m of wall between."""
 
     def shift(room: Room) -> Floats:
         k = next(i for i, one in enumerate(rooms) if one is room)
@@ -529,7 +522,7 @@ _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 def difference_share(
     a: Room, b: Room, T_room_camera: Floats, T_other: Floats | None = None
 ) -> float:
-    """Share of a view of one room that another shows elsewhere from the same place, or another."""
+    """Return the share of a view that another room shows otherwise, from `T_other` if given."""
     here = render(a, T_room_camera, _COARSE)
     there = render(b, T_room_camera if T_other is None else T_other, _COARSE)
     nearer = np.minimum(here, there)
@@ -539,7 +532,7 @@ def difference_share(
 
 
 def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """A row whose last room the map lacks; what is asked differs from all others in sight.
+    """Return a row whose last room the map lacks; what is asked differs from all others in sight.
 
     It must differ by more than a moved chair: no method tells an equal room from a mapped one
     in which somebody moved a chair.
@@ -560,7 +553,7 @@ def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> Shoot:
 
 
 def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Two rooms of different plans; the furniture of one corner is the same, arranged alike."""
+    """Return two rooms of different plans with the same furniture in one corner."""
     pieces = [make(rng) for make in _KITCHEN]
     pieces += [pieces[2], kitchen_row(rng)][: int(rng.integers(1, 3))]
     middle = table(rng) if rng.random() < 0.7 else counter(rng)
@@ -578,7 +571,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Shoot
 
 
 def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """A piece and its like back to back, other things before each: the map sees one side."""
+    """Return a piece and its like back to back, other things before each: the map sees one side."""
     make = (desk, shelf, counter, table, cupboard)[int(rng.integers(0, 5))]
     piece = make(rng)
     w, d = piece.width, piece.depth
@@ -615,7 +608,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
 
 
 def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Rooms and objects that have nothing to do with each other."""
+    """Return rooms and objects that have nothing to do with each other."""
 
     def views(rooms: int, each: int, around: int) -> list[tuple[Room, Floats]]:
         found = []
@@ -634,7 +627,7 @@ def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:
 
 
 def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Different rooms side by side, seen from few places or from many, in which people live.
+    """Return different rooms side by side, seen from few places or from many, in which people live.
 
     Things stand about that were elsewhere, or not there, when the map was recorded.
     """

@@ -36,15 +36,15 @@ class SyntheticMesh:
     loss: Floats32
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0) -> SyntheticMesh:
-        """The mesh turned about z by yaw (radians), then shifted by offset (3, metres)."""
+        """Return the mesh turned about z by yaw (radians), then shifted by offset (3, metres)."""
         return self.turned(rotation_z(yaw), offset) if yaw else self._shifted(offset)
 
     def turned(self, rotation: Floats, offset: ArrayLike = (0.0, 0.0, 0.0)) -> SyntheticMesh:
-        """The mesh after x -> rotation x + offset; rotation (3, 3), offset (3,) metres."""
+        """Return the mesh after x -> rotation x + offset; rotation (3, 3), offset (3,) metres."""
         return replace(self, vertices=self.vertices @ rotation.T + np.asarray(offset, float))
 
     def with_loss(self, share: float) -> SyntheticMesh:
-        """The same mesh with one loss on all faces."""
+        """Return the same mesh with one loss on all faces."""
         return replace(self, loss=np.full(len(self.faces), share, np.float32))
 
     def _shifted(self, offset: ArrayLike) -> SyntheticMesh:
@@ -52,7 +52,7 @@ class SyntheticMesh:
 
 
 def mesh_of(vertices: ArrayLike, faces: ArrayLike) -> SyntheticMesh:
-    """A mesh without loss, its faces of no area left out."""
+    """Return a mesh without loss, its faces of no area left out."""
     v = np.asarray(vertices, np.float64).reshape(-1, 3)
     f: NDArray[np.int32] = np.asarray(faces, np.int32).reshape(-1, 3)
     a, b, c = v[f[:, 0]], v[f[:, 1]], v[f[:, 2]]
@@ -70,7 +70,7 @@ def mesh_of(vertices: ArrayLike, faces: ArrayLike) -> SyntheticMesh:
 
 
 def join(meshes: Iterable[SyntheticMesh]) -> SyntheticMesh:
-    """All meshes as one; an empty iterable gives the empty mesh."""
+    """Return all meshes as one; an empty iterable gives the empty mesh."""
     parts = list(meshes)
     if not parts:
         return SyntheticMesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.float32))
@@ -83,30 +83,30 @@ def join(meshes: Iterable[SyntheticMesh]) -> SyntheticMesh:
 
 
 def rotation_z(yaw: float) -> Floats:
-    """(3, 3) rotation about z by yaw radians."""
+    """Return (3, 3) rotation about z by yaw radians."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def rotation_x(angle: float) -> Floats:
-    """(3, 3) rotation about x by angle radians."""
+    """Return (3, 3) rotation about x by angle radians."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def face_normals(mesh: SyntheticMesh) -> Floats:
-    """(F, 3) normals of the faces, each as long as twice the area of its face, m^2."""
+    """Return (F, 3) normals of the faces, each as long as twice the area of its face, m^2."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return np.asarray(np.cross(b - a, c - a))
 
 
 def area(mesh: SyntheticMesh) -> float:
-    """Area of all faces, m^2."""
+    """Return area of all faces, m^2."""
     return float(np.linalg.norm(face_normals(mesh), axis=1).sum() / 2)
 
 
 def volume(mesh: SyntheticMesh) -> float:
-    """Enclosed volume, m^3, by the divergence theorem; negative where normals face inward."""
+    """Return the enclosed volume, m^3; negative where normals face inward."""
     return float((mesh.vertices[mesh.faces[:, 0]] * face_normals(mesh)).sum() / 6)
 
 
@@ -123,7 +123,7 @@ _BOX_FACES = np.array(
 def box(
     width: float, depth: float, height: float, at: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0
 ) -> SyntheticMesh:
-    """A cuboid width x depth x height along x, y, z; `at` is the middle of its underside."""
+    """Return a cuboid width x depth x height along x, y, z; `at` is the middle of its underside."""
     m = SyntheticMesh(_CORNERS * (width, depth, height), _BOX_FACES, np.zeros(12, np.float32))
     return m.moved(at, yaw)
 
@@ -131,14 +131,14 @@ def box(
 def tapered_box(
     bottom: tuple[float, float], top: tuple[float, float], height: float
 ) -> SyntheticMesh:
-    """A box whose underside (width, depth) differs from its upper side."""
+    """Return a box whose underside (width, depth) differs from its upper side."""
     scale = np.where(_CORNERS[:, 2:] > 0.5, np.array(top), np.array(bottom))
     xy = _CORNERS[:, :2] * scale
     return mesh_of(np.column_stack([xy, _CORNERS[:, 2] * height]), _BOX_FACES)
 
 
 def revolve(profile: ArrayLike, segments: int = 16) -> SyntheticMesh:
-    """The solid swept by a profile that turns about z.
+    """Return the solid swept by a profile that turns about z.
 
     Parameters
     ----------
@@ -158,17 +158,17 @@ def revolve(profile: ArrayLike, segments: int = 16) -> SyntheticMesh:
 
 
 def cylinder(radius: float, height: float, segments: int = 16) -> SyntheticMesh:
-    """An upright cylinder, as a prism of that many sides."""
+    """Return an upright cylinder, as a prism of that many sides."""
     return revolve([(radius, 0.0), (radius, height)], segments)
 
 
 def cone(lower: float, upper: float, height: float, segments: int = 16) -> SyntheticMesh:
-    """A truncated cone from radius lower to radius upper; 0 makes a tip."""
+    """Return a truncated cone from radius lower to radius upper; 0 makes a tip."""
     return revolve([(lower, 0.0), (upper, height)], segments)
 
 
 def ellipsoid(radii: ArrayLike, power: float = 1.0, segments: int = 16) -> SyntheticMesh:
-    """A superellipsoid resting on z = 0: power 1 is an ellipsoid, towards 0 a box."""
+    """Return a superellipsoid resting on z = 0: power 1 is an ellipsoid, towards 0 a box."""
     directions = _sphere(segments)
     shaped = np.sign(directions) * np.abs(directions) ** power
     # points of the level set |x|^(2/power) + ... = 1 along each direction
@@ -177,7 +177,7 @@ def ellipsoid(radii: ArrayLike, power: float = 1.0, segments: int = 16) -> Synth
 
 
 def blob(rng: np.random.Generator, radii: ArrayLike, roughness: float = 0.12) -> SyntheticMesh:
-    """A sphere bent by a few low-frequency waves: bags, cushions, crumpled cloth."""
+    """Return a sphere bent by a few low-frequency waves: bags, cushions, crumpled cloth."""
     directions = _sphere(26)
     waves = rng.normal(size=(4, 3)) * 2.2
     swell = np.cos(directions @ waves.T + rng.uniform(0, 2 * math.pi, 4)) @ rng.normal(size=4)
@@ -190,7 +190,7 @@ def blob(rng: np.random.Generator, radii: ArrayLike, roughness: float = 0.12) ->
 
 
 def extrude(outline: ArrayLike, height: float) -> SyntheticMesh:
-    """A prism over a simple polygon (n, 2), counter-clockwise, metres."""
+    """Return a prism over a simple polygon (n, 2), counter-clockwise, metres."""
     p = np.asarray(outline, float)
     n = len(p)
     cap = triangulate(p)
@@ -202,7 +202,7 @@ def extrude(outline: ArrayLike, height: float) -> SyntheticMesh:
 
 
 def ribbon(path: ArrayLike, thickness: float, height: float) -> SyntheticMesh:
-    """An upright sheet over an open path (n, 2): curtains, bent panels."""
+    """Return an upright sheet over an open path (n, 2): curtains, bent panels."""
     p = np.asarray(path, float)
     along = np.gradient(p, axis=0)
     side = np.column_stack([along[:, 1], -along[:, 0]])
@@ -222,7 +222,7 @@ def ribbon(path: ArrayLike, thickness: float, height: float) -> SyntheticMesh:
 
 
 def tube(points: Sequence[ArrayLike], radius: float, segments: int = 8) -> SyntheticMesh:
-    """A round rod along a path of points (n, 3): pipes, chair frames, cables, handles."""
+    """Return a round rod along a path of points (n, 3): pipes, chair frames, cables, handles."""
     p = np.asarray(points, float)
     along = np.gradient(p, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -240,7 +240,7 @@ def tube(points: Sequence[ArrayLike], radius: float, segments: int = 8) -> Synth
 
 
 def triangulate(outline: Floats) -> Ints32:
-    """(n - 2, 3) triangles that fill a simple polygon (n, 2), counter-clockwise: ear clipping."""
+    """Return (n - 2, 3) triangles that fill a counter-clockwise polygon (n, 2), by ear clipping."""
     p = np.asarray(outline, float)
     left = list(range(len(p)))
     triangles = []
@@ -335,11 +335,11 @@ class Wall:
 
     @property
     def inward(self) -> Floats:
-        """(2,) unit vector from the wall into the room."""
+        """Return (2,) unit vector from the wall into the room."""
         return np.array([-self.along[1], self.along[0]])
 
     def at(self, distance: float, out: float = 0.0) -> Floats:
-        """(2,) the floor point so far along the wall and so far out into the room."""
+        """Return (2,) the floor point so far along the wall and so far out into the room."""
         return np.asarray(self.corner + distance * self.along + out * self.inward)
 
 
@@ -351,12 +351,12 @@ class Ceiling:
     slope: Floats
 
     def at(self, points: Floats) -> Floats:
-        """(...,) heights over floor points (..., 2)."""
+        """Return (...,) heights over floor points (..., 2)."""
         return np.asarray(self.height + points @ self.slope)
 
 
 def floor_plan(rng: np.random.Generator) -> Floats:
-    """(n, 2) outline, counter-clockwise from the origin: rectangle, L, alcove or cut corner."""
+    """Return an outline (n, 2), counter-clockwise: rectangle, L, alcove or cut corner."""
     w, d = rng.uniform(2.6, 8.0), rng.uniform(2.5, 6.5)
     kind = rng.choice(4, p=(0.4, 0.25, 0.2, 0.15))
     a, b = w * rng.uniform(0.4, 0.7), d * rng.uniform(0.4, 0.7)
@@ -375,7 +375,7 @@ def floor_plan(rng: np.random.Generator) -> Floats:
 
 
 def ceiling(rng: np.random.Generator, outline: Floats) -> Ceiling:
-    """A flat ceiling, or one in four sloped along x or y."""
+    """Return a flat ceiling, or one in four sloped along x or y."""
     height = rng.uniform(2.3, 3.2)
     if rng.random() > 0.25:
         return Ceiling(height, np.zeros(2))
@@ -388,7 +388,7 @@ def ceiling(rng: np.random.Generator, outline: Floats) -> Ceiling:
 
 
 def walls_of(outline: Floats) -> list[Wall]:
-    """The walls over the edges of an outline, without openings."""
+    """Return the walls over the edges of an outline, without openings."""
     walls = []
     for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         length = float(np.linalg.norm(b - a))
@@ -397,7 +397,7 @@ def walls_of(outline: Floats) -> list[Wall]:
 
 
 def shell(outline: Floats, walls: list[Wall], top: Ceiling) -> SyntheticMesh:
-    """Floor, ceiling and walls as one closed surface whose normals face the room."""
+    """Return floor, ceiling and walls as one closed surface whose normals face the room."""
     flat = triangulate(outline)
     floor = mesh_of(np.c_[outline, np.zeros(len(outline))], flat)
     roof = mesh_of(np.c_[outline, top.at(outline)], flat[:, ::-1])
@@ -405,7 +405,7 @@ def shell(outline: Floats, walls: list[Wall], top: Ceiling) -> SyntheticMesh:
 
 
 def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
-    """One wall up to the ceiling, its openings cut out and lined."""
+    """Return one wall up to the ceiling, its openings cut out and lined."""
     us = sorted({0.0, wall.length, *(u for o in wall.openings for u in (o.start, o.end))})
     vs = sorted({0.0, *(v for o in wall.openings for v in (o.low, o.high))})
     grid = np.array([[(u, 0.0, v) for u in us] for v in [*vs, math.inf]])
@@ -425,7 +425,7 @@ def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
 
 
 def _lining(o: Opening) -> SyntheticMesh:
-    """Sides and back of a recess, in the wall's frame (along, inward, up)."""
+    """Return sides and back of a recess, in the wall's frame (along, inward, up)."""
     ring = ((o.start, o.low), (o.end, o.low), (o.end, o.high), (o.start, o.high))
     front = np.array([(u, 0.0, v) for u, v in ring])
     back = front - (0.0, o.deep, 0.0)
@@ -434,7 +434,7 @@ def _lining(o: Opening) -> SyntheticMesh:
 
 
 def _quads(corners: list[Floats]) -> SyntheticMesh:
-    """Quadrilaterals in the plane (along, up), given so that they face +inward."""
+    """Return quadrilaterals in the plane (along, up), given so that they face +inward."""
     v = np.concatenate(corners)
     first = np.arange(0, len(v), 4)[:, None]
     # (along, inward, up) is right-handed: along x up points to -inward, so turn them round

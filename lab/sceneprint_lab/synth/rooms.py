@@ -115,7 +115,7 @@ class Floor:
     def _cells(
         self, place: PiecePose, width: float, depth: float
     ) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-        """A part of the grid that holds the rectangle, and which of its cells it covers."""
+        """Return a part of the grid that holds the rectangle, and which of its cells it covers."""
         reach = math.hypot(width, depth) / 2 + self.cell
         middle = np.array([place.x, place.y])
         first = np.floor((middle - reach - self._low) / self.cell).astype(int).clip(0)
@@ -129,7 +129,7 @@ class Floor:
 
 
 def inside(outline: Floats, points: Floats) -> NDArray[np.bool_]:
-    """(...,) whether floor points (..., 2) lie in the outline (n, 2): crossings of a ray."""
+    """Return (...,) whether floor points (..., 2) lie in the outline (n, 2): crossings of a ray."""
     x, y = points[..., 0], points[..., 1]
     result = np.zeros(x.shape, bool)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -164,7 +164,7 @@ def keep_doors_free(site: Site) -> None:
 
 
 def along_wall(wall: Wall, menu: Menu, site: Site) -> list[SyntheticMesh]:
-    """Pieces side by side along a wall; how densely differs from wall to wall."""
+    """Return pieces side by side along a wall; how densely differs from wall to wall."""
     rng = site.rng
     parts: list[SyntheticMesh] = []
     u, density = rng.uniform(0.0, 0.5), rng.uniform(0.5, 1.0)
@@ -182,7 +182,7 @@ def along_wall(wall: Wall, menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
-    """Pieces in the middle of the room, square to it or at any yaw."""
+    """Return pieces in the middle of the room, square to it or at any yaw."""
     rng = site.rng
     parts: list[SyntheticMesh] = []
     spots = site.floor.points[~site.floor.claimed]
@@ -198,7 +198,7 @@ def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def partitions(site: Site) -> list[SyntheticMesh]:
-    """Now and then a wall or screen that stands out into the room."""
+    """Return now and then a wall or screen that stands out into the room."""
     rng, floor = site.rng, site.floor
     lowest = float(site.top.at(floor.points[floor.inside]).min())
     parts = []
@@ -215,7 +215,7 @@ def partitions(site: Site) -> list[SyntheticMesh]:
 
 
 def on_the_floor(site: Site) -> list[SyntheticMesh]:
-    """Bins, boxes, plants and small things on what floor is left."""
+    """Return bins, boxes, plants and small things on what floor is left."""
     rng, floor = site.rng, site.floor
     parts = []
     for _ in range(rng.integers(3, 16)):
@@ -241,7 +241,7 @@ def _pick(menu: Menu, rng: np.random.Generator) -> Piece:
 
 
 def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
-    """The piece with its load and its chairs at a place, or nothing if there is no room."""
+    """Return the piece with its load and its chairs at a place, or nothing if there is no room."""
     rng = site.rng
     mesh = furnished(piece, rng).moved((place.x, place.y, 0.0), place.yaw)
     if (mesh.vertices[:, 2] > site.top.at(mesh.vertices[:, :2]) - 0.02).any():
@@ -263,7 +263,7 @@ def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
 def _seat(
     seat: Piece, side: int, piece: Piece, place: PiecePose, site: Site
 ) -> list[SyntheticMesh]:
-    """A chair at one side of a table (0 is its front), pushed in more or less."""
+    """Return a chair at one side of a table (0 is its front), pushed in more or less."""
     rng = site.rng
     yaw = place.yaw + side * math.pi / 2
     half, span = (piece.depth, piece.width) if side % 2 == 0 else (piece.width, piece.depth)
@@ -316,27 +316,27 @@ class Room:
 
     @property
     def vertices(self) -> Floats32:
-        """(V, 3) metres, z up."""
+        """Return (V, 3) metres, z up."""
         return self.mesh.vertices.astype(np.float32)
 
     @property
     def faces(self) -> Ints32:
-        """(F, 3) indices into vertices."""
+        """Return (F, 3) indices into vertices."""
         return self.mesh.faces
 
     @property
     def size(self) -> Floats:
-        """(3,) extents of the room along x, y, z, metres."""
+        """Return (3,) extents of the room along x, y, z, metres."""
         return np.array([*np.ptp(self.outline, axis=0), self.ceiling.at(self.outline).max()])
 
     @cached_property
     def caster(self) -> Caster:
-        """The mesh ready for rays; built at the first use."""
+        """Return the mesh ready for rays; built at the first use."""
         return Caster(self.mesh)
 
 
 def make_room(rng: np.random.Generator) -> Room:
-    """A room of 2.5 to 8 m with furniture, fittings and clutter, all drawn from rng."""
+    """Return a room of 2.5 to 8 m with furniture, fittings and clutter, all drawn from rng."""
     outline = floor_plan(rng)
     top = ceiling(rng, outline)
     walls = [pierced(w, rng, _depth_behind(w, outline)) for w in walls_of(outline)]
@@ -354,7 +354,7 @@ def make_room(rng: np.random.Generator) -> Room:
 
 
 def _depth_behind(wall: Wall, outline: Floats) -> float:
-    """How deep a recess may go, metres, without meeting the room or another recess."""
+    """Return how deep a recess may go, metres, without meeting the room or another recess."""
     along = np.linspace(-0.3, wall.length + 0.3, 15)
     for depth in (2.0, 1.0, 0.5, 0.25):
         behind = np.linspace(0.01, depth + 0.1, 12)

@@ -57,7 +57,7 @@ class Caster:
         self._normals = np.concatenate([normals, np.zeros((1, 3))]).astype(np.float32)
 
     def cast(self, origins: Floats32, directions: Floats32) -> RayHits:
-        """The first face that each ray meets.
+        """Return the first face that each ray meets.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class Caster:
 def cast_depth(
     caster: Caster, T_world_camera: Floats, intrinsics: Intrinsics
 ) -> tuple[Floats32, Floats32]:
-    """An ideal depth image and how steeply each sample is met.
+    """Return an ideal depth image and how steeply each sample is met.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def cast_depth(
 def cast_faces(
     caster: Caster, T_world_camera: Floats, intrinsics: Intrinsics
 ) -> tuple[Floats32, Floats32, Ints32]:
-    """As `cast_depth`, and the index of the face seen: (H, W) int32, -1 for none."""
+    """Return as `cast_depth`, and the index of the face seen: (H, W) int32, -1 for none."""
     shape = (intrinsics.height, intrinsics.width)
     rays = pixel_rays(intrinsics) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
@@ -113,7 +113,7 @@ def cast_faces(
 
 
 def pixel_rays(intrinsics: Intrinsics) -> Floats32:
-    """(H W, 3) float32 rays through the pixel centres, row by row, with z = 1."""
+    """Return (H W, 3) float32 rays through the pixel centres, row by row, with z = 1."""
     x = (np.arange(intrinsics.width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(intrinsics.height) - intrinsics.cy) / intrinsics.fy
     rays = np.ones((intrinsics.height, intrinsics.width, 3), np.float32)
@@ -163,14 +163,10 @@ KINECT_V1 = KinectNoise()
 
 
 def kinect_noise(
-    depth: Floats32,
-    cosine: Floats32,
-    intrinsics: Intrinsics,
-    rng: np.random.Generator,
-    parameters: KinectNoise = KINECT_V1,
-    loss: Floats32 | None = None,
-) -> Floats32:
-    """A depth image as a Kinect v1 would have given it.
+    depth: Floats32, cosine: Floats32, intrinsics: Intrinsics, rng: np.random.Generator,
+    parameters: KinectNoise = KINECT_V1, loss: Floats32 | None = None,
+) -> Floats32:  # fmt: skip
+    """Return a depth image as a Kinect v1 would have given it.
 
     Parameters
     ----------
@@ -206,7 +202,7 @@ def kinect_noise(
 def _strayed(
     depth: Floats32, rng: np.random.Generator, p: KinectNoise
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns to look samples up at: near edges of depth, each block strays as one."""
+    """Return the rows and columns of samples; near edges of depth, each block strays as one."""
     height, width = depth.shape
     small = (-(-height // p.edge_block), -(-width // p.edge_block))
     stray = np.round(rng.normal(0, p.edge_jitter, (2, *small))).astype(np.intp)
@@ -219,7 +215,7 @@ def _strayed(
 
 
 def _within(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
-    """(H, W) all but the border."""
+    """Return (H, W) all but the border."""
     left, right, top, bottom = p.border
     within = np.zeros(shape, bool)
     within[top : shape[0] - bottom, left : shape[1] - right] = True
@@ -227,7 +223,7 @@ def _within(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
 
 
 def _shadowed(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.bool_]:
-    """Samples that the projector, to the right of the camera, cannot reach.
+    """Return samples that the projector, to the right of the camera, cannot reach.
 
     Light leaves the projector in column u - d. Of two samples in one such column the
     nearer is lit; nearer ones come from farther right.
@@ -240,7 +236,7 @@ def _shadowed(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.b
 
 
 def _lost_share(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floats32:
-    """(H, W) chance that a sample is missing: patches anywhere, grazing rays, poor surfaces."""
+    """Return the chance (H, W) that a sample is missing: patches, grazing rays, poor surfaces."""
     steep = (math.cos(p.grazing_start) - cosine) / (
         math.cos(p.grazing_start) - math.cos(p.grazing_end)
     )
@@ -251,7 +247,7 @@ def _lost_share(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floa
 
 
 def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats32:
-    """(H, W) normal noise of unit variance whose grain is about `size` pixels wide.
+    """Return (H, W) normal noise of unit variance whose grain is about `size` pixels wide.
 
     Coarse grain is drawn on a coarse grid and enlarged, which costs a tenth of a blur.
     """
@@ -267,7 +263,7 @@ def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Flo
 
 
 def _enlarged(coarse: Floats32, step: int) -> Floats32:
-    """Linear interpolation, step samples for each one."""
+    """Return linear interpolation, step samples for each one."""
     share = (np.arange(step, dtype=np.float32) / step)[:, None]
     rows = coarse[:-1, None] * (1 - share) + coarse[1:, None] * share
     rows = rows.reshape(-1, coarse.shape[1])
@@ -315,17 +311,17 @@ class Spinning:
 
     @property
     def elevations(self) -> Floats:
-        """(rings,) rad, from the lowest up."""
+        """Return (rings,) rad, from the lowest up."""
         return np.linspace(self.lowest, self.highest, self.rings)
 
     @property
     def azimuths(self) -> Floats32:
-        """(firings,) rad, from -pi on."""
+        """Return (firings,) rad, from -pi on."""
         n = round(2 * math.pi / self.azimuth_step)
         return (np.arange(n) * (2 * math.pi / n) - math.pi).astype(np.float32)
 
     def rays(self, rng: np.random.Generator) -> Floats32:  # noqa: ARG002
-        """(rings x firings, 3) unit directions, ring by ring; the same in every scan."""
+        """Return (rings x firings, 3) unit directions, ring by ring; the same in every scan."""
         azimuth, elevation = self.azimuths, self.elevations.astype(np.float32)[:, None]
         c = np.cos(elevation)
         rays = np.empty((self.rings, len(azimuth), 3), np.float32)
@@ -335,18 +331,18 @@ class Spinning:
         return rays.reshape(-1, 3)
 
     def offsets(self, rng: np.random.Generator) -> Floats32:
-        """(rings x firings,) errors that the ranges of a ring have in common, metres."""
+        """Return (rings x firings,) errors that the ranges of a ring have in common, metres."""
         own = rng.normal(0, self.ring_sigma, self.rings).astype(np.float32)
         return np.repeat(own, len(self.azimuths))
 
     def hidden(self) -> NDArray[np.bool_]:
-        """(rings x firings,) whether the carrier is in the way."""
+        """Return (rings x firings,) whether the carrier is in the way."""
         away = np.abs((self.azimuths - self.blind_middle + math.pi) % (2 * math.pi) - math.pi)
         below = (self.elevations < self.blind_below)[:, None]
         return np.asarray(((away < self.blind_width / 2) & below).ravel())
 
     def perfect(self) -> Spinning:
-        """The same scanner without errors, losses and blind angles."""
+        """Return the same scanner without errors, losses and blind angles."""
         return replace(self, sigma=0.0, ring_sigma=0.0, loss=0.0, grazing=0.0, blind_width=0.0)
 
 
@@ -380,7 +376,7 @@ class Rosette:
     grazing: float = 0.1
 
     def rays(self, rng: np.random.Generator) -> Floats32:
-        """(firings, 3) unit directions in the order of time, other ones in every scan."""
+        """Return (firings, 3) unit directions in the order of time, other ones in every scan."""
         start = rng.uniform(-math.pi, math.pi, 2)
         turned = np.arange(self.firings)[:, None] / self.firings * (2 * math.pi) * self.turns
         waves: NDArray[np.complex128] = np.exp(1j * (turned + start))
@@ -393,15 +389,15 @@ class Rosette:
         return np.stack(rays, axis=1).astype(np.float32)
 
     def offsets(self, rng: np.random.Generator) -> Floats32:  # noqa: ARG002
-        """(firings,) of zeros: no ranges have an error in common."""
+        """Return (firings,) of zeros: no ranges have an error in common."""
         return np.zeros(self.firings, np.float32)
 
     def hidden(self) -> NDArray[np.bool_]:
-        """(firings,) False: nothing is in the way."""
+        """Return (firings,) False: nothing is in the way."""
         return np.zeros(self.firings, np.bool_)
 
     def perfect(self) -> Rosette:
-        """The same scanner without errors and losses."""
+        """Return the same scanner without errors and losses."""
         return replace(self, sigma=0.0, loss=0.0, grazing=0.0)
 
 
@@ -409,7 +405,7 @@ Scanner = Spinning | Rosette
 
 
 def own_scanner(rng: np.random.Generator) -> Spinning:
-    """A scanner as there are many: 16 to 128 rings, narrow or tall, near- or far-sighted."""
+    """Return a scanner as there are many: 16 to 128 rings, narrow or tall, near- or far-sighted."""
     rings = int(rng.choice((16, 32, 64, 64, 96, 128)))
     low, high = np.radians(rng.uniform((-45.0, 8.0), (-14.0, 45.0)))
     if rings < 64:  # few rings are never far apart
@@ -417,39 +413,30 @@ def own_scanner(rng: np.random.Generator) -> Spinning:
     # the more rings, the coarser: scanners of many rings have tens of thousands of points as well
     step = math.radians(rng.uniform(0.18, 0.4)) * (1.0 if rings <= 64 else 1.6)
     return Spinning(
-        rings=rings,
-        lowest=float(low),
-        highest=float(high),
-        azimuth_step=step,
-        minimum=float(rng.uniform(0.4, 1.2)),
-        maximum=float(rng.uniform(45.0, 100.0)),
-        sigma=float(rng.uniform(0.01, 0.03)),
-        ring_sigma=float(rng.uniform(0.0, 0.015)),
-        loss=float(rng.uniform(0.0, 0.05)),
-        grazing=float(rng.uniform(0.03, 0.2)),
+        rings=rings, lowest=float(low), highest=float(high), azimuth_step=step,
+        minimum=float(rng.uniform(0.4, 1.2)), maximum=float(rng.uniform(45.0, 100.0)),
+        sigma=float(rng.uniform(0.01, 0.03)), ring_sigma=float(rng.uniform(0.0, 0.015)),
+        loss=float(rng.uniform(0.0, 0.05)), grazing=float(rng.uniform(0.03, 0.2)),
         blind_middle=float(rng.uniform(-math.pi, math.pi)),
         blind_width=float(rng.choice((0.0, rng.uniform(0.2, 1.8)))),
         blind_below=float(rng.uniform(-0.3, 0.6)),
-    )
+    )  # fmt: skip
 
 
 def own_rosette(rng: np.random.Generator) -> Rosette:
-    """A scanner of a small field of view, 60 to 80 degrees, with 8,000 to 24,000 firings a scan."""
+    """Return a scanner of a field of view of 60 to 80 degrees, with 8,000 to 24,000 firings."""
     return Rosette(
         half_angle=float(np.radians(rng.uniform(30.0, 40.0))),
-        firings=int(rng.integers(8_000, 24_001)),
-        minimum=float(rng.uniform(0.4, 1.2)),
-        maximum=float(rng.uniform(60.0, 120.0)),
-        sigma=float(rng.uniform(0.01, 0.03)),
-        loss=float(rng.uniform(0.0, 0.05)),
-        grazing=float(rng.uniform(0.03, 0.2)),
-    )
+        firings=int(rng.integers(8_000, 24_001)), minimum=float(rng.uniform(0.4, 1.2)),
+        maximum=float(rng.uniform(60.0, 120.0)), sigma=float(rng.uniform(0.01, 0.03)),
+        loss=float(rng.uniform(0.0, 0.05)), grazing=float(rng.uniform(0.03, 0.2)),
+    )  # fmt: skip
 
 
 def scan(
     caster: Caster, T_world_sensor: Floats, sensor: Scanner, rng: np.random.Generator
 ) -> Floats32:
-    """One scan of a scanner that stands still.
+    """Return one scan of a scanner that stands still.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ _COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: what a Kinect sees, i
 
 
 def pose(view: Floats) -> Floats:
-    """T_world_camera (4, 4) of a view (6,); the optical frame is x right, y down, z forward."""
+    """Return T_world_camera (4, 4) of a view (6,), in the optical frame."""
     x, y, z, yaw, pitch, roll = view
     forward = np.array(
         [math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)]
@@ -44,7 +44,7 @@ def pose(view: Floats) -> Floats:
 
 
 def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 3) are in free space, that far from all surfaces.
+    """Return (n,) whether points (n, 3) are in free space, that far from all surfaces.
 
     Rays go out in 128 directions. One that meets the back of a face has started inside a
     solid or outside the room.
@@ -61,7 +61,7 @@ def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np
 
 
 def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
-    """Independent views; each sees a good share of the room within 0.5 to 5 m.
+    """Return independent views; each sees a good share of the room within 0.5 to 5 m.
 
     Half of them look at some object from 0.7 to 3 m, half look about from anywhere.
 
@@ -88,14 +88,14 @@ def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats
 
 
 def looking_about(room: Room, n: int, rng: np.random.Generator) -> Floats:
-    """(n, 6) views from anywhere, slightly downward."""
+    """Return (n, 6) views from anywhere, slightly downward."""
     yaw = rng.uniform(-math.pi, math.pi, n)
     pitch = np.clip(np.radians(rng.normal(-15, 15, n)), -1.3, 0.6)
     return np.column_stack([_positions(room, n, rng), yaw, pitch, _rolls(n, rng)])
 
 
 def looking_at(room: Room, n: int, rng: np.random.Generator) -> Floats:
-    """(n, 6) views whose middle is a point on some surface between knee and head."""
+    """Return (n, 6) views whose middle is a point on some surface between knee and head."""
     a, b, c = (room.mesh.vertices[room.mesh.faces[:, k]] for k in range(3))
     middle = (a + b + c) / 3
     weight = np.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1))  # small things count too
@@ -130,7 +130,7 @@ def _rolls(n: int, rng: np.random.Generator) -> Floats:
 
 
 def worth_seeing(room: Room, T_world_camera: Floats, least: float) -> bool:
-    """Whether a share `least` of the view lies within 0.5 to 5 m, on several surfaces.
+    """Return whether a share `least` of the view lies within 0.5 to 5 m, on several surfaces.
 
     Of the neighbours in a coarse grid of rays, a tenth must differ in depth or in normal,
     and the normals must span more than one direction. Less is asked as `least` falls.
@@ -152,7 +152,7 @@ def worth_seeing(room: Room, T_world_camera: Floats, least: float) -> bool:
 
 
 def _directions(n: int) -> Floats:
-    """(n, 3) unit vectors spread evenly: a Fibonacci lattice."""
+    """Return (n, 3) unit vectors spread evenly: a Fibonacci lattice."""
     k = np.arange(n) + 0.5
     z = 1 - 2 * k / n
     r, turn = np.sqrt(1 - z * z), k * math.pi * (1 + math.sqrt(5))
@@ -165,15 +165,10 @@ def _directions(n: int) -> Floats:
 
 
 def orbit(
-    middle: tuple[float, float, float],
-    radius: float,
-    n: int,
-    rng: np.random.Generator,
-    *,
-    first: float | None = None,
-    sweep: float = 2 * math.pi,
-) -> list[Floats]:
-    """Hand-held views from a circle, slightly downward, each looking at its middle.
+    middle: tuple[float, float, float], radius: float, n: int, rng: np.random.Generator, *,
+    first: float | None = None, sweep: float = 2 * math.pi,
+) -> list[Floats]:  # fmt: skip
+    """Return hand-held views from a circle, slightly downward, each looking at its middle.
 
     Distance, height and aim wander slowly, by a tenth of a metre or two.
 
@@ -211,7 +206,7 @@ def orbit(
 
 
 def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
-    """A smooth hand-held path that looks around and comes back to places it has seen.
+    """Return a smooth hand-held path that looks around and comes back to places it has seen.
 
     The camera wanders between a few viewpoints, 3 to 8 cm or 1 to 3 degrees a frame,
     whichever takes longer; its hand trembles a little.
@@ -242,7 +237,7 @@ def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
 
 
 def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, list[list[int]]]:
-    """Viewpoints (k, 6) and, for each, those that a clear straight way leads to."""
+    """Return viewpoints (k, 6) and, for each, those that a clear straight way leads to."""
     anchors: list[Floats] = []
     ways: list[list[int]] = []
     for attempt in range(400):
@@ -271,7 +266,7 @@ def _way(room: Room, a: Floats, b: Floats) -> bool:
 
 
 def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
-    """Views from a (left out) to b; yaw goes the short way round."""
+    """Return views from a (left out) to b; yaw goes the short way round."""
     change = b - a
     change[3] = (change[3] + math.pi) % (2 * math.pi) - math.pi
     walked = np.linalg.norm(change[:3]) / rng.uniform(0.03, 0.08)
@@ -281,7 +276,7 @@ def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _smoothed(values: Floats, radius: int) -> Floats:
-    """Columns after a triangular moving mean over 2 radius + 1 rows, the ends held."""
+    """Return columns after a triangular moving mean over 2 radius + 1 rows, the ends held."""
     kernel = np.bartlett(2 * radius + 3)[1:-1]
     kernel /= kernel.sum()
     padded = np.pad(values, ((radius, radius), (0, 0)), mode="edge")
@@ -297,7 +292,7 @@ COARSE = 3  #: cells of the floor's grid to one of the grid that walks go on
 
 
 def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floats]:
-    """Poses anywhere in the premises, facing anywhere."""
+    """Return poses anywhere in the premises, facing anywhere."""
     spots = premises.floor.points[premises.walkable]
     height = float(rng.uniform(0.5, 1.9))
     chosen = spots[rng.integers(0, len(spots), n)]
@@ -305,7 +300,7 @@ def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floa
 
 
 def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STEP) -> list[Floats]:
-    """Poses every `step` metres on a walk from place to place, facing ahead; it comes back often.
+    """Return poses every `step` metres on a walk, facing ahead; it comes back often.
 
     Parameters
     ----------
@@ -344,7 +339,7 @@ def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STE
 
 
 def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Generator) -> Floats:
-    """T_world_sensor (4, 4) of a scanner that is carried nearly upright, about 2 cm off z."""
+    """Return T_world_sensor (4, 4) of a scanner that is carried nearly upright."""
     roll, pitch = rng.normal(0, math.radians(1.5), 2)
     T = np.eye(4)
     across = rotation_z(math.pi / 2) @ rotation_x(float(pitch)) @ rotation_z(-math.pi / 2)
@@ -354,7 +349,7 @@ def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Genera
 
 
 def _ways(premises: Premises) -> tuple[Floats, csr_array]:
-    """Spots (n, 2) that one can walk on, and the distances of neighbours."""
+    """Return spots (n, 2) that one can walk on, and the distances of neighbours."""
     free = premises.walkable[::COARSE, ::COARSE]
     parts, count = ndimage.label(free, np.ones((3, 3)))
     if count:

@@ -1,6 +1,4 @@
-"""Whole answers at places that look alike: `python -m benchmarks.lookalikes --seed S --sites N`.
-
-seed  --synthesise_lookalike-->  sites  --ask_site-->  SiteAnswer, ...  --table-->  shares by kind
+"""Answer queries at places that look alike: `python -m sceneprint_lab.cli.lookalike_answers`.
 
 With `--model lidar` the sites are scanned by a laser, and an answer is right within 50 cm and 10
 degrees; it is grossly wrong beyond 2.5 m or 15 degrees.
@@ -22,35 +20,35 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneprint.models import PRESETS, read_model
-from sceneprint.pipeline import Signer, open_signer
+from sceneprint.pipeline import open_signer
 from sceneprint_lab.evaluation.measures import answers
 from sceneprint_lab.evaluation.protocol import map_over
 from sceneprint_lab.evaluation.sites import SiteAnswer, ask_site, kinds_of
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
-#: Queries of one site when absent scenes are asked by the thousand.
+#: Queries of one site of the kind "absent", which --absent asks by the thousand.
 ABSENT_BLOCK = 100
+#: Columns of the table and the shares in them, by their names in `measures.answers`.
+SHARES = {
+    "found and right": "found_right", "found and wrong": "found_wrong",
+    "wrong of found": "wrong_of_found", "grossly wrong": "grossly_wrong",
+    "at most": "grossly_wrong_at_most", "called strong": "found_strong_wrong",
+    "ambiguous": "ambiguous", "not found": "not_found",
+}  # fmt: skip
 
 
 def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
-    """Shares by kind as lines of Markdown, and over all."""
+    """Return the shares by kind and over all as lines of Markdown."""
     lines = [
-        "| kind | queries | answerable | found and right | found and wrong | wrong of found "
-        "| grossly wrong | at most | called strong | ambiguous | not found | ms |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
+        f"| kind | queries | answerable | {' | '.join(SHARES)} | ms |",
+        f"|---|{'--:|' * (len(SHARES) + 3)}",
     ]
-    kinds = dict.fromkeys(one.kind for one in site_answers)
-    for name, own in [
-        *((k, [t for t in site_answers if t.kind == k]) for k in kinds),
-        ("all", list(site_answers)),
-    ]:
-        f = answers([one.answer for one in own])
-        keys = (
-            "found_right", "found_wrong", "wrong_of_found", "grossly_wrong",
-            "grossly_wrong_at_most", "found_strong_wrong", "ambiguous", "not_found",
-        )  # fmt: skip
-        shares = " | ".join(f"{f[key] or 0.0:.3f}" for key in keys)
+    groups = {one.kind: [two for two in site_answers if two.kind == one.kind]
+              for one in site_answers}  # fmt: skip
+    for name, own in {**groups, "all": list(site_answers)}.items():
+        figures = answers([one.answer for one in own])
+        shares = " | ".join(f"{figures[key] or 0.0:.3f}" for key in SHARES.values())
         able = sum(one.answerable for one in own)
         ms = float(np.median([one.answer.milliseconds for one in own]))
         lines.append(f"| {name} | {len(own)} | {able} | {shares} | {ms:.0f} |")
@@ -59,21 +57,22 @@ def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
 
 def main() -> None:
     """Ask the sites and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.lookalikes", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m sceneprint_lab.cli.lookalike_answers", description=__doc__
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the sites (default: 1)")
     parser.add_argument("--sites", type=int, default=3, help="of each kind (default: 3)")
     parser.add_argument("--first", type=int, default=0, help="index of the first (default: 0)")
     parser.add_argument("--queries", type=int, default=16, help="of each site (default: 16)")
     parser.add_argument(
         "--kinds", nargs="+", choices=[*dict.fromkeys(KINDS + ORDINARY + SURVEYED_KINDS)],
-        help="default: all in which places look alike, or all of a laser's",
+        help="default: all kinds of the model's sensor in which places look alike",
     )  # fmt: skip
-    parser.add_argument(
-        "--absent", type=int, default=0, metavar="N", help="queries of other places"
-    )
+    parser.add_argument("--absent", type=int, default=0, metavar="N",
+                        help="query N frames of other places instead")  # fmt: skip
     parser.add_argument(
         "--prior", nargs=2, type=float, metavar=("LEAST", "MOST"),
-        help="metres that the robot's prior is off, as 0 0.3 or 1.5 4 (default: it has none)",
+        help="error of the robot's prior in metres, as 0 0.3 or 1.5 4 (default: no prior)",
     )  # fmt: skip
     parser.add_argument("--candidates", type=int, default=10, help="size of C (default: 10)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -86,31 +85,23 @@ def main() -> None:
         parser.error(
             f"--kinds {unknown[0]}: for {options.model} choose from {', '.join(supported)}"
         )
-    work = [
-        (kind, index, options.queries)
-        for index in range(options.first, options.first + options.sites)
-        for kind in kinds
-    ]
+    indices = range(options.first, options.first + options.sites)
+    work = [(kind, index, options.queries) for index in indices for kind in kinds]
     if options.absent:
-        blocks = range(-(-options.absent // ABSENT_BLOCK))
         work = [
-            ("absent", options.first + b, min(ABSENT_BLOCK, options.absent - b * ABSENT_BLOCK))
-            for b in blocks
+            ("absent", options.first + i, min(ABSENT_BLOCK, options.absent - i * ABSENT_BLOCK))
+            for i in range(-(-options.absent // ABSENT_BLOCK))
         ]
     start, site_answers = time.monotonic(), []
     prior = None if options.prior is None else (options.prior[0], options.prior[1])
-    do = partial(ask_site, seed=options.seed, candidates=options.candidates, prior=prior)
-    opening = partial(_open, options.model)
-    for of_site in tqdm(map_over(work, do, opening, options.jobs), total=len(work), disable=None):
+    ask = partial(ask_site, seed=options.seed, candidates=options.candidates, prior=prior)
+    answered = map_over(work, ask, partial(open_signer, options.model), options.jobs)
+    for of_site in tqdm(answered, total=len(work), disable=None):
         site_answers += of_site
     print("\n".join(table(site_answers)))
     print(f"seed {options.seed}, {len(work)} sites, {time.monotonic() - start:.0f} s")
     if options.json is not None:
         options.json.write_text(json.dumps([asdict(one) for one in site_answers], indent=1))
-
-
-def _open(model: str) -> Signer:
-    return open_signer(read_model(model))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.lookalikes`: the table by hand, and one small site asked for real."""
+"""Answers at places that look alike, of one small site."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import math
 
 import pytest
 
-from benchmarks.lookalikes import ask_site
 from sceneprint.models import read_model
 from sceneprint.pipeline import Signer, open_signer
 from sceneprint_lab.evaluation import sites
 from sceneprint_lab.evaluation.protocol import Error, JudgedAnswer
-from sceneprint_lab.evaluation.sites import kinds_of
+from sceneprint_lab.evaluation.sites import ask_site, kinds_of
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
