@@ -1,4 +1,4 @@
-"""What signing costs, stage by stage, beside Open3D's FPFH of the same frames in the same run."""
+"""Measure signing stage by stage, beside Open3D's FPFH of the same frames in the same run."""
 
 from __future__ import annotations
 
@@ -22,8 +22,6 @@ from sceneprint.pipeline import Signer, geometry_of, open_signer, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_lab.evaluation.pair_run import FEATURES, NORMALS, VOXEL, Clock, points_of
-
-__all__ = ["Clock", "measure", "open3d", "points_of", "signing_stages"]
 
 
 def signing_stages(frame: DepthFrame, signer: Signer) -> dict[str, float]:
@@ -85,12 +83,8 @@ def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list
     preset : of the model
     warm_up : frames that are also signed before the clock runs
     """
-    signer, note, o3d = open_signer(preset), "", None
+    signer, o3d, note = open_signer(preset), *open3d_or_note()
     p = signer.model.parameters.depth
-    try:
-        o3d = open3d("FPFH")
-    except MissingDependency as error:
-        note = str(error)
     for frame in frames[:warm_up]:
         sign(frame, signer)
         artifact_stages(frame, signer)
@@ -101,43 +95,48 @@ def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list
         if o3d is not None:
             theirs.append(fpfh_stages(points_of(frame, p.minimum_depth, p.maximum_depth), o3d))
     sums, other = [sum(row.values()) for row in ours], [sum(row.values()) for row in theirs]
-    signing = [sum(row.values()) - row["artifact from bytes"] for row, _ in artifacts]
+    whole = np.add(sums, [sum(row.values()) - row["artifact from bytes"] for row, _ in artifacts])
     lines = [
-        f"### Signing, `{preset}`: median of {len(frames)} frames, one thread, warm", "",
-        "| stage | ms |", "|---|--:|", *stage_rows(ours),
+        f"### Signing, `{preset}`: median of {len(frames)} frames, one thread, warm",
+        "",
+        "| stage | ms |",
+        "|---|--:|",
+        *stage_rows(ours),
         f"| **signing, sum** | **{np.median(sums):.1f}** |",
-        *stage_rows([row for row, _ in artifacts]), *stage_rows(theirs),
-    ]  # fmt: skip
+        *stage_rows([row for row, _ in artifacts]),
+        *stage_rows(theirs),
+        f"| FPFH | not measured: {note} |",
+    ]
     if other:
-        whole = np.add(sums, signing)
-        lines += [
+        lines[-1:] = [
             f"| **FPFH, sum** | **{np.median(other):.1f}** |",
             f"| **signing / FPFH** | **{np.median(np.divide(sums, other)):.2f}** |",
             f"| **signing and geometry artifact / FPFH** | "
             f"**{np.median(np.divide(whole, other)):.2f}** |",
         ]
-    else:
-        lines.append(f"| FPFH | not measured: {note} |")
-    size = int(np.median([size for _, size in artifacts]))
-    return [
-        *lines, "",
-        f"Geometry artifact: {size:,} bytes. Peak memory of a process that signs: "
-        f"{_peak_memory(frames, preset):.0f} MB.", "",
-    ]  # fmt: skip
-
-
-def stage_rows(rows: Sequence[Mapping[str, float]], prefix: str = "") -> Iterable[str]:
-    """Yield a row of a table for each stage: its median."""
-    for stage in rows[0] if rows else ():
-        yield f"| {prefix}{stage} | {np.median([row[stage] for row in rows]):.1f} |"
-
-
-def _peak_memory(frames: Sequence[DepthFrame], preset: str) -> float:
-    """Return the peak memory of `sceneprint sign` over ten of the frames, MB."""
     with tempfile.TemporaryDirectory() as folder:
         for i, frame in enumerate(frames[:10]):
             own = Path(folder) / f"{i:02d}"
             own.mkdir()
             write_intrinsics(own, Camera(frame.intrinsics, 1000.0, along_ray=False))
             write_depth_png(own / "frame.png", frame.depth, 1000.0)
-        return peak_megabytes_of_signing(Path(folder), preset)
+        peak = peak_megabytes_of_signing(Path(folder), preset)
+    size = int(np.median([size for _, size in artifacts]))
+    return [
+        *lines, "", f"Geometry artifact: {size:,} bytes. Peak memory of a process that signs: "
+        f"{peak:.0f} MB.", "",
+    ]  # fmt: skip
+
+
+def open3d_or_note() -> tuple[Any, str]:
+    """Return Open3D, or None and the reason why it is missing."""
+    try:
+        return open3d("FPFH"), ""
+    except MissingDependency as error:
+        return None, str(error)
+
+
+def stage_rows(rows: Sequence[Mapping[str, float]], prefix: str = "") -> Iterable[str]:
+    """Yield a row of a table for each stage: its median."""
+    for stage in rows[0] if rows else ():
+        yield f"| {prefix}{stage} | {np.median([row[stage] for row in rows]):.1f} |"

@@ -1,4 +1,4 @@
-"""Maps of many frames at once: rows as workers write them, of signatures from elsewhere."""
+"""Fill maps with many frames at once: rows as workers write them, of given signatures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same query by the library alone, for the service to be compared with."""
+"""Answer queries by the library alone, for comparison with the service."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.encode import Clock
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.localization import PoseEstimate, localize, views_of_rows
@@ -24,13 +23,14 @@ from sceneprint.pipeline import (
 from sceneprint.places import QueryFrame
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer
+from sceneprint_lab.evaluation.pair_run import Clock
 
-#: What a match is compared by: place in the database, and its transform row by row.
+#: Matches for comparison: place in the database, and transform row by row.
 Matches = list[tuple[int, list[list[float]]]]
 
 
 class Library:
-    """A database in memory, asked stage by stage.
+    """A database in memory that is queried stage by stage.
 
     Parameters
     ----------
@@ -61,10 +61,11 @@ class Library:
         geometry = read_geometry(write_geometry(seen))  # as both have it
         matching = partial(associate, geometry, ranking, selection.indices.tolist(), self._geometry)
         matches = clock.run("validate", lambda: matching(pose_of=self._pose))
-        found = clock.run("locate", lambda: self._locate(geometry, matches))
-        known = searched(matches)
-        if known is not None and found is not None and found.status != "found":  # as a service does
-            matches = matching(known=known)
+        estimate = clock.run("locate", lambda: self._locate(geometry, matches))
+        before = searched(matches)
+        # as a service does
+        if before is not None and estimate is not None and estimate.status != "found":
+            matches = matching(known=before)
         return clock.stages, [
             (match.index, match.validation.T_match_query.tolist())
             for match in matches

@@ -1,7 +1,4 @@
-"""Pairs of frames that see much of each other, with the truth about how they lie.
-
-frames with poses  --pairs_among-->  FramePair, ...
-"""
+"""Choose pairs of frames that see much of each other, with their true transforms."""
 
 from __future__ import annotations
 

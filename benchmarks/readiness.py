@@ -103,9 +103,9 @@ def _sign(data: Path, frames: Sequence[FrameReference], n: int) -> float:
 
 def _await_signed(client: Client, signed: int) -> tuple[int, float]:
     """Return how many frames are signed once so many are, and when; a look costs time."""
-    while (found := (client.status().jobs or {}).get("succeeded", 0)) < signed:
+    while (done := (client.status().jobs or {}).get("succeeded", 0)) < signed:
         time.sleep(0.05)
-    return found, time.perf_counter()
+    return done, time.perf_counter()
 
 
 def measure_disk(frames: Sequence[FrameReference]) -> list[str]:

@@ -1,7 +1,7 @@
-"""Two frames to a transform: our validation beside Open3D's FPFH + RANSAC + ICP.
+"""Measure the validation of two frames beside Open3D's FPFH + RANSAC + ICP.
 
-Ours works in both directions, says whether to believe the result, and looks for rivals. Open3D's
-works in one direction and always answers. Features of both frames count, for both.
+Ours works in both directions, accepts or rejects the result, and looks for rivals. Open3D's works
+in one direction and always answers. The features of both frames count, for both.
 """
 
 from __future__ import annotations
@@ -11,16 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.encode import Clock, points_of, stage_rows
+from benchmarks.encode import open3d_or_note, stage_rows
 from benchmarks.pairs import FramePair
-from sceneprint.errors import MissingDependency
-from sceneprint.fusion import open3d
 from sceneprint.geometry.rigid import difference
 from sceneprint.models import Model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats
-from sceneprint_lab.evaluation.pair_run import METHODS, register
+from sceneprint_lab.evaluation.pair_run import METHODS, Clock, points_of, register
 
 #: The one of Open3D's methods that is timed here; `sceneprint evaluate-pairs` has the others.
 METHOD = METHODS[0]
@@ -31,7 +29,7 @@ RIGHT = (0.10, float(np.radians(10.0)))
 def register_by_us(
     query: DepthFrame, match: DepthFrame, model: Model, clock: Clock
 ) -> Floats | None:
-    """Validate two frames: T_match_query (4, 4) where it is accepted, else None."""
+    """Validate two frames; return T_match_query (4, 4) if it is accepted."""
     of_query, of_match = clock.run(
         "geometry of both frames",
         lambda: [geometry_of(see(frame, model.parameters), model) for frame in (query, match)],
@@ -57,11 +55,7 @@ def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> list[
     model : with the parameters of our validation
     warm_up : pairs that are also validated before the clock runs
     """
-    p, note, o3d = model.parameters.depth, "", None
-    try:
-        o3d = open3d("FPFH")
-    except MissingDependency as error:
-        note = str(error)
+    p, (o3d, note) = model.parameters.depth, open3d_or_note()
     for pair in pairs[:warm_up]:
         register_by_us(pair.query, pair.match, model, Clock())
     ours: list[dict[str, float]] = []

@@ -1,4 +1,4 @@
-"""What an exact scan of stored signatures costs, beside a plain read of the same bytes."""
+"""Measure an exact scan of stored signatures beside a plain read of the same bytes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.encode import Clock
 from sceneprint.geometry.retrieval.ranking import cross_distances, distances
+from sceneprint_lab.evaluation.pair_run import Clock
 
 #: Queries that share one pass over the database.
 TOGETHER = 8

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.encode import Clock
 from sceneprint.index import Generation, Tail, publish, search
 from sceneprint.models import PRESETS, read_model
 from sceneprint.types import Bytes
+from sceneprint_lab.evaluation.pair_run import Clock
 
-#: Hits that are asked for: the longest ranking.
+#: Hits of a search: the longest ranking.
 SIZE = 200
 #: Frames of a place, and of a block.
 PLACE, BLOCK = 50, 1 << 16
@@ -63,8 +63,8 @@ def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
         centre = rng.normal(size=length)
         rows[own] = centre + 0.7 * rng.normal(size=(PLACE, length))[frame[own]]
     rows *= 26.0 * length**0.5 / np.linalg.norm(rows, axis=1, keepdims=True)
-    found: Bytes = (np.clip(np.rint(rows), -127, 127) + 128).astype(np.uint8)
-    return found
+    quantised: Bytes = (np.clip(np.rint(rows), -127, 127) + 128).astype(np.uint8)
+    return quantised
 
 
 def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
@@ -78,7 +78,7 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
     """
     length = read_model(PRESETS[0]).signature_bytes
     tail = Tail.empty(length)
-    # of places that the map has, but of frames that it has not
+    # of mapped places, but of frames that are not in the map
     seen = (np.arange(runs + 1) * max(frames // (runs + 1), 1)) // PLACE * PLACE
     queries = signatures(seen, length)
 
@@ -90,13 +90,13 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
                 yield keys, signatures(keys, length)
 
     def published(folder: Path, previous: Generation | None, first: int, last: int) -> Generation:
-        made = publish(
+        generation = publish(
             folder, model_id="bench", revision=last, blocks=blocks(first, last), previous=previous,
             flat_bytes=flat_bytes,
         )  # fmt: skip
-        if made is None:
-            raise RuntimeError(f"{folder} is being built in")
-        return made
+        if generation is None:
+            raise RuntimeError(f"another process publishes in {folder}")
+        return generation
 
     whole = Clock()
     with tempfile.TemporaryDirectory() as name:

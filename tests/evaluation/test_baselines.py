@@ -65,15 +65,6 @@ def test_the_rings_of_five_points_by_hand() -> None:
     assert found[12, 30] == np.float32(5.0)
 
 
-def test_another_axis_may_point_up() -> None:
-    points = walls(1)
-    for pole in (0, 1):  # z, x, y onto pole, next, after
-        moved = np.empty_like(points)
-        for k, axis in ((0, pole), (1, (pole + 1) % 3), (2, (pole + 2) % 3)):
-            moved[:, axis] = points[:, (2 + k) % 3]
-        np.testing.assert_array_equal(ring_descriptor(moved, pole=pole), ring_descriptor(points))
-
-
 def test_turning_by_sectors_shifts_the_columns() -> None:
     points = walls(2)
     own, other = ring_descriptor(points), ring_descriptor(turned(points, 7))

@@ -1,4 +1,4 @@
-"""`sceneprint demo`: the main job, start to end, through a service of its own."""
+"""Run the main job from start to end, through a service: `sceneprint demo`."""
 
 from __future__ import annotations
 
@@ -42,13 +42,11 @@ from sceneprint.settings import Settings
 from sceneprint.signing import see
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import Added, Answer, JobState
-from sceneprint_lab.evaluation.report import FramePlace, answer_rows, judge_answers
-
-# The demo's building: rooms walked through once, some frames for the map and some to look up.
+from sceneprint_lab.evaluation.report import FramePlace, answer_rows, decimal, judge_answers
 
 SEED = 11
-#: Frames of a walk, 3 to 8 cm apart. Of every ten, those of the map and those that are looked up,
-#: which are 10 to 30 cm away from any of the map.
+#: Frames of a walk through a room of the building, 3 to 8 cm apart. Of every ten, those of the map
+#: and those of the queries, which are 10 to 30 cm away from any of the map.
 WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7,)
 DEPTH_SCALE = 1000.0
 
@@ -63,7 +61,7 @@ def write_building(folder: Path, rooms: int) -> Generator[None]:
     """
     write = partial(_write_room, folder)
     jobs = min(os.cpu_count() or 1, rooms)
-    if jobs == 1:  # a process of its own would import all anew
+    if jobs == 1:  # a process of its own would import all modules again
         yield from map(write, range(rooms))
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
@@ -88,10 +86,6 @@ def _write_room(folder: Path, number: int) -> None:
             write_depth_png(run / f"frame-{i:06d}.depth.png", depth, DEPTH_SCALE)
             write_pose(run / f"frame-{i:06d}.pose.txt", pose)
 
-
-# Which frames of a data set the demo keeps as its map, and which it looks up.
-#
-# path  --choose_frames-->  Choice
 
 #: Without split files: shares of each sequence that are the map, and that separate it.
 DATABASE_SHARE, GAP_SHARE = 0.60, 0.05
@@ -129,18 +123,15 @@ def choose_frames(path: Path) -> Choice:
     """
     database: list[DemoFrame] = []
     queries: list[DemoFrame] = []
-    found = find_sequences(path)
-    split = any(sequence.split for sequence in found)
-    for sequence in found:
-        frames = [
-            DemoFrame(sequence.parent_frame, sequence.name, reference)
-            for reference in sequence.frames
-        ]
+    sequences = find_sequences(path)
+    split = any(sequence.split for sequence in sequences)
+    for one in sequences:
+        frames = [DemoFrame(one.parent_frame, one.name, reference) for reference in one.frames]
+        n = len(frames)
         if split:
-            database += frames if sequence.split == "train" else []
-            queries += frames if sequence.split == "test" else []
+            database += frames if one.split == "train" else []
+            queries += frames if one.split == "test" else []
         else:
-            n = len(frames)
             database += frames[: round(DATABASE_SHARE * n)]
             queries += frames[round((DATABASE_SHARE + GAP_SHARE) * n) :]
     if not database or not queries:
@@ -190,10 +181,10 @@ def run_demo(options: argparse.Namespace) -> int:
         (folder / "data").mkdir()
         with serving(folder / "data", options.workers) as url, Client(url) as client:
             print(f"service: {url}, empty data folder, {options.workers} worker processes")
-            known = fill(client, options.model, choice)
-            asked = run_queries(client, choice)
-        report(known, asked)
-        draw(known, asked, options.model, options.out)
+            indexed = fill(client, options.model, choice)
+            queries = run_queries(client, choice)
+        report(indexed, queries)
+        draw(indexed, queries, options.model, options.out)
     print(f"whole demo: {time.perf_counter() - begun:.1f} s")
     print(
         "next: `sceneprint serve`; then, in another terminal, `sceneprint upload MAP PATH` and "
@@ -204,22 +195,19 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 def _building(folder: Path, rooms: int) -> Path:
-
     start = time.perf_counter()
-    # closed before the folder is removed, however this ends: its processes write there
-    with closing(write_building(folder, rooms)) as made:
-        for _ in tqdm(made, total=rooms, desc="synthetic building", unit="room", disable=None):
+    # closed before the folder is removed, as its processes write there
+    with closing(write_building(folder, rooms)) as written:
+        for _ in tqdm(written, total=rooms, desc="synthetic building", unit="room", disable=None):
             pass
     print(f"synthetic building: {rooms} rooms in {time.perf_counter() - start:.1f} s")
     return folder
 
 
-# The demo's map, filled and asked over HTTP.
-
 DEMO_MAP = "demo"
 #: Uploads in flight.
 PARALLEL = 4
-#: What is wrong with one frame, and says nothing of the next.
+#: Errors of a single frame, after which the demo continues.
 _OF_FRAME = (FrameError, FrameConflict)
 
 
@@ -238,7 +226,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
     Returns
     -------
-    known : the frames that are indexed, by their ids
+    indexed : the frames that are indexed, by their ids
 
     Raises
     ------
@@ -246,7 +234,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
     ServiceError : some were not signed in time.
     """
     client.create_map(DEMO_MAP, model=model)
-    known: dict[str, DemoFrame] = {}
+    indexed: dict[str, DemoFrame] = {}
     jobs = []
     start = time.perf_counter()
     pool = ThreadPoolExecutor(PARALLEL)
@@ -258,9 +246,9 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
             except _OF_FRAME as error:
                 tqdm.write(f"skipped: {one.reference.name}: {error}")
                 continue
-            known[added.frame_id] = one
+            indexed[added.frame_id] = one
             jobs.append(added.job_id)
-    finally:  # where something ends it, what is not in flight is not begun
+    finally:  # after an error, uploads that are not in flight are not begun
         pool.shutdown(cancel_futures=True)
     with tqdm(total=len(jobs), desc="sign", unit="frame", disable=None) as bar:
 
@@ -269,29 +257,29 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
         done = client.wait(jobs, progress=progress)
     late = sum(not job.state.over for job in done)
-    if late:  # they would be found later, and be of no frame that is known
+    if late:  # queries would find them, and their poses would be unknown
         raise ServiceError(
             f"{late} of {len(done)} map frames were not signed in time. Run the demo with more "
             "--workers or a shorter --dataset."
         )
     for job in done:
-        if job.state != JobState.SUCCEEDED and job.frame_id in known:
-            print(f"skipped: {known.pop(job.frame_id).reference.name}: {job.error}")
-    if not known:
+        if job.state != JobState.SUCCEEDED and job.frame_id in indexed:
+            print(f"skipped: {indexed.pop(job.frame_id).reference.name}: {job.error}")
+    if not indexed:
         raise DatasetError("No map frame could be signed. The lines above give the reasons.")
     seconds = time.perf_counter() - start
     print(
-        f"map: {len(known)} of {len(choice.database)} frames uploaded, signed and indexed in "
-        f"{seconds:.1f} s, {len(known) / seconds:.1f} a second"
+        f"map: {len(indexed)} of {len(choice.database)} frames uploaded, signed and indexed in "
+        f"{seconds:.1f} s, {len(indexed) / seconds:.1f} a second"
     )
-    return known
+    return indexed
 
 
 def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
     """Query every frame, without and with diversification."""
-    asked, begun = [], time.perf_counter()
+    answered, begun = [], time.perf_counter()
     for one in tqdm(choice.queries, desc="query", unit="frame", disable=None):
-        meta = meta_of(one.reference, with_pose=False)  # a lost robot knows none
+        meta = meta_of(one.reference, with_pose=False)  # a lost robot has none
         path = one.reference.path
         try:
             # all that are validated, as `sceneprint evaluate` does
@@ -303,17 +291,15 @@ def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
         except FrameError as error:
             tqdm.write(f"skipped: {one.reference.name}: {error}")
             continue
-        asked.append(DemoQuery(one, ranked, diverse, time.perf_counter() - start))
-    print(f"asked: {2 * len(asked)} queries over HTTP in {time.perf_counter() - begun:.1f} s")
-    return asked
+        answered.append(DemoQuery(one, ranked, diverse, time.perf_counter() - start))
+    print(f"asked: {2 * len(answered)} queries over HTTP in {time.perf_counter() - begun:.1f} s")
+    return answered
 
 
 def _upload(client: Client, one: DemoFrame) -> Added:
     meta = meta_of(one.reference, session=one.session, parent_frame=one.parent)
     return client.upload(DEMO_MAP, one.reference.path, meta)
 
-
-# What the demo found: the paper's rows with true pose errors, and a picture.
 
 _NAMES = {
     "R": "R    nearest frame",
@@ -324,68 +310,67 @@ _NAMES = {
 }
 
 
-def report(known: Mapping[str, DemoFrame], asked: Sequence[DemoQuery]) -> None:
-    """Print the table, where true poses are known, and what a query took."""
-    counts = Counter(one.diverse.status for one in asked)
+def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> None:
+    """Print the table, if true poses are known, and the time of a query."""
+    counts = Counter(one.diverse.status for one in queries)
     states = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-    print(f"queries: {len(asked)}: {states or 'none could be sent'}")
-    truths = [(one, place_of(one.chosen)) for one in asked]
-    places = {key: place_of(one) for key, one in known.items()}
-    posed = {key: place for key, place in places.items() if place is not None}
-    if len(posed) == len(places) and asked and all(truth for _, truth in truths):
-        rows = answer_rows(
-            [judge_answers(t, one.ranked, one.diverse, posed) for one, t in truths if t is not None]
-        )
-        print(*table(rows), sep="\n")
+    print(f"queries: {len(queries)}: {states or 'none could be sent'}")
+    truths = [(one, place_of(one.chosen)) for one in queries]
+    places = {key: place for key, one in indexed.items() if (place := place_of(one)) is not None}
+    judged = [judge_answers(t, one.ranked, one.diverse, places) for one, t in truths
+              if t is not None and len(places) == len(indexed)]  # fmt: skip
+    if judged and len(judged) == len(queries):
+        print(*table(answer_rows(judged)), sep="\n")
     else:
         print("no table: it needs the true pose of every frame")
-    if asked:
-        stages = asked[0].diverse.milliseconds
+    if queries:
         medians = [
-            f"{stage} {statistics.median(one.diverse.milliseconds[stage] for one in asked):.0f}"
-            for stage in stages
+            f"{stage} {statistics.median(one.diverse.milliseconds[stage] for one in queries):.0f}"
+            for stage in queries[0].diverse.milliseconds
             if stage != "total"
         ]
-        whole = 1e3 * statistics.median(one.seconds for one in asked)
+        whole = 1e3 * statistics.median(one.seconds for one in queries)
         print(f"a query over HTTP: {whole:.0f} ms (median; {', '.join(medians)})")
 
 
 def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the rows as lines to read; figures as `answer_rows` gives them."""
+    """Return the rows as lines to read; figures as `answer_rows` returns them."""
     lines = [
         f"{'first answer within':26}{'5cm/5deg':>10}{'10cm/10deg':>12}{'median cm':>11}{'deg':>7}"
         f"{'first five: m from the query':>32}"
     ]
     for row, name in _NAMES.items():
         figures = rows[row]
-        metres, degrees = figures["median_translation_m"], figures["median_rotation_deg"]
-        line = f"{name:26}{_share(figures['within_5cm_5deg']):>10}"
-        line += f"{_share(figures['within_10cm_10deg']):>12}"
-        line += f"{'-' if metres is None else f'{100 * metres:.1f}':>11}"
-        line += f"{'-' if degrees is None else f'{degrees:.2f}':>7}"
-        if figures["spread_mean_m"] is not None:
-            spread = f"{figures['spread_mean_m']:.2f} +- {figures['spread_std_m']:.2f}"
-            line += f"{spread:>32}"
+        metres, spread = figures["median_translation_m"], figures["spread_mean_m"]
+        line = (
+            f"{name:26}{decimal(figures['within_5cm_5deg']):>10}"
+            f"{decimal(figures['within_10cm_10deg']):>12}"
+            f"{decimal(metres if metres is None else 100 * metres, 1):>11}"
+            f"{decimal(figures['median_rotation_deg'], 2):>7}"
+        )
+        if spread is not None:
+            both = f"{spread:.2f} +- {figures['spread_std_m']:.2f}"
+            line += f"{both:>32}"
         lines.append(line)
     return lines
 
 
 def draw(
-    known: Mapping[str, DemoFrame], asked: Sequence[DemoQuery], preset: str, out: Path
+    indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery], preset: str, out: Path
 ) -> None:
-    """Draw the accepted match that turns the query most, as there alignment shows best."""
-    found = [
+    """Draw the accepted match that turns the query most: it shows alignment best."""
+    accepted = [
         (one, match, np.array(match.transform.matrix))
-        for one in asked
+        for one in queries
         for match in one.diverse.matches[:1]
         if match.validation.status == "accepted" and match.transform is not None
     ]
-    if not found:
+    if not accepted:
         print("no picture: no match was accepted")
         return
-    one, match, transform = min(found, key=lambda each: each[2][:3, :3].trace())
+    one, match, transform = min(accepted, key=lambda each: each[2][:3, :3].trace())
     parameters = read_model(preset).parameters
-    query, database = one.chosen.reference, known[match.frame_id].reference
+    query, database = one.chosen.reference, indexed[match.frame_id].reference
     title = f"{query.name} in {database.name}: {match.validation.overlap:.0%} of the surfaces agree"
     picture = overlay_picture(
         see(query.read(), parameters), see(database.read(), parameters), transform,
@@ -396,16 +381,10 @@ def draw(
 
 
 def place_of(one: DemoFrame) -> FramePlace | None:
-    """Return where a frame was taken, where that is known."""
+    """Return where a frame was taken, or None if that is unknown."""
     pose = one.reference.pose
     return None if pose is None else FramePlace(one.parent, pose)
 
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-# A service of one's own for as long as it is needed, in processes of its own.
 
 #: Seconds that the service may take to start, on a machine that compiles first, and to stop.
 START_S, STOP_S = 120.0, 30.0
@@ -414,11 +393,11 @@ _READY = "sceneprint: serving "
 
 @contextmanager
 def serving(data: Path, workers: int) -> Iterator[str]:
-    """Run `sceneprint serve` on a free loopback port; it is gone when this ends.
+    """Run `sceneprint serve` on a free loopback port until the context ends.
 
     Parameters
     ----------
-    data : folder for database and blobs; its log goes there too
+    data : folder for database, blobs and log
     workers : processes that sign
 
     Yields
@@ -427,7 +406,7 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 
     Raises
     ------
-    Unreachable : it did not start; says what it said.
+    Unreachable : it did not start; with the end of its log.
     """
     log = data / "service.log"
     arguments = ["--port", "0", "--data", str(data), "--workers", str(workers)]
@@ -458,23 +437,23 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 
 
 def _first_line(pipe: IO[bytes]) -> str:
-    """Return the first line; what there is of it where the other end is closed.
+    """Return the first line, or its beginning if the other end is closed.
 
     Raises
     ------
     Unreachable : none came in time.
     """
-    got, until = b"", time.monotonic() + START_S
+    data, until = b"", time.monotonic() + START_S
     with DefaultSelector() as selector:
         selector.register(pipe, EVENT_READ)
-        while b"\n" not in got:
+        while b"\n" not in data:
             if not selector.select(max(until - time.monotonic(), 0.0)):
                 raise Unreachable(
                     f"The service did not start within {START_S:g} s. "
                     "Run `sceneprint doctor` to see what is missing, or try again."
                 )
-            more = os.read(pipe.fileno(), 4096)  # what is there: never waits for a whole line
+            more = os.read(pipe.fileno(), 4096)  # it does not wait for a whole line
             if not more:
                 break
-            got += more
-    return got.partition(b"\n")[0].decode(errors="replace")
+            data += more
+    return data.partition(b"\n")[0].decode(errors="replace")

@@ -1,4 +1,4 @@
-"""`sceneprint evaluate`: how well frames are found again, by their true poses."""
+"""Measure how well frames are found again and registered: `evaluate`, `evaluate-pairs`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from sceneprint.settings import Settings
 from sceneprint_client.sidecars import Camera
 
 if TYPE_CHECKING:
-    from sceneprint.models import Model
     from sceneprint_lab.evaluation.protocol import EvaluationProtocol
 
 T = TypeVar("T")
@@ -156,8 +155,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
     protocol = _protocol(options)
     baselines = _baselines(options.baselines)
-    own = Settings()
-    signer = open_for(options, own, psi=options.signature == "psi")
+    signer = open_for(options, Settings(), psi=options.signature == "psi")
     if options.levels is not None and signer.model.whitening is not None:
         raise DatasetError(
             f"--levels {options.levels}: the signatures of model {signer.model.label} cannot be "
@@ -168,39 +166,64 @@ def run_evaluate(options: argparse.Namespace) -> int:
             f"--levels {options.levels}: model {signer.model.label} has {most} levels. "
             f"Choose from 1 to {most}."
         )
-    _make_room(options.json)
+    _check_writable(options.json)
+    keys = (
+        "metric", "levels", "mode", "matching", "candidates", "max_overlap", "absent", "gap_m",
+        "seed", "jobs",
+    )  # fmt: skip
     settings = EvaluationSettings(
-        metric=options.metric, levels=options.levels, mode=options.mode, matching=options.matching,
-        candidates=options.candidates, max_overlap=options.max_overlap, absent=options.absent,
-        gap_m=options.gap_m, within_m=options.within, baselines=baselines, seed=options.seed,
-        jobs=options.jobs, cache_dir=own.cache_dir,
+        **{key: getattr(options, key) for key in keys}, within_m=options.within,
+        baselines=baselines, cache_dir=Settings().cache_dir,
     )  # fmt: skip
     with TemporaryDirectory(prefix="sceneprint-") as folder:
         store = FrameStore(Path(folder))
         evaluation = evaluate(protocol, signer, store, settings, _watch)
         database = evaluation.prepared.database
-        found = figures(
-            evaluation,
-            lambda match: store.frame(database[match]),
-            _settings_of(options, signer.model),
-        )
+        written = _settings_of(
+            options, signer.model.id, "paths", "db", "queries", "db_step", "query_step",
+            "max_overlap", "absent", "gap_m", "within", "baselines", "signature", "metric",
+            "levels", "mode", "matching", "candidates", "seed", "seven_scenes", "distractors",
+        )  # fmt: skip
+        written["metric"] = options.metric or signer.model.metric
+        found = figures(evaluation, lambda match: store.frame(database[match]), written)
         if options.json is not None:
             write_whole(options.json, to_json(found))
-        print(f"model {signer.model.label}: {_counts(found)}")
+        counts = found["counts"]
+        print(
+            f"model {signer.model.label}: {counts['queries']} queries, {counts['database']} "
+            f"database frames{_skipped(counts['left_out'])}"
+        )
         print("\n".join(table(found)))
         if options.seven_scenes is not None:
             print("\n".join(["", *seven_scenes_table(found, evaluation.outcomes[0].scene)]))
     return 0
 
 
-def _make_room(file: Path | None) -> None:
-    """Make the folder of a file that is to be written, if any, and check that it can be.
+def _check_writable(file: Path | None) -> None:
+    """Create the folder of the figures, and check that they can be written.
 
     A file that cannot be written must not cost the work of an hour.
     """
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         check_writable(file)
+
+
+def _settings_of(options: argparse.Namespace, model_id: str, *keys: str) -> dict[str, Any]:
+    """Return some options with versions: everything that is needed to repeat the evaluation."""
+    from sceneprint import __version__
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Path):
+            return str(value)
+        return [plain(one) for one in value] if isinstance(value, list) else value
+
+    own = {key: plain(getattr(options, key)) for key in keys}
+    return {"version": __version__, "model_id": model_id, **own}
+
+
+def _skipped(number: int) -> str:
+    return f", {number} frames skipped" if number else ""
 
 
 def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
@@ -222,8 +245,8 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
     ranged = [part for part in parts if part.database is None and part.queries is None]
     elsewhere = options.distractors or any(part.database for part in parts)
     if any(both) and not all(both) and not (both[1] and elsewhere):
-        given, missing = ("--db", "--queries") if both[0] else ("--queries", "--db")
-        raise DatasetError(f"{given} needs {missing}. Give both or neither.")
+        one, other = ("--db", "--queries") if both[0] else ("--queries", "--db")
+        raise DatasetError(f"{one} needs {other}. Give both or neither.")
     if any(both) and not ranged:
         raise DatasetError(
             "--db and --queries apply only to a PATH without its own ranges, and every PATH has "
@@ -241,11 +264,11 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
     """Return the folders of the scenes; name missing ones on standard error."""
     from sceneprint_lab.evaluation.report import PAPER
 
-    for given, name in (
+    for value, name in (
         (options.paths, "PATH"), (options.db, "--db"), (options.queries, "--queries"),
         (options.distractors, "--distractors"), (options.gap_m, "--gap-m"),
     ):  # fmt: skip
-        if given:
+        if value:
             raise DatasetError(
                 f"--7scenes takes database and queries from the splits of its scenes. Leave {name} "
                 "out, or name the scenes as PATHs."
@@ -266,53 +289,22 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
 
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
-    """Return the baselines to ask, in the order of BASELINES."""
+    """Return the baselines to use, in the order of BASELINES."""
     from sceneprint_lab.evaluation.baselines import BASELINES
 
-    if names is None:
-        return ()
-    unknown = [name for name in names if name not in BASELINES]
-    if unknown:
+    if unknown := [name for name in names or () if name not in BASELINES]:
         raise DatasetError(
             f"--baselines {unknown[0]}: no such baseline. Choose from {', '.join(BASELINES)}; "
             "put the PATHs first."
         )
-    return tuple(name for name in BASELINES if name in names or not names)
-
-
-def _settings_of(options: argparse.Namespace, model: Model) -> dict[str, Any]:
-    """Return everything that is needed to repeat the evaluation."""
-    from sceneprint import __version__
-
-    keys = (
-        "paths", "db", "queries", "db_step", "query_step", "max_overlap", "absent", "gap_m",
-        "within", "baselines", "signature", "metric", "levels", "mode", "matching", "candidates",
-        "seed",
-    )  # fmt: skip
-    asked = {key: getattr(options, key) for key in keys}
-    asked["metric"] = options.metric or model.metric
-    return {
-        "version": __version__,
-        "model_id": model.id,
-        **asked,
-        "seven_scenes": None if options.seven_scenes is None else str(options.seven_scenes),
-        "distractors": [str(path) for path in options.distractors],
-    }
-
-
-def _counts(found: dict[str, Any]) -> str:
-    counts = found["counts"]
-    left_out = f", {counts['left_out']} frames skipped" if counts["left_out"] else ""
-    return f"{counts['queries']} queries, {counts['database']} database frames{left_out}"
+    return () if names is None else tuple(one for one in BASELINES if one in names or not names)
 
 
 def _watch(items: Iterable[T], stage: str, total: int) -> Iterable[T]:
     return tqdm(items, desc=stage, total=total, disable=None)
 
 
-# `sceneprint evaluate-pairs`: how well two frames are registered, and rightly believed.
-
-#: Frames of a scene at the most: overlap is of all with all.
+#: Most frames of a scene, as the overlap of all with all is computed.
 _MOST = 2000
 _PAIR_EXAMPLES = """\
 pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes are
@@ -387,46 +379,32 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
     from sceneprint_lab.evaluation.protocol import FrameStore
     from sceneprint_lab.evaluation.report import to_json
 
-    own = Settings()
-    _make_room(options.json)
-    signer = open_for(options, own)
+    _check_writable(options.json)
+    signer = open_for(options, Settings())
+    keys = ("frames", "mode", "matching", "seed", "baselines", "jobs")
     settings = PairSettings(
-        drawing=Drawing(options.pairs, options.negatives, options.apart, options.seed),
-        frames=options.frames, mode=options.mode, matching=options.matching, seed=options.seed,
-        limits=(options.right[0], options.right[1]), baselines=options.baselines, jobs=options.jobs,
-        cache_dir=own.cache_dir,
+        Drawing(options.pairs, options.negatives, options.apart, options.seed),
+        **{key: getattr(options, key) for key in keys}, limits=tuple(options.right),
+        cache_dir=Settings().cache_dir,
     )  # fmt: skip
     with TemporaryDirectory(prefix="sceneprint-") as folder:
         store = FrameStore(Path(folder))
         evaluation = evaluate_pairs(options.paths, signer, store, settings, _watch)
-        found = pair_figures(evaluation, _pair_settings(options, signer.model.id))
+        written = _settings_of(
+            options, signer.model.id, "paths", "pairs", "negatives", "apart", "frames", "seed",
+            "mode", "matching", "right", "baselines",
+        )  # fmt: skip
+        found = pair_figures(evaluation, written)
         if options.json is not None:
             write_whole(options.json, to_json(found))
-        print(f"model {signer.model.label}: {_pair_counts(found)}")
+        counts = found["counts"]
+        frames = ", ".join(
+            f"{n} frames of {scene} ({counts['planar'][scene]} planar)"
+            for scene, n in counts["frames"].items()
+        )
+        print(
+            f"model {signer.model.label}: {counts['pairs']} pairs of {frames}"
+            f"{_skipped(counts['left_out'])}"
+        )
         print("\n".join(pair_table(found)))
     return 0
-
-
-def _pair_settings(options: argparse.Namespace, model_id: str) -> dict[str, Any]:
-    """Return everything that is needed to repeat the evaluation."""
-    from sceneprint import __version__
-
-    keys = (
-        "pairs", "negatives", "apart", "frames", "seed", "mode", "matching", "right", "baselines",
-    )  # fmt: skip
-    return {
-        "version": __version__,
-        "model_id": model_id,
-        "paths": [str(path) for path in options.paths],
-        **{key: getattr(options, key) for key in keys},
-    }
-
-
-def _pair_counts(found: dict[str, Any]) -> str:
-    counts = found["counts"]
-    frames = ", ".join(
-        f"{n} frames of {scene} ({counts['planar'][scene]} planar)"
-        for scene, n in counts["frames"].items()
-    )
-    left_out = f", {counts['left_out']} frames skipped" if counts["left_out"] else ""
-    return f"{counts['pairs']} pairs of {frames}{left_out}"

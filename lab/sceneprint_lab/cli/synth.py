@@ -17,7 +17,7 @@ from sceneprint.cli import positive, whole_number
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.formats.export import write_ply
-from sceneprint.types import AnyFrame, Cloud, DepthFrame
+from sceneprint.types import AnyFrame, Cloud
 
 if TYPE_CHECKING:
     from sceneprint_lab.synth import LookalikeSite
@@ -99,100 +99,75 @@ def run_synth(options: argparse.Namespace) -> int:
     with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:
         for _ in _rooms(options):
             bar.update()
-    made = "sites" if options.lookalikes or options.sensor == "lidar" else "rooms"
+    scenes = "sites" if options.lookalikes or options.sensor == "lidar" else "rooms"
     views = "queries" if options.lookalikes else "views"
-    print(f"{options.rooms} {made} of {options.views} {views} in {options.out}")
+    print(f"{options.rooms} {scenes} of {options.views} {views} in {options.out}")
     return 0
 
 
 def _rooms(options: argparse.Namespace) -> Iterator[None]:
-    where = options.out, options.seed, options.views
-    make: Callable[[int], None]
+    where = options.out, options.seed, options.views, options.sensor == "lidar", options.perfect
+    write: Callable[[int], None] = partial(_write_room, *where, options.path)
     if options.lookalikes:
-        look = _write_lookalike_survey if options.sensor == "lidar" else _write_lookalike
-        make = partial(look, *where, kind=options.lookalikes, perfect=options.perfect)
-    else:
-        write = _write_site if options.sensor == "lidar" else _write_room
-        make = partial(write, *where, along_path=options.path, perfect=options.perfect)
+        write = partial(_write_lookalike, *where, options.lookalikes)
     jobs = min(options.jobs, options.rooms)
-    if jobs == 1:  # a process of its own would import all anew
-        yield from map(make, range(options.rooms))
+    if jobs == 1:  # a process of its own would import all modules again
+        yield from map(write, range(options.rooms))
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(make, range(options.rooms))
+        yield from pool.map(write, range(options.rooms))
 
 
 def _write_room(
-    out: Path, seed: int, views: int, index: int, *, along_path: bool, perfect: bool
+    out: Path, seed: int, views: int, lidar: bool, perfect: bool, along_path: bool, index: int
 ) -> None:
-    from sceneprint_lab.synth import KinectNoise, synthesise_room
+    from sceneprint_lab.synth import KinectNoise, synthesise_room, synthesise_survey
 
+    if lidar:
+        survey = synthesise_survey(seed, index, views, along_path=along_path, perfect=perfect)
+        _write_sequence(out / survey.name, survey.clouds)
+        return
     noise = None if perfect else KinectNoise()
     room = synthesise_room(seed, index, views, along_path=along_path, noise=noise)
-    folder = out / room.name
-    _write_sequence(folder / "seq-01", room.frames)
-    write_intrinsics(folder, Camera(room.frames[0].intrinsics, DEPTH_SCALE, along_ray=False))
-
-
-def _write_sequence(sequence: Path, frames: Sequence[DepthFrame]) -> None:
-    sequence.mkdir(parents=True)
-    for number, frame in enumerate(frames):
-        write_depth_png(sequence / f"frame-{number:06d}.depth.png", frame.depth, DEPTH_SCALE)
-        if frame.pose is not None:
-            write_pose(sequence / f"frame-{number:06d}.pose.txt", frame.pose)
+    _write_sequence(out / room.name / "seq-01", room.frames)
 
 
 def _write_lookalike(
-    out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
+    out: Path, seed: int, queries: int, lidar: bool, perfect: bool, kind: str, index: int
 ) -> None:
     """Write a scene of two sequences, or two scenes if the map lacks the queries' place."""
-    from sceneprint_lab.synth import KinectNoise, synthesise_lookalike
+    from sceneprint_lab.synth import (
+        KinectNoise,
+        synthesise_lookalike,
+        synthesise_lookalike_survey,
+    )
 
     noise = None if perfect else KinectNoise()
-    site = synthesise_lookalike(kind, seed, index, queries=queries, noise=noise)
-    of_map, of_queries = _split_scenes(out, site)
+    site: LookalikeSite[AnyFrame] = (
+        synthesise_lookalike_survey(kind, seed, index, queries=queries, perfect=perfect)
+        if lidar
+        else synthesise_lookalike(kind, seed, index, queries=queries, noise=noise)
+    )
+    of_map = out / site.name
+    of_queries = of_map if site.same_frame else out / f"{site.name}-elsewhere"
     _write_sequence(of_map / "seq-01", site.map)
     _write_sequence(of_queries / "seq-02", site.queries)
-    for folder in {of_map, of_queries}:
-        write_intrinsics(folder, Camera(site.map[0].intrinsics, DEPTH_SCALE, along_ray=False))
-
-
-def _write_lookalike_survey(
-    out: Path, seed: int, queries: int, index: int, *, kind: str, perfect: bool
-) -> None:
-    """Write a site as `_write_lookalike`, of scans."""
-    from sceneprint_lab.synth import synthesise_lookalike_survey
-
-    site = synthesise_lookalike_survey(kind, seed, index, queries=queries, perfect=perfect)
-    of_map, of_queries = _split_scenes(out, site)
-    _write_scans(of_map / "seq-01", site.map)
-    _write_scans(of_queries / "seq-02", site.queries)
-
-
-def _split_scenes(out: Path, site: LookalikeSite[AnyFrame]) -> tuple[Path, Path]:
-    """Create the scenes of a site's map and of its queries, with the files of their splits."""
-    of_map = of_queries = out / site.name
-    if not site.same_frame:
-        of_queries = out / f"{site.name}-elsewhere"
-    for folder in (of_map, of_queries):
-        folder.mkdir(parents=True, exist_ok=True)
     (of_map / "TrainSplit.txt").write_text("sequence1\n")
     (of_queries / "TestSplit.txt").write_text("sequence2\n")
-    return of_map, of_queries
 
 
-def _write_site(
-    out: Path, seed: int, views: int, index: int, *, along_path: bool, perfect: bool
-) -> None:
-    from sceneprint_lab.synth import synthesise_survey
-
-    survey = synthesise_survey(seed, index, views, along_path=along_path, perfect=perfect)
-    _write_scans(out / survey.name, survey.clouds)
-
-
-def _write_scans(folder: Path, clouds: Sequence[Cloud]) -> None:
+def _write_sequence(folder: Path, frames: Sequence[AnyFrame]) -> None:
+    """Write scans with their poses, or depth images with those and the camera of the scene."""
     folder.mkdir(parents=True)
-    for number, cloud in enumerate(clouds):
-        (folder / f"scan-{number:06d}.ply").write_bytes(write_ply(cloud.points))
-        if cloud.pose is not None:
-            write_pose(folder / f"scan-{number:06d}.pose.txt", cloud.pose)
+    for number, frame in enumerate(frames):
+        if isinstance(frame, Cloud):
+            name = f"scan-{number:06d}"
+            (folder / f"{name}.ply").write_bytes(write_ply(frame.points))
+        else:
+            name = f"frame-{number:06d}"
+            write_depth_png(folder / f"{name}.depth.png", frame.depth, DEPTH_SCALE)
+            if number == 0:
+                camera = Camera(frame.intrinsics, DEPTH_SCALE, along_ray=False)
+                write_intrinsics(folder.parent, camera)
+        if frame.pose is not None:
+            write_pose(folder / f"{name}.pose.txt", frame.pose)

@@ -1,27 +1,14 @@
-"""Other ways to find a place again, measured in the same run: what the signature is held against.
+"""Rank by other methods, and measure them in the run that measures the signature.
 
-Prepared, allowed  --compare-->  Compared: each baseline's ranking of every query, and its time
+Thumbnails are small inverse depth images, compared by L1 or ZNCC.
 
-Thumbnails: the depth image made small, what anyone would try first.
+FPFH are local features of Open3D (Rusu et al., ICRA 2009), aggregated by VLAD (Jegou et al., CVPR
+2010). The vocabulary is learnt on the database that is searched, which favours this baseline: no
+model has seen a frame of it.
 
-    depth (H, W)  --thumbnail-->  (30, 40) inverse depth      two of them  -->  L1 or ZNCC
-
-FPFH: local features of Open3D, aggregated by VLAD over a vocabulary of the database.
-
-    frame  --features-->  (n, 33)  --vlad-->  (64 * 33,)      two of them  -->  L2 distance
-
-Rusu et al., Fast point feature histograms, ICRA 2009; Jegou et al., Aggregating local descriptors,
-CVPR 2010. The vocabulary is learnt on the database that is searched, which favours the baseline:
-the model it is held against has never seen a frame of it.
-
-Rings: how high the world is about a scanner, as Scan Context.
-
-    points (N, 3)  --ring_descriptor-->  (rings, sectors)      two  --ring_distance-->  distance
-
-Kim and Kim, Scan Context: egocentric spatial descriptor for place recognition within 3D point
-cloud map, IROS 2018. The ground about the sensor is divided into rings and sectors; each cell has
-the height of its highest point. Turning the sensor about the upright axis by a sector moves the
-columns on by one, so that two scans are compared at every shift, and the best counts.
+Rings are heights about a scanner, as in Scan Context (Kim and Kim, IROS 2018). The ground about the
+sensor is divided into rings and sectors; each cell has the height of its highest point. A turn of
+the sensor by a sector shifts the columns by one, so that two scans are compared at every shift.
 """
 
 from __future__ import annotations
@@ -30,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +35,38 @@ from sceneprint_lab.evaluation.protocol import (
     SignedFrame,
     ValidatedPair,
     Watch,
+    points_at,
     unwatched,
 )
+
+
+class Baseline:
+    """A way to compare frames without signatures."""
+
+    name: str
+
+    def check(self) -> None:
+        """Raise MissingDependency if a library is absent."""
+
+    def takes(self, frame: AnyFrame) -> bool:  # noqa: ARG002
+        """Return whether the baseline supports such a frame."""
+        return True
+
+    def read(self, frame: AnyFrame) -> Floats32:
+        """Return what the descriptor is computed from; raise UselessFrame if there is nothing."""
+        raise NotImplementedError
+
+    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
+        """Learn from what `read` returned for the `count` frames of the database."""
+
+    def finish(self, features: Floats32) -> Floats32:
+        """Return the descriptor of what `read` returned; of one shape for all frames."""
+        return features
+
+    def distances(self, query: Floats32, database: Floats32) -> Floats:
+        """Return (N,) from one descriptor to each of a stack of N; infinite is farthest."""
+        raise NotImplementedError
+
 
 # Thumbnails.
 
@@ -80,7 +97,7 @@ def thumbnail(depth: Floats32, rows: int = ROWS, columns: int = COLUMNS) -> Floa
     return mean.reshape(rows, columns)
 
 
-class Thumbnails:
+class Thumbnails(Baseline):
     """Small inverse depth images, by mean absolute difference or by correlation.
 
     Parameters
@@ -94,28 +111,21 @@ class Thumbnails:
         self.name = f"thumbnail_{comparison}"
 
     def takes(self, frame: AnyFrame) -> bool:
-        """Return whether the baseline is made for such a frame."""
+        """Return whether the frame is a depth image."""
         return isinstance(frame, DepthFrame)
 
     def read(self, frame: AnyFrame) -> Floats32:
         """Return the thumbnail of a depth image."""
-        if not isinstance(frame, DepthFrame):
-            raise UselessFrame(f"{frame.name}: A thumbnail is of a depth image. Send one.")
+        assert isinstance(frame, DepthFrame)
         return thumbnail(frame.depth)
 
-    def check(self) -> None:
-        """Nothing is needed."""
-
-    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """Nothing is learnt."""
-
-    def finish(self, kept: Floats32) -> Floats32:
+    def finish(self, features: Floats32) -> Floats32:
         """Return the thumbnail; for correlation at mean 0 and length 1."""
         if self.comparison == "l1":
-            return kept
-        filled = kept > 0
-        mean = float(kept[filled].mean()) if filled.any() else 0.0
-        centred = np.where(filled, kept - mean, 0.0)
+            return features
+        filled = features > 0
+        mean = float(features[filled].mean()) if filled.any() else 0.0
+        centred = np.where(filled, features - mean, 0.0)
         length = float(np.linalg.norm(centred))
         return (centred / length if length > 0 else centred).astype(np.float32)
 
@@ -196,7 +206,7 @@ def vlad(local: Floats32, words: Floats) -> Floats32:
     return result
 
 
-class FpfhVlad:
+class FpfhVlad(Baseline):
     """FPFH-VLAD as a baseline, for depth images and clouds.
 
     Parameters
@@ -211,12 +221,8 @@ class FpfhVlad:
         self._words: Floats | None = None
 
     def check(self) -> None:
-        """See `open3d`."""
+        """Raise MissingDependency unless Open3D is installed."""
         open3d(_WHAT)
-
-    def takes(self, frame: AnyFrame) -> bool:  # noqa: ARG002
-        """Return whether the baseline is made for such a frame: always."""
-        return True
 
     def read(self, frame: AnyFrame) -> Floats32:
         """Return the local features of a frame.
@@ -226,7 +232,11 @@ class FpfhVlad:
         MissingDependency : see `open3d`.
         UselessFrame : no point is in range.
         """
-        points = _points(frame)
+        points = (
+            np.asarray(frame.points, np.float64)
+            if isinstance(frame, Cloud)
+            else points_at(frame, *np.nonzero(frame.depth > 0))
+        )
         points = points[np.linalg.norm(points, axis=1) <= self.maximum]
         if not len(points):
             raise UselessFrame(f"{frame.name}: No point lies within {self.maximum:g} m.")
@@ -246,11 +256,11 @@ class FpfhVlad:
         means = KMeans(min(WORDS, distinct), n_init=1, random_state=seed).fit(sample)
         self._words = np.asarray(means.cluster_centers_, np.float64)
 
-    def finish(self, kept: Floats32) -> Floats32:
+    def finish(self, features: Floats32) -> Floats32:
         """Return the VLAD of a frame's features; after `learn`."""
         if self._words is None:
             raise ValueError("the vocabulary has not been learnt")
-        return vlad(kept, self._words)
+        return vlad(features, self._words)
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
         """Return Euclidean distance of one to each of (N, k * d): (N,)."""
@@ -258,50 +268,33 @@ class FpfhVlad:
         return found
 
 
-def _points(frame: AnyFrame) -> Floats:
-    if isinstance(frame, Cloud):
-        return np.asarray(frame.points, np.float64)
-    k, depth = frame.intrinsics, frame.depth
-    y, x = np.nonzero(depth > 0)
-    z = depth[y, x].astype(np.float64)
-    return np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
-
-
 # Rings.
 
-#: The paper's numbers: rings, sectors, metres that the rings reach, and what is added to heights
-#: so that what lies about the wheels is not nought, metres.
+#: The paper's numbers: rings, sectors, reach of the rings, and the lift of all heights, so that
+#: what lies about the wheels is above 0, metres.
 RINGS, SECTORS, RADIUS, LIFT = 20, 60, 80.0, 2.0
 
 
-def ring_descriptor(
-    points: Floats32 | Floats, *, rings: int = RINGS, sectors: int = SECTORS,
-    radius: float = RADIUS, lift: float = LIFT, pole: int = 2,
-) -> Floats32:  # fmt: skip
+def ring_descriptor(points: Floats32 | Floats) -> Floats32:
     """Return the greatest height in each ring and sector about the sensor.
 
     Parameters
     ----------
-    points : (N, 3) metres, the sensor at the origin
-    rings, sectors : how many; a sector is 2 pi / sectors of azimuth
-    radius : metres in the ground plane; points beyond are left out
-    lift : added to every height, metres
-    pole : axis that points up, 0, 1 or 2; azimuth counts from the next axis towards the one after
+    points : (N, 3) metres, the sensor at the origin, z up; azimuth counts from x towards y
 
     Returns
     -------
-    (rings, sectors) float32, the height and `lift`; 0 where a cell holds no point
+    (RINGS, SECTORS) float32, the height and `LIFT`; 0 where a cell holds no point
     """
-    p = np.asarray(points, np.float64)
-    a, b, c = (p[:, (pole + k) % 3] for k in (1, 2, 0))
-    flat = np.hypot(a, b)
-    inside = flat < radius
-    ring = (flat[inside] / radius * rings).astype(np.intp)
-    azimuth = np.mod(np.arctan2(b[inside], a[inside]), 2 * np.pi)
+    x, y, z = np.asarray(points, np.float64).T
+    flat = np.hypot(x, y)
+    inside = flat < RADIUS
+    ring = (flat[inside] / RADIUS * RINGS).astype(np.intp)
+    azimuth = np.mod(np.arctan2(y[inside], x[inside]), 2 * np.pi)
     # an azimuth a rounding below 2 pi is of the last sector, not of one more
-    sector = np.minimum((azimuth / (2 * np.pi) * sectors).astype(np.intp), sectors - 1)
-    highest = np.full((rings, sectors), -np.inf)
-    np.maximum.at(highest, (ring, sector), c[inside] + lift)
+    sector = np.minimum((azimuth / (2 * np.pi) * SECTORS).astype(np.intp), SECTORS - 1)
+    highest = np.full((RINGS, SECTORS), -np.inf)
+    np.maximum.at(highest, (ring, sector), z[inside] + LIFT)
     return np.where(np.isfinite(highest), highest, 0.0).astype(np.float32)
 
 
@@ -368,73 +361,26 @@ def ring_distances(query: Floats32, database: Floats32) -> Floats:
     return np.array([_best_shift(*own, *_columns(other))[0] for other in database], float)
 
 
-class Rings:
+class Rings(Baseline):
     """The ring descriptor as a baseline: for clouds with a viewpoint."""
 
     name = "rings"
 
-    def __init__(self, radius: float = RADIUS) -> None:
-        self.radius = radius
-
     def takes(self, frame: AnyFrame) -> bool:
-        """Return whether the baseline is made for such a frame."""
+        """Return whether the frame is a cloud with a viewpoint."""
         return isinstance(frame, Cloud) and frame.has_viewpoint
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """Return the descriptor of a cloud, its z axis taken as upright."""
-        if not isinstance(frame, Cloud):
-            raise UselessFrame(f"{frame.name}: A ring descriptor is of a point cloud. Send one.")
-        return ring_descriptor(frame.points, radius=self.radius)
-
-    def check(self) -> None:
-        """Nothing is needed."""
-
-    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """Nothing is learnt."""
-
-    def finish(self, kept: Floats32) -> Floats32:
-        """Return the descriptor itself."""
-        return kept
+        """Return the descriptor of a cloud whose z axis is upright."""
+        assert isinstance(frame, Cloud)
+        return ring_descriptor(frame.points)
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """See `ring_distances`."""
+        """Return the distances of `ring_distances`."""
         return ring_distances(query, database)
 
 
-# What every baseline does, so that one loop can ask them all.
-
-
-class Baseline(Protocol):
-    """A way to compare frames that knows nothing of signatures."""
-
-    name: str
-
-    def check(self) -> None:
-        """Raise MissingDependency where what it needs is not there."""
-        ...
-
-    def takes(self, frame: AnyFrame) -> bool:
-        """Return whether it is made for such a frame."""
-        ...
-
-    def read(self, frame: AnyFrame) -> Floats32:
-        """Return what the descriptor is computed from; raise UselessFrame if there is nothing."""
-        ...
-
-    def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """Learn from what was kept of the `count` frames of the database."""
-        ...
-
-    def finish(self, kept: Floats32) -> Floats32:
-        """Return the descriptor of what `read` returned; of one shape for all frames."""
-        ...
-
-    def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """Return (N,) from one descriptor to each of a stack of N; infinite is farthest."""
-        ...
-
-
-#: Each baseline, made for a sensor of so many metres of range.
+#: Constructors of the baselines by the range of the sensor, metres.
 BASELINES: dict[str, Callable[[float], Baseline]] = {
     "thumbnail_l1": lambda _: Thumbnails("l1"),
     "thumbnail_zncc": lambda _: Thumbnails("zncc"),
@@ -444,7 +390,7 @@ BASELINES: dict[str, Callable[[float], Baseline]] = {
 
 
 def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
-    """Return baselines by their names, ready to be asked.
+    """Return baselines by their names, ready for use.
 
     Parameters
     ----------
@@ -453,7 +399,7 @@ def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
 
     Raises
     ------
-    MissingDependency : a library one needs is absent.
+    MissingDependency : a library is absent.
     """
     opened = [BASELINES[name](maximum) for name in names]
     for one in opened:
@@ -461,21 +407,19 @@ def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
     return opened
 
 
-# The baselines asked what the signatures were asked.
-
 #: Queries that are described and signed once more, to time a baseline beside the signature.
 TIMED = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """What a baseline made of the queries.
+    """The answers of a baseline to the queries.
 
     Parameters
     ----------
     name : of the baseline
-    reason : why it could not be asked; empty where it was
-    rankings : of each query the nearest database indices, nearest first; none where refused
+    reason : why it cannot be used; empty if it can
+    rankings : of each query the nearest database indices, nearest first
     first : of each query the pair with the nearest, validated as ours; None without a ranking
     milliseconds : processor time, medians of a query: to `describe` it, to `sign` it for the
         signature, and to `rank` the database
@@ -526,21 +470,21 @@ def _compared(
     baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
     seed: int, watch: Watch,
 ) -> Compared:  # fmt: skip
-    def kept(member: SignedFrame) -> Path:
+    def file(member: SignedFrame) -> Path:
         return store.folder / f"{member.number}.{baseline.name}.npy"
 
     members = {m.number: m for m in (*prepared.queries, *prepared.database)}
     for member in watch(members.values(), baseline.name, len(members)):
-        np.save(kept(member), baseline.read(store.frame(member)))
+        np.save(file(member), baseline.read(store.frame(member)))
 
     def database() -> Iterator[Floats32]:
-        return (np.load(kept(m)) for m in prepared.database)
+        return (np.load(file(m)) for m in prepared.database)
 
     baseline.learn(database(), len(prepared.database), seed)
     stack = np.stack([baseline.finish(one) for one in database()])
     rankings, ranking_ms = [], []
     for i, member in enumerate(prepared.queries):
-        descriptor = baseline.finish(np.load(kept(member)))
+        descriptor = baseline.finish(np.load(file(member)))
         index = np.flatnonzero(allowed[i])
         start = time.process_time()
         order = np.argsort(baseline.distances(descriptor, stack[index]), kind="stable")
@@ -553,18 +497,16 @@ def registered(
     judge: Judge, rankings: Sequence[Sequence[int]], prepared: Prepared,
     overlap_mean: NDArray[np.float64], overlap_least: NDArray[np.float64],
 ) -> list[ValidatedPair | None]:  # fmt: skip
-    """The nearest frame of each query validated as ours is: what R would be by this ranking."""
+    """Return the validated pair of each query with its nearest frame, as R has it by a ranking."""
     found: list[ValidatedPair | None] = []
     for i, (query, ranking) in enumerate(zip(prepared.queries, rankings, strict=True)):
         if not ranking:
             found.append(None)
             continue
         j = ranking[0]
-        match = prepared.database[j]
-        candidate = Candidate(
-            j, match.number, match.scene, match.pose,
-            float(overlap_mean[i, j]), float(overlap_least[i, j]),
-        )  # fmt: skip
+        candidate = Candidate.of(
+            prepared.database[j], j, float(overlap_mean[i, j]), float(overlap_least[i, j])
+        )
         task = QueryTask(query.number, query.scene, query.pose, [j], [], (candidate,))
         found.append(validated(judge, task, candidate))
     return found

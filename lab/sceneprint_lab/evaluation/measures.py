@@ -21,6 +21,7 @@ from sceneprint_lab.evaluation.protocol import (
     QueryOutcome,
     SignedFrame,
     ValidatedPair,
+    points_at,
 )
 
 #: The k of recall@k.
@@ -572,19 +573,17 @@ def voxels(frame: AnyFrame) -> Voxels:
 
 
 def points_of(frame: AnyFrame, step: int, farthest: float) -> Floats:
-    """Return (N, 3) metres, sensor frame: every `step`-th pixel both ways that is nearer than that.
+    """Return the points (N, 3) of every `step`-th pixel both ways, or of a cloud all.
 
-    Of a cloud all points that are nearer than that to the sensor.
+    Points that are as far as `farthest` metres are left out.
     """
     if isinstance(frame, Cloud):
         every: Floats = frame.points.astype(float)
         near: Floats = every[np.linalg.norm(every, axis=1) < farthest]
         return near
     k = frame.intrinsics
-    y, x = np.mgrid[0 : k.height : step, 0 : k.width : step]
-    z = frame.depth[::step, ::step].astype(float)
-    points: Floats = np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=-1)
-    return points[(z > 0) & (z < farthest)]
+    points = points_at(frame, *np.mgrid[0 : k.height : step, 0 : k.width : step])
+    return points[(points[..., 2] > 0) & (points[..., 2] < farthest)]
 
 
 def _of_scene(outcome: QueryOutcome, of: str) -> list[ValidatedPair]:

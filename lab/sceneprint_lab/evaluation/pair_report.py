@@ -1,6 +1,6 @@
-"""The figures of pairs of frames, ready for JSON.
+"""Report an evaluation of pairs: its figures for JSON, and as lines to read.
 
-PairEvaluation  --pair_figures-->  dict
+PairEvaluation  --pair_figures-->  dict  --pair_table-->  lines
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def residual(v: PairValidation, p: AcceptanceParameters) -> float:
     return max(v.residual_m / p.residual_m, v.residual_rad / p.residual_rad)
 
 
-#: What is told of a transform, each so that more speaks for it; None where it is not known.
+#: Statistics of a transform, each so that more speaks for it; None if it is unknown.
 STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | None]] = {
     "residual": lambda v, p: -residual(v, p),
     "overlap": lambda v, _: v.overlap,

@@ -1,4 +1,4 @@
-"""From recordings to pairs of frames that were registered, and how far off each is.
+"""Draw pairs of frames, register them, by Open3D too, and judge them by the true poses.
 
 PATH...  --evaluate_pairs-->  PairEvaluation
 """
@@ -51,6 +51,7 @@ from sceneprint_lab.evaluation.protocol import (
     Watch,
     every_frame,
     map_over,
+    points_at,
     pose_error,
     prepare_all,
     unwatched,
@@ -130,8 +131,8 @@ def draw(
 ) -> list[Drawn]:
     """Return pairs of every bin and of both kinds of negatives, or fewer if fewer exist.
 
-    The later frame is the query. Of pairs of two scenes, every two scenes have as many, and a
-    quarter is drawn among those with a planar frame, so long as there are any.
+    Each pair is drawn once, and its later frame is the query. Every two scenes have as many pairs,
+    and a quarter is drawn among those with a planar frame, so long as there are any.
 
     Parameters
     ----------
@@ -203,26 +204,23 @@ def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.
     return np.sort(rng.choice(of, min(n, len(of)), replace=False))
 
 
-# Registration as others do it, beside ours: FPFH with RANSAC or FGR, then ICP, by Open3D.
-#
-# points, points  --register-->  Attempt of each method
-#
-# One standard configuration each, not tuned, in one direction; they always answer, and do not say
-# whether to believe it. Features are counted on both frames.
+# Registration by Open3D: FPFH with RANSAC or FGR, then ICP. Each has one standard configuration,
+# which is not tuned, and works in one direction. It always answers, and does not say whether to
+# believe it. The features of both frames count.
 
 T = TypeVar("T")
 
-#: FPFH as its users run it: voxel, then normals (radius, neighbours), features (the same).
+#: Of FPFH: voxel, then radius and neighbours of normals, and of features.
 VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
-#: RANSAC: farthest correspondence (metres), points a hypothesis, least ratio of edge lengths, ...
+#: Of RANSAC: farthest correspondence (metres), points a hypothesis, least ratio of edge lengths,
 CORRESPONDENCE, POINTS, BASELINE_EDGES = 0.075, 3, 0.9
-#: ... hypotheses at the most, and confidence at which it stops.
+#: most hypotheses, and confidence at which it stops.
 HYPOTHESES, CONFIDENCE = 100_000, 0.999
-#: FGR: farthest correspondence, metres: half a voxel, as its authors' example has it.
+#: Of FGR: farthest correspondence, metres: half a voxel, as in its authors' example.
 FGR_CORRESPONDENCE = 0.025
-#: ICP, point to plane: voxel of both clouds, and farthest correspondence, metres.
+#: Of ICP, point to plane: voxel of both clouds, and farthest correspondence, metres.
 ICP_VOXEL, ICP_CORRESPONDENCE = 0.02, 0.05
-#: What is measured, in the order of the tables.
+#: The methods in the order of the tables.
 METHODS = ("FPFH + RANSAC", "FPFH + FGR")
 #: Fewer points than this in the thinned cloud are not registered.
 _FEWEST = 10
@@ -244,7 +242,7 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """What one method makes of a pair.
+    """The result of one method for a pair.
 
     Parameters
     ----------
@@ -265,17 +263,14 @@ class Attempt:
 
 def points_of(frame: DepthFrame, minimum: float, maximum: float) -> Floats:
     """Return all samples of a depth image within a range, (N, 3) metres."""
-    k = frame.intrinsics
-    y, x = np.nonzero((frame.depth >= minimum) & (frame.depth <= maximum))
-    z = frame.depth[y, x].astype(np.float64)
-    return np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
+    return points_at(frame, *np.nonzero((frame.depth >= minimum) & (frame.depth <= maximum)))
 
 
 def register(
     query: Floats, match: Floats, o3d: Any, methods: Sequence[str] = METHODS, *, seed: int = 0,
     scale: float = 1.0,
 ) -> dict[str, Attempt]:  # fmt: skip
-    """Return each method on a pair of clouds; nothing where one of these is next to empty.
+    """Register a pair of clouds by each method; return nothing if one of them is next to empty.
 
     Features are computed once, and counted for each method.
 
@@ -287,77 +282,62 @@ def register(
     seed : of the random choices
     scale : that all lengths are multiplied by: 1 for rooms
     """
-    register, search = o3d.pipelines.registration, _searching(o3d, scale)
-    shared, clouds = Clock(), [cloud_of(points, o3d) for points in (query, match)]
+    o3r, shared = o3d.pipelines.registration, Clock()
+
+    def search(radius: float, most: int) -> Any:
+        return o3d.geometry.KDTreeSearchParamHybrid(scale * radius, most)
+
+    clouds = [
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (query, match)
+    ]
     thin = shared.run("voxel grid", lambda: [c.voxel_down_sample(scale * VOXEL) for c in clouds])
     if min(len(c.points) for c in thin) < _FEWEST:
         return {}
     shared.run("normals", lambda: [c.estimate_normals(search(*NORMALS)) for c in thin])
     features = shared.run(
-        "features", lambda: [register.compute_fpfh_feature(c, search(*FEATURES)) for c in thin]
+        "features", lambda: [o3r.compute_fpfh_feature(c, search(*FEATURES)) for c in thin]
     )
-    found = {}
+
+    def ransac() -> Any:
+        return o3r.registration_ransac_based_on_feature_matching(
+            *thin, *features, True, scale * CORRESPONDENCE,
+            o3r.TransformationEstimationPointToPoint(False), POINTS,
+            [
+                o3r.CorrespondenceCheckerBasedOnEdgeLength(BASELINE_EDGES),
+                o3r.CorrespondenceCheckerBasedOnDistance(scale * CORRESPONDENCE),
+            ],
+            o3r.RANSACConvergenceCriteria(HYPOTHESES, CONFIDENCE),
+        )  # fmt: skip
+
+    def fgr() -> Any:
+        option = o3r.FastGlobalRegistrationOption(
+            maximum_correspondence_distance=scale * FGR_CORRESPONDENCE
+        )
+        return o3r.registration_fgr_based_on_feature_matching(*thin, *features, option)
+
+    def icp(start: Floats) -> Any:
+        # the finer clouds, and normals, are its own
+        fine = [c.voxel_down_sample(scale * ICP_VOXEL) for c in clouds]
+        fine[1].estimate_normals(search(*NORMALS))
+        return o3r.registration_icp(
+            *fine, scale * ICP_CORRESPONDENCE, start, o3r.TransformationEstimationPointToPlane()
+        )
+
+    attempts = {}
     for name in methods:
-        clock, estimate = Clock(), _ransac if name == METHODS[0] else _fgr
+        clock = Clock()
         clock.stages |= shared.stages
         o3d.utility.random.seed(seed)
-        start = clock.run(name.split()[-1], lambda: estimate(thin, features, o3d, scale))  # noqa: B023
-        refined = clock.run("ICP", lambda: _icp(clouds, start, o3d, scale))  # noqa: B023
-        found[name] = Attempt(start, refined, clock.stages)
-    return found
-
-
-def cloud_of(points: Floats, o3d: Any) -> Any:
-    """Return Open3D's cloud of (N, 3) points."""
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-
-
-def _searching(o3d: Any, scale: float) -> Callable[[float, int], Any]:
-    return lambda radius, most: o3d.geometry.KDTreeSearchParamHybrid(scale * radius, most)
-
-
-def _ransac(thin: list[Any], features: list[Any], o3d: Any, scale: float) -> Floats:
-    register = o3d.pipelines.registration
-    found = register.registration_ransac_based_on_feature_matching(
-        *thin, *features, True, scale * CORRESPONDENCE,
-        register.TransformationEstimationPointToPoint(False), POINTS,
-        [
-            register.CorrespondenceCheckerBasedOnEdgeLength(BASELINE_EDGES),
-            register.CorrespondenceCheckerBasedOnDistance(scale * CORRESPONDENCE),
-        ],
-        register.RANSACConvergenceCriteria(HYPOTHESES, CONFIDENCE),
-    )  # fmt: skip
-    return np.array(found.transformation, np.float64)
-
-
-def _fgr(thin: list[Any], features: list[Any], o3d: Any, scale: float) -> Floats:
-    register = o3d.pipelines.registration
-    option = register.FastGlobalRegistrationOption(
-        maximum_correspondence_distance=scale * FGR_CORRESPONDENCE
-    )
-    found = register.registration_fgr_based_on_feature_matching(*thin, *features, option)
-    return np.array(found.transformation, np.float64)
-
-
-def _icp(clouds: list[Any], start: Floats, o3d: Any, scale: float) -> Floats:
-    """Return point to plane; the finer clouds and the normals it asks for are its own."""
-    register = o3d.pipelines.registration
-    fine = [c.voxel_down_sample(scale * ICP_VOXEL) for c in clouds]
-    fine[1].estimate_normals(_searching(o3d, scale)(*NORMALS))
-    found = register.registration_icp(
-        *fine, scale * ICP_CORRESPONDENCE, start, register.TransformationEstimationPointToPlane(),
-    )  # fmt: skip
-    return np.array(found.transformation, np.float64)
-
-
-# A pair of frames registered by us and by others, and judged by the true poses.
-#
-# Drawn, Member, Member  --attempt-->  Tried
+        estimated = clock.run(name.split()[-1], ransac if name == METHODS[0] else fgr)
+        start = np.array(estimated.transformation, np.float64)
+        refined = clock.run("ICP", partial(icp, start))
+        attempts[name] = Attempt(start, np.array(refined.transformation, np.float64), clock.stages)
+    return attempts
 
 
 @dataclass(frozen=True, eq=False)
 class Other:
-    """What a baseline made of a pair.
+    """The errors of a baseline on a pair.
 
     Parameters
     ----------
@@ -378,10 +358,10 @@ class Tried:
     Parameters
     ----------
     drawn : see Drawn
-    pair : see Pair; with `bound` where the two overlap
-    others : by method; None where baselines were not asked for, or the two do not overlap, and
-        empty where there were too few points for any
-    milliseconds : beside others: of ours, features of both frames counted; else None
+    pair : see ValidatedPair; with `bound` where the two overlap
+    others : by method; None without baselines, or if the two do not overlap; empty if there are
+        too few points for any
+    milliseconds : beside others: of ours, with the features of both frames; else None
     """
 
     drawn: Drawn
@@ -400,7 +380,7 @@ class Bench:
     store : of the frames
     model : for baselines: with the parameters of ours
     limits : metres and degrees to which a transform is to be right
-    o3d : Open3D, or None where no baselines were asked for
+    o3d : Open3D, or None without baselines
     """
 
     judging: Judge
@@ -414,18 +394,16 @@ def open_bench(
     store: FrameStore, model: Model, mode: Mode, seed: int, limits: tuple[float, float], *,
     baselines: bool, matching: Matching = "histograms",
 ) -> Bench:  # fmt: skip
-    """Make ready to try pairs of the frames of a store."""
+    """Return what is needed to try pairs of the frames of a store."""
     o3d = open3d("A baseline of registration") if baselines else None
     judging = open_judge(store, mode, seed, model.parameters.validation, matching)
     return Bench(judging, store, model, limits, o3d)
 
 
 def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried:
-    """Validate a pair; where the two overlap, see what registration could reach and others do."""
+    """Validate a pair; if the two overlap, compute the bound and run the baselines too."""
     drawn, query, match = task
-    candidate = Candidate(
-        drawn.match, match.number, match.scene, match.pose, drawn.overlap_mean, drawn.overlap_least
-    )
+    candidate = Candidate.of(match, drawn.match, drawn.overlap_mean, drawn.overlap_least)
     asked = QueryTask(query.number, query.scene, query.pose, [], [], (candidate,))
     pair = replace(validated(bench.judging, asked, candidate), limits=bench.limits)
     if drawn.kind != "overlapping":
@@ -488,7 +466,7 @@ def _error(T: Floats | None, true: Floats) -> Error:
 
 @dataclass(frozen=True)
 class PairSettings:
-    """How to evaluate pairs.
+    """The settings of an evaluation of pairs.
 
     Parameters
     ----------
@@ -515,7 +493,7 @@ class PairSettings:
 
 @dataclass(frozen=True, eq=False)
 class PairEvaluation:
-    """What came of every pair.
+    """The results of all pairs.
 
     Parameters
     ----------
@@ -548,17 +526,17 @@ def evaluate_pairs(
     ----------
     paths : of sequences with poses; frames of two scenes are negatives of each other
     signer : see `open_signer`
-    store : an empty one; its frames serve the pictures afterwards
-    settings : see Settings
-    watch : told of every step of every stage
+    store : empty
+    settings : see PairSettings
+    watch : follows the steps of every stage
 
     Raises
     ------
-    DatasetError : no two frames could be used, or no pair is to be had of them.
-    MissingDependency : baselines were asked for, and Open3D cannot be imported.
+    DatasetError : no two frames can be used, or none make a pair.
+    MissingDependency : baselines need Open3D, which cannot be imported.
     """
     if settings.baselines:
-        # before all the reading: where it is missing, that is what is to be told
+        # before the frames are read: a missing library must not cost that
         open3d("A baseline of registration")
     placed = spread(every_frame(paths), settings.frames)
     chosen = tuple(one for one, _ in placed)
@@ -569,7 +547,7 @@ def evaluate_pairs(
     if len(members) < 2:
         raise DatasetError(_too_few(prepared))
     parameters = signer.model.parameters
-    opening_views = partial(_views, store, OFF_PLANE * scale_of(parameters))
+    opening_views = partial(_same, store, OFF_PLANE * scale_of(parameters))
     shares = map_over(members, _plane_share, opening_views, settings.jobs)
     planes = np.array(list(watch(shares, "planes", len(members))))
     places = [placed[member.number][1] for member in members]
@@ -620,13 +598,13 @@ def _too_few(prepared: Prepared) -> str:
     )
 
 
-def _views(store: FrameStore, off: float) -> tuple[FrameStore, float]:
-    return store, off
-
-
 def _plane_share(opened: tuple[FrameStore, float], member: SignedFrame) -> float:
     store, off = opened
     return plane_share(view_of(store.frame(member)).samples, off)
+
+
+def _same(*opened: Any) -> tuple[Any, ...]:
+    return opened
 
 
 def _overlaps(members: Sequence[SignedFrame], store: FrameStore, watch: Watch) -> Overlaps:

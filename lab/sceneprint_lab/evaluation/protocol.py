@@ -327,6 +327,13 @@ class Overlaps:
     least: Floats
 
 
+def points_at(frame: DepthFrame, y: NDArray[np.intp], x: NDArray[np.intp]) -> Floats:
+    """Return the points (..., 3) of some pixels of a depth image, metres, sensor frame."""
+    k, z = frame.intrinsics, frame.depth[y, x].astype(np.float64)
+    points: Floats = np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=-1)
+    return points
+
+
 def view_of(frame: AnyFrame) -> AnyView:
     """Return what the overlap of a frame with a pose is computed from."""
     if frame.pose is None:
@@ -335,8 +342,8 @@ def view_of(frame: AnyFrame) -> AnyView:
         return _cloud_view(frame, frame.pose)
     k = frame.intrinsics
     y, x = np.mgrid[GRID // 2 : k.height : GRID, GRID // 2 : k.width : GRID]
-    z = frame.depth[y, x].astype(float)
-    points = np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=-1)[z > 0]
+    points = points_at(frame, y, x)
+    points = points[points[..., 2] > 0]
     return OverlapView(np.ascontiguousarray(moved(frame.pose, points)), frame.depth, k, frame.pose)
 
 
