@@ -17,7 +17,7 @@ from sceneprint.fusion import open3d
 from sceneprint.geometry.signature.fisher_vector import quantise, statistics_of_counts, whiten
 from sceneprint.geometry.signature.pair_features import count_pairs
 from sceneprint.geometry.signature.segmentation import hierarchy, patch_weights, segment
-from sceneprint.geometry.surface.depth_image import inverse_depth, surface
+from sceneprint.geometry.surface.depth_image import fit_surface, inverse_depth
 from sceneprint.pipeline import Signer, geometry_of, open_signer, sign
 from sceneprint.signing import float_signature, see
 from sceneprint.types import DepthFrame, Floats
@@ -28,7 +28,7 @@ def signing_stages(frame: DepthFrame, signer: Signer) -> dict[str, float]:
     """Return milliseconds of each stage of `sign`; their sum is the time of `sign` itself."""
     model, p, clock = signer.model, signer.model.parameters, Clock()
     q, camera = clock.run("inverse depth", lambda: inverse_depth(frame, p.depth))
-    seen = clock.run("points and normals", lambda: surface(q, camera, p.normals))
+    seen = clock.run("points and normals", lambda: fit_surface(q, camera, p.normals))
     finest = clock.run("segmentation", lambda: segment(seen, p.segmentation))
     every = clock.run("hierarchy", lambda: hierarchy(seen, finest, p.hierarchy)).levels
     levels = [every[level] for level in model.levels]

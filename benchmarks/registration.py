@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from benchmarks.encode import open3d_or_note, stage_rows
 from benchmarks.pairs import FramePair
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.models import Model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
@@ -42,7 +42,7 @@ def is_right(T_match_query: Floats | None, truth: Floats) -> bool:
     """Return whether a transform is within 10 cm and 10 degrees of the truth."""
     if T_match_query is None:
         return False
-    metres, radians = difference(T_match_query, truth)
+    metres, radians = pose_difference(T_match_query, truth)
     return metres <= RIGHT[0] and radians <= RIGHT[1]
 
 

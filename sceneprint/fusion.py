@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidRequest, MissingDependency, UselessFrame
-from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.geometry.surface.coverage import TriangleMesh
-from sceneprint.geometry.surface.depth_image import halved
+from sceneprint.geometry.surface.depth_image import halve_camera
 from sceneprint.types import DepthFrame, Floats, Floats32
 
 #: Debian packages with the system libraries that Open3D loads.
@@ -109,7 +109,7 @@ def within(view: DepthFrame, p: FusionParameters) -> DepthFrame:
     """
     depth, camera = np.asarray(view.depth, np.float32), view.intrinsics
     while depth.size > p.most_samples:
-        camera = halved(camera)
+        camera = halve_camera(camera)
         # of each 2 x 2 samples the first; its ray is half a (new) quarter pixel up and left
         depth = depth[: 2 * camera.height : 2, : 2 * camera.width : 2]
         camera = replace(camera, cx=camera.cx + 0.25, cy=camera.cy + 0.25)
@@ -167,7 +167,7 @@ def _blocks(T: Floats, points: Floats, voxel: float) -> NDArray[np.int32]:
     z = points[:, 2:]
     keys = []
     for offset in np.linspace(-band, band, 5):  # at a slant too, steps are less than a block
-        cells = np.floor(moved(T, points * np.maximum((z + offset) / z, 0.0)) / edge)
+        cells = np.floor(transform_points(T, points * np.maximum((z + offset) / z, 0.0)) / edge)
         packed = (cells.astype(np.int64) + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1])
         keys.append(np.unique(packed))
     packed = np.unique(np.concatenate(keys))

@@ -15,7 +15,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.types import (
     Bytes,
     Floats,
@@ -305,7 +305,7 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
 
     # from above: x to the right and z up the picture, where the match's camera looks
     of_query, of_match = (one.points[one.valid].astype(np.float64) for one in (query, match))
-    aligned = moved(T_match_query, of_query)
+    aligned = transform_points(T_match_query, of_query)
     everything = np.concatenate([of_match, of_query, aligned])[:, [0, 2]]
     low, high = np.percentile(everything, (1, 99), axis=0)  # a few stray points lie far out
     scale = (_PANEL - 1) / (high - low).max()

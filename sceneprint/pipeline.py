@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sceneprint.errors import ModelMismatch
-from sceneprint.geometry.kernel import both
+from sceneprint.geometry.kernel import run_both
 from sceneprint.geometry.registration.alignment import are_scans
 from sceneprint.geometry.registration.overlap import thinned
 from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
@@ -97,7 +97,7 @@ def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
     """
     p = signer.model.parameters
     seen = see(frame, p)
-    return both(
+    return run_both(
         lambda: encode(hierarchy_of(seen, p, frame.name), signer, frame.name),
         lambda: geometry_of(seen, signer.model),
     )

@@ -36,7 +36,7 @@ from sceneprint.geometry.signature.segmentation import (
     segment,
     supervoxels,
 )
-from sceneprint.geometry.surface.depth_image import inverse_depth, surface
+from sceneprint.geometry.surface.depth_image import fit_surface, inverse_depth
 from sceneprint.geometry.surface.voxels import Voxels, voxels
 from sceneprint.models import (
     PRESETS,
@@ -129,7 +129,7 @@ def see(frame: AnyFrame, p: ModelParameters) -> Surface:
     if isinstance(frame, Cloud):
         return voxels(frame, p.cloud)
     q, camera = inverse_depth(frame, p.depth)
-    return surface(q, camera, p.normals)
+    return fit_surface(q, camera, p.normals)
 
 
 def describe(frame: AnyFrame, p: ModelParameters) -> Hierarchy:

@@ -16,8 +16,8 @@ from sceneprint.fusion import (
 from sceneprint.geometry.surface.coverage import (
     TriangleMesh,
     added_areas,
+    first_views,
     observed_volume,
-    of_views,
     share_seen,
 )
 from sceneprint.types import DepthFrame, Intrinsics
@@ -118,7 +118,7 @@ def test_a_thinned_view_keeps_its_rays(around: list[DepthFrame]) -> None:
 def test_what_each_view_adds(around: list[DepthFrame], room: tuple[TriangleMesh, float]) -> None:
     mesh, voxel = room
     views = [around[0], around[0], around[2], *around[1:2], *around[3:]]
-    first = of_views(mesh, views, 2 * voxel)
+    first = first_views(mesh, views, 2 * voxel)
     added = added_areas(mesh, first, len(views))
     assert added.sum() == pytest.approx(mesh.areas().sum())
     assert added[1] == 0  # a duplicate adds nothing
@@ -141,7 +141,7 @@ def test_first_seen_by_hand() -> None:
     near[1, 1], near[1, 2], near[2, 1] = 0, 2.0, 2.0  # nothing known, and seen through
     far[2, 2] = 0
     views = [DepthFrame(near, k, "a", np.eye(4)), DepthFrame(far, k, "b", np.eye(4))]
-    first = of_views(mesh, views, 0.1)
+    first = first_views(mesh, views, 0.1)
     assert first.tolist() == [1, 1, 1, 0]
     assert added_areas(mesh, first, 2).tolist() == [0.5, 0.5]
     assert share_seen(points, views[:1]) == 0.25

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.retrieval.ranking import Ranking
-from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.geometry.validation.validation import ValidationParameters, validate_guided
 from sceneprint.localization import localize
 from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, searched
@@ -54,7 +54,7 @@ def test_two_matches_guide_the_rest_to_the_truth(walk: Room) -> None:
     for match in matches:
         v = match.validation
         assert v.T_match_query is not None
-        metres, radians = difference(v.T_match_query, inverse(poses[match.index]) @ poses[0])
+        metres, radians = pose_difference(v.T_match_query, inverse(poses[match.index]) @ poses[0])
         assert metres < 0.03
         assert radians < np.radians(1.0)
         assert v.guided == (v.predicted is not None) == (match.index > 2)
@@ -125,7 +125,7 @@ def test_a_prediction_that_the_frames_do_not_bear_out_is_searched_for(walk: Room
     assert kinds(matches) == ["correspondences"] * 3
     T = matches[2].validation.T_match_query
     assert T is not None
-    assert difference(T, inverse(poses[3]) @ poses[0])[0] < 0.03
+    assert pose_difference(T, inverse(poses[3]) @ poses[0])[0] < 0.03
     truth = inverse(poses[3]) @ poses[0]
     near = truth.copy()
     near[0, 3] += 0.1

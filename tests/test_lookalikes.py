@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from benchmarks.pairs import pairs_among
 from sceneprint.formats.dataset import FrameReference, find_sequences
-from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
@@ -128,7 +128,7 @@ def outcome(query: Geometry, match: Geometry, truth: Floats | None, seed: int) -
     v = validate(query, match, seed)
     if v.status != "accepted" or v.T_match_query is None:
         return v.status
-    right = truth is not None and difference(v.T_match_query, truth)[0] < RIGHT_M
+    right = truth is not None and pose_difference(v.T_match_query, truth)[0] < RIGHT_M
     return f"accepted {v.strength}, {'right' if right else 'wrong'}"
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, cached_at, runs_here
+from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, code_folder, runs_here
 from sceneprint.geometry.registration import icp
 from sceneprint.geometry.signature import pair_features
 from sceneprint.geometry.views import plan
@@ -45,7 +45,7 @@ _compiling = threading.Lock()
 
 def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
     """Which of the parts are yet to be compiled for this processor, or for this version."""
-    return tuple(part for part in parts if not cached_at(_LAST[part])[1])
+    return tuple(part for part in parts if not code_folder(_LAST[part])[1])
 
 
 def compile_kernels(

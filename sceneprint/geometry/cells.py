@@ -1,20 +1,17 @@
-"""Surfaces as cells of a grid: views fused to cells, and the cells of two sessions compared.
+"""Fuse views to the cells of a grid, and compare the cells of two sessions.
 
-    points of a view  --seen_cells-->  CELL_SUM by tile
-    CELL_SUM of views  --fused-->  CELL_SUM
-    CELL_SUM  --encoded-->  cells as bytes hold them  --coarser-->  a part of the next level's tile
+    points of a view  --view_cells-->  CELL_SUM by tile
+    CELL_SUM of views  --fuse_cells-->  CELL_SUM
+    CELL_SUM  --encode_cells-->  CELL  --coarsen_cells-->  part of a tile of the next level
 
-    points of the frames of a session  --add_views-->  SessionCells
-    cells, a frame of the other session  --frame_verdicts-->  what it says of each of them
+    points of a session's frames  --merge_views-->  SessionCells
+    cells, a frame of the other session  --frame_verdicts-->  one verdict per cell
     verdicts of all these frames, counted  --cell_states-->  same, changed or unseen
 
-A tile has 64 x 64 x 64 cells. Fusing is exact and of no order: sums are of integers, and of views
-the last counts by its time, then by its number. So a tile depends on the views that touch it, and
-on nothing else.
-
-A cell of the earlier session that changed is gone; one of the later session that changed is new.
-A frame agrees with a cell, or saw through it, by the same tolerances as in validation in the map,
-but from either side: cells have no normals.
+A tile has 64 x 64 x 64 cells. Fusing is exact and independent of order: it sums integers, and the
+last view is the one with the greatest time, then number. A changed cell of the earlier session is
+gone; a changed cell of the later session is new. Verdicts use the tolerances of validation in the
+map, but from either side, since cells have no normals.
 """
 
 from __future__ import annotations
@@ -41,8 +38,8 @@ from sceneprint_client.surface_encoding import CELL, NO_SESSION, NO_TIME, SEEN_S
 
 #: Column, row and floor of a tile.
 TilePlace = tuple[int, int, int]
-#: What views saw in a cell: its place in the tile as z, y, x of 6 bits each; how many views; sums
-#: of where each saw it, in 256ths of a cell; and the last view's time, number and session.
+#: Sums over the views of a cell: its position in the tile as z, y, x of 6 bits each; the number of
+#: views; sums of the observed positions in 256ths of a cell; the last view's time, number, session.
 CELL_SUM = np.dtype(
     [
         ("key", "<u4"), ("views", "<u4"), ("sums", "<u4", 3), ("taken", "<f8"),
@@ -51,24 +48,24 @@ CELL_SUM = np.dtype(
 )  # fmt: skip
 CellSums = NDArray[Any]
 Cells = NDArray[Any]
-#: Cells of the next level are so many times as wide.
+#: Ratio of the cell widths of successive levels.
 FACTOR = 4
-#: Steps of a place within a cell.
+#: Steps of a position within a cell.
 _FINE = 256
-#: Points farther from the origin are left out, in cells: tiles are numbered exactly there.
+#: Greatest coordinate of a point, in cells: tile numbers are exact up to there.
 _FARTHEST = 2.0**40
-#: Tiles that one view is fused into, at most: those in which it fills most cells.
+#: Maximum number of tiles per view: those in which it fills most cells.
 MOST_TILES = 256
 
 
 @dataclass(frozen=True)
 class ViewStamp:
-    """Who saw it, and when.
+    """The identity and time of a view.
 
     Parameters
     ----------
-    number : of the view; of two of one time, the greater counts as later
-    taken : seconds since 1970; None where that is not known, which counts as before all others
+    number : number of the view; of two views with one time, the greater counts as later
+    taken : seconds since 1970; None if unknown, which counts as the earliest
     session : index of its session, or NO_SESSION
     """
 
@@ -79,35 +76,30 @@ class ViewStamp:
 
 @dataclass(frozen=True)
 class TimeScale:
-    """How times are told in 16 bits: steps of so many seconds since a time."""
+    """A 16-bit encoding of times, in steps of `step_s` seconds since `start`."""
 
     start: float
     step_s: float
 
     def holds(self, first: float, last: float) -> bool:
-        """Whether times between two can be told."""
+        """Return whether the scale can represent all times from `first` to `last`."""
         return self.start <= first and (last - self.start) / self.step_s < NO_TIME
 
 
 def time_scale(first: float, last: float) -> TimeScale:
-    """A scale for times between two, and for some that come before and many that come after."""
+    """Return a scale for times from `first` to `last`, with room before and more room after."""
     span = max(4.0 * (last - first), float(NO_TIME - 1))
     step = 2.0 ** np.ceil(np.log2(span / (NO_TIME - 1)))
     return TimeScale(float(np.floor(first - span / 8.0)), float(step))
 
 
-def seen_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlace, CellSums]:
-    """What one view saw, by tile.
+def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlace, CellSums]:
+    """Return the cells of one view by tile: CELL_SUM sorted by key, in at most MOST_TILES tiles.
 
     Parameters
     ----------
     points : (N, 3) metres, in the frame of the grid
-    cell_m : width of a cell
-    stamp : of the view
-
-    Returns
-    -------
-    cells : CELL_SUM of each tile, by key; of at most MOST_TILES tiles
+    cell_m : width of a cell, metres
     """
     places = points / cell_m
     places = places[(np.abs(places) < _FARTHEST).all(axis=1)]  # false for NaN
@@ -132,35 +124,34 @@ def seen_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlac
     rows["number"], rows["session"] = stamp.number, stamp.session
     begins = np.flatnonzero(is_tile[starts])
     ends = np.append(begins[1:], len(rows))
-    found = [
+    by_tile = [
         (tuple(tiles[starts[a]].tolist()), rows[a:b]) for a, b in zip(begins, ends, strict=True)
     ]
-    if len(found) > MOST_TILES:
-        found = sorted(found, key=lambda one: (-len(one[1]), one[0]))[:MOST_TILES]
-    return dict(found)
+    if len(by_tile) > MOST_TILES:
+        by_tile = sorted(by_tile, key=lambda item: (-len(item[1]), item[0]))[:MOST_TILES]
+    return dict(by_tile)
 
 
-def fused(parts: Sequence[CellSums]) -> CellSums:
-    """What several views saw of one tile, or several groups of them, together; by key."""
+def fuse_cells(parts: Sequence[CellSums]) -> CellSums:
+    """Return the fused cells of several views, or groups of views, of one tile; sorted by key."""
     rows = np.concatenate(parts) if parts else np.zeros(0, CELL_SUM)
     if len(rows) == 0:
         return rows
     rows = rows[np.lexsort((rows["number"], rows["taken"], rows["key"]))]
     starts = np.flatnonzero(np.append(True, rows["key"][1:] != rows["key"][:-1]))
     last = np.append(starts[1:], len(rows)) - 1
-    found: CellSums = rows[last]  # the latest of each cell
-    found["views"] = np.add.reduceat(rows["views"].astype(np.int64), starts)
-    found["sums"] = np.add.reduceat(rows["sums"], starts)
-    return found
+    result: CellSums = rows[last]  # the latest view of each cell
+    result["views"] = np.add.reduceat(rows["views"].astype(np.int64), starts)
+    result["sums"] = np.add.reduceat(rows["sums"], starts)
+    return result
 
 
-def encoded(rows: CellSums, scale: TimeScale | None) -> Cells:
-    """A tile as it is given out: CELL, in the order of z, y and x of the cells.
+def encode_cells(rows: CellSums, scale: TimeScale | None) -> Cells:
+    """Encode a tile of `fuse_cells` as CELL, in the order of z, y and x of the cells.
 
     Parameters
     ----------
-    rows : of `fused`
-    scale : of times; None where no view has one
+    scale : scale of times; None if no view has a time
     """
     cells = np.zeros(len(rows), CELL)
     key, views = rows["key"].astype(np.int64), rows["views"].astype(np.float64)
@@ -174,169 +165,157 @@ def encoded(rows: CellSums, scale: TimeScale | None) -> Cells:
     known = np.isfinite(rows["taken"])
     cells["taken"] = NO_TIME
     if scale is not None:
-        told = np.floor((rows["taken"][known] - scale.start) / scale.step_s)
-        cells["taken"][known] = np.clip(told, 0, NO_TIME - 1)
+        steps_since = np.floor((rows["taken"][known] - scale.start) / scale.step_s)
+        cells["taken"][known] = np.clip(steps_since, 0, NO_TIME - 1)
     return cells
 
 
-def coarser(parts: Mapping[TilePlace, Cells]) -> Cells:
-    """A tile of the next level.
+def coarsen_cells(parts: Mapping[TilePlace, Cells]) -> Cells:
+    """Return the cells (CELL) of a tile of the next level.
+
+    A coarse cell lies at the mean of its finer cells, has their greatest `seen`, and the session
+    and time of the last seen.
 
     Parameters
     ----------
-    parts : CELL of tiles in it, by their places; a tile (x, y, z) lies in the next level's
+    parts : CELL of the finer tiles by position; tile (x, y, z) lies in the next level's
         (x // 4, y // 4, z // 4)
-
-    Returns
-    -------
-    cells : CELL. A cell lies at the mean of the finer ones in it, was seen as often as the most
-        seen of them, and by whom and when the last seen of them was
     """
-    rows = [_shrunk(cells, place) for place, cells in parts.items()]
-    found = np.concatenate(rows) if rows else np.zeros(0, CELL)
-    if len(found) == 0:
-        return found
-    at = found["at"].astype(np.int64)
-    key = _key(at)
-    # NO_TIME is before all times; of equal times, the greater session: some order, and always it
-    when = (found["taken"].astype(np.int64) + 1) % (NO_TIME + 1)
-    who = (found["session"].astype(np.int64) + 1) % (NO_SESSION + 1)
-    order = np.lexsort((who, when, key))
-    found, at, key = found[order], at[order], key[order]
+    rows = [np.zeros(0, CELL)]
+    for place, part in parts.items():
+        scaled = part.copy()
+        corner = np.array(place) % FACTOR
+        scaled["at"] = (part["at"].astype(np.int64) + STEPS * corner) // FACTOR
+        rows.append(scaled)
+    cells = np.concatenate(rows)
+    if len(cells) == 0:
+        return cells
+    at = cells["at"].astype(np.int64)
+    key = _cell_keys(at)
+    # NO_TIME sorts before all times; of equal times the greater session counts, for a fixed order
+    when = (cells["taken"].astype(np.int64) + 1) % (NO_TIME + 1)
+    session = (cells["session"].astype(np.int64) + 1) % (NO_SESSION + 1)
+    order = np.lexsort((session, when, key))
+    cells, at, key = cells[order], at[order], key[order]
     starts = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
-    ends = np.append(starts[1:], len(found))
-    result: Cells = found[ends - 1]
+    ends = np.append(starts[1:], len(cells))
+    result: Cells = cells[ends - 1]
     result["at"] = np.add.reduceat(at, starts) // (ends - starts)[:, None]
-    result["seen"] = np.maximum.reduceat(found["seen"], starts)
+    result["seen"] = np.maximum.reduceat(cells["seen"], starts)
     return result
 
 
-def without(cells: Cells, place: TilePlace) -> Cells:
-    """The cells of a coarser tile that are not of one tile of the level below."""
+def remove_tile(cells: Cells, place: TilePlace) -> Cells:
+    """Return the cells of a coarser tile that lie outside one tile of the level below."""
     corner = np.array(place) % FACTOR
-    inside = (cells["at"] // (STEPS // FACTOR) == corner).all(axis=1)
-    kept: Cells = cells[~inside]
-    return kept
+    outside: Cells = cells[(cells["at"] // (STEPS // FACTOR) != corner).any(axis=1)]
+    return outside
 
 
-def joined(kept: Cells, added: Cells) -> Cells:
-    """Cells of two parts of one tile that share none, in order."""
-    both = np.concatenate([kept, added])
-    return both[np.argsort(_key(both["at"].astype(np.int64)), kind="stable")]
+def merge_cells(cells: Cells, others: Cells) -> Cells:
+    """Return the cells of two disjoint parts of one tile, in order."""
+    merged = np.concatenate([cells, others])
+    return merged[np.argsort(_cell_keys(merged["at"].astype(np.int64)), kind="stable")]
 
 
-def _shrunk(cells: Cells, place: TilePlace) -> Cells:
-    """Cells with their places as shares of the next level's tile."""
-    corner = np.array(place) % FACTOR
-    found = cells.copy()
-    found["at"] = (cells["at"].astype(np.int64) + STEPS * corner) // FACTOR
-    return found
-
-
-def _key(at: NDArray[np.int64]) -> NDArray[np.int64]:
+def _cell_keys(at: NDArray[np.int64]) -> NDArray[np.int64]:
     cell = at // (STEPS // SIDE)
     return (cell[:, 2] * SIDE + cell[:, 1]) * SIDE + cell[:, 0]
 
 
-# Cells of two sessions compared.
-
-#: Cells of a session, by tile; see cell_fusion.
+#: Cells of a session, by tile.
 SessionCells = dict[TilePlace, CellSums]
-#: States of a cell: nothing is known of it, the other session has it too, or has not.
+#: States of a cell: not observed by the other session, confirmed by it, or contradicted by it.
 UNSEEN, SAME, CHANGED = 0, 1, 2
-#: Frames that must have seen through a cell that changed, where there are so many.
+#: Number of frames that must see through a changed cell, or all if there are fewer.
 LEAST_THROUGH = 2
 
 
 @dataclass(frozen=True, eq=False)
 class VerdictCounts:
-    """What the frames of the other session said of cells.
+    """Counts of the verdicts of another session's frames on cells.
 
     Parameters
     ----------
-    agreeing : (N,) uint16 frames that saw a surface there
-    through : (N,) uint16 frames that saw through
+    agreeing : (N,) uint16 number of frames that saw a surface there
+    through : (N,) uint16 number of frames that saw through the cell
     """
 
     agreeing: NDArray[np.uint16]
     through: NDArray[np.uint16]
 
-    def add(self, said: Bytes) -> None:
-        """Count what one more frame said, (N,) of `frame_verdicts`."""
-        self.agreeing[said == AGREES] += 1
-        self.through[said == VIOLATES] += 1
+    def add(self, verdicts: Bytes) -> None:
+        """Count the verdicts of another frame, (N,) of `frame_verdicts`."""
+        self.agreeing[verdicts == AGREES] += 1
+        self.through[verdicts == VIOLATES] += 1
 
 
-def no_verdicts(count: int) -> VerdictCounts:
-    """Of so many cells that nothing was said of yet."""
+def empty_counts(count: int) -> VerdictCounts:
+    """Return counts of zero for so many cells."""
     return VerdictCounts(np.zeros(count, np.uint16), np.zeros(count, np.uint16))
 
 
-def add_views(cells: SessionCells, views: Sequence[SessionCells]) -> SessionCells:
-    """Cells of a session and what more of its frames saw, each of `seen_cells`, together."""
+def merge_views(cells: SessionCells, views: Sequence[SessionCells]) -> SessionCells:
+    """Return the cells of a session with those of more of its frames (`view_cells`) fused in."""
     parts: dict[TilePlace, list[CellSums]] = {place: [rows] for place, rows in cells.items()}
     for view in views:
         for place, rows in view.items():
             parts.setdefault(place, []).append(rows)
-    return {place: fused(parts[place]) for place in sorted(parts)}
+    return {place: fuse_cells(parts[place]) for place in sorted(parts)}
 
 
 def count_cells(cells: SessionCells) -> int:
-    """How many there are in all tiles."""
+    """Return the number of cells in all tiles."""
     return sum(len(rows) for rows in cells.values())
 
 
 def cell_positions(cells: SessionCells, cell_m: float) -> Floats:
-    """(N, 3) means of what frames saw in each cell, metres; by tile, then as they lie in it."""
-    found = [np.zeros((0, 3))]
+    """Return the mean position observed in each cell, (N, 3) metres, by tile and row."""
+    positions = [np.zeros((0, 3))]
     for place in sorted(cells):
         rows = cells[place]
         key = rows["key"].astype(np.int64)
         corner = np.stack([key % SIDE, key // SIDE % SIDE, key // SIDE**2], axis=1)
         within = (rows["sums"] + 0.5 * rows["views"][:, None]) / (rows["views"][:, None] * _FINE)
-        found.append((np.array(place) * SIDE + corner + within) * cell_m)
-    return np.concatenate(found)
+        positions.append((np.array(place) * SIDE + corner + within) * cell_m)
+    return np.concatenate(positions)
 
 
 def frame_verdicts(
     positions: Floats, surface: Surface, T_parent_sensor: Floats, p: OverlapParameters
 ) -> Bytes:
-    """What one frame says of cells.
+    """Return one frame's verdicts on cells: UNKNOWN, AGREES or VIOLATES, (N,) uint8.
 
     Parameters
     ----------
-    positions : (N, 3) of the cells, metres in the parent frame
-    T_parent_sensor : (4, 4)
-    p : tolerances, of the model
-
-    Returns
-    -------
-    (N,) uint8: UNKNOWN, AGREES or VIOLATES
+    positions : (N, 3) positions of the cells, metres in the parent frame
+    T_parent_sensor : (4, 4) pose of the frame
+    p : tolerances of the model
     """
-    said = np.full(len(positions), UNKNOWN, np.uint8)
+    verdicts = np.full(len(positions), UNKNOWN, np.uint8)
     ranges = np.linalg.norm(surface.points[surface.valid].astype(np.float64), axis=1)
     if not len(ranges):
-        return said
-    # about the sensor: float32 holds millimetres there, wherever the parent frame begins
+        return verdicts
+    # relative to the sensor, where float32 resolves millimetres however far the origin is
     offsets = positions - T_parent_sensor[:3, 3]
     reach = 1.1 * float(ranges.max()) + p.point_tolerance
     near = np.flatnonzero(np.einsum("ij,ij->i", offsets, offsets) < reach * reach)
     source = np.zeros((len(near), 6), np.float32)
     source[:, :3] = offsets[near]
-    turn = np.eye(4)
-    turn[:3, :3] = T_parent_sensor[:3, :3]
+    rotation = np.eye(4)
+    rotation[:3, :3] = T_parent_sensor[:3, :3]
     either_side = tolerances(replace(p, normal_cosine=-2.0))
-    said[near] = look_up(source, looked_up(surface, p), inverse(turn), either_side)
-    return said
+    verdicts[near] = look_up(source, looked_up(surface, p), inverse(rotation), either_side)
+    return verdicts
 
 
 def cell_states(counts: VerdictCounts, frames: int) -> Bytes:
-    """UNSEEN, SAME or CHANGED of each cell, (N,) uint8.
+    """Return the state of each cell, UNSEEN, SAME or CHANGED, (N,) uint8.
 
     Parameters
     ----------
-    counts : of what the other session's frames said
-    frames : how many they were
+    counts : counts over the frames of the other session
+    frames : number of these frames
     """
     states = np.full(len(counts.agreeing), UNSEEN, np.uint8)
     states[counts.through >= min(LEAST_THROUGH, frames)] = CHANGED

@@ -1,29 +1,15 @@
-"""How this package computes: loops compiled by one decorator, values of a frame kept, halves of a
-computation side by side.
+"""Compile loops to machine code, cache values per frame, and run two computations at once.
 
-`nogil` lets threads of the service run kernels side by side. `cache` compiles once per
-installation. Never `parallel` (a forked child dies in OpenMP), and never `fastmath`: the
-compiler may then neither reorder sums nor fuse products, so that one frame gives the same
-bytes on every processor. Division follows IEEE, as numpy's does: a check before each would
-keep the compiler from working on eight or sixteen numbers at once, so kernels guard their
-divisors themselves. For the same reason inner loops write one array each, unless the kernel is
-disjoint: then the compiler knows that what it writes is nothing it reads.
+Kernels release the interpreter's lock (`nogil`) and are compiled once per installation (`cache`).
+They never use `parallel` (a forked child dies in OpenMP) or `fastmath`, so the compiler neither
+reorders sums nor fuses products, and a frame gives the same bytes on every processor. Division
+follows IEEE without a check, which would prevent vectorization: kernels guard their divisors
+themselves. For the same reason an inner loop writes one array, unless the kernel is disjoint.
 
-A kernel's code holds that of the kernels it calls, and numbers of other files, so what is on
-disk is valid for these too, and not for its own file alone, which is all that numba looks at:
-see `_made_of`.
+    with cores.shared():  run_both(first, second)  -->  both results
 
-The rest saves time and changes no bit of a result. What depends on one frame alone is computed once
-for as long as the frame is in memory: a query is compared with ten frames, and each of these with
-it on several views. Its samples, the weights of its planes and its symmetries are the same each
-time.
-
-    with cores.lent():  both(first, second)  -->  both results
-
-Validation refines two directions that know nothing of each other, and a frame's signature and its
-artifact are made of one surface. Kernels hold no lock of the interpreter, so the halves of a query
-take little more than half of its time, while answers stay the same to the bit. Queries share the
-cores: once as many run as there are cores, each does its halves in turn.
+Validation refines two independent directions, and a frame's signature and artifact come from one
+surface: `run_both` computes such halves on two cores if one is free. Results stay equal to the bit.
 """
 
 from __future__ import annotations
@@ -45,85 +31,83 @@ import numpy as np
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: The processor that wheels and images carry machine code for, in LLVM's words. All of its
-#: features, so that code for it runs on whichever processor has these: x86-64 of 2013 and later.
+#: LLVM's name and features of the processor for which wheels and images carry machine code:
+#: x86-64 of 2013 and later.
 TARGET = "x86-64-v3"
 TARGET_FEATURES = (
     "+avx,+avx2,+bmi,+bmi2,+cx16,+f16c,+fma,+lzcnt,+movbe,+popcnt,+sahf,+sse3,+sse4.1,+sse4.2,"
     "+ssse3"
 )
 
-#: One thread at a time makes compilers of kernels; making one makes those that it calls.
-_making = threading.RLock()
+#: Guards the creation of compilers. Reentrant: a kernel creates the compilers of its callees.
+_compiler_lock = threading.RLock()
 
 
 class Kernel:
-    """A loop over arrays that is compiled, or loaded, when it is first called.
-
-    numba is imported then and not before: a service answers without it.
+    """A loop over arrays that imports numba and compiles, or loads its code, on its first call.
 
     Parameters
     ----------
-    function : of arrays and numbers
-    disjoint : whether no array that it writes shares memory with another that it is given
+    function : function of arrays and numbers
+    disjoint : whether no array that it writes shares memory with another argument
     """
 
     def __init__(self, function: Callable[..., Any], *, disjoint: bool = False) -> None:
         update_wrapper(self, function)
         self.function, self._disjoint = function, disjoint
-        self._known = dict(cast(dict[str, Any], getattr(function, "__globals__", {})))
+        self._globals = dict(cast(dict[str, Any], getattr(function, "__globals__", {})))
         self._compiler: Any = None
         self._call: Callable[..., Any] = self._first_call
         self._stamp = ""
 
-    #: Call the machine code: a query does so a thousand times, with nothing of Python between.
+    #: Resolves to the machine code, because a Python method would slow the thousand calls a query.
     __call__ = property(attrgetter("_call"))
 
     def _first_call(self, *arguments: Any) -> Any:
         return self.compiler(*arguments)
 
     def __reduce__(self) -> str:
-        """By its name, as a function is pickled."""
+        """Pickle by name, as functions are."""
         return self.function.__qualname__
 
     def __getattr__(self, name: str) -> Any:
-        """What numba's compiler of it has: signatures, statistics, assembly."""
+        """Return an attribute of numba's compiler: signatures, statistics, assembly."""
         if name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.compiler, name)
 
     @property
     def _numba_type_(self) -> Any:
-        """As numba sees a kernel that another kernel calls."""
+        """Return the type that numba uses when another kernel calls this one."""
         return self.compiler._numba_type_
 
     @property
     def compiler(self) -> Any:
-        """What compiles it: numba's, with our rules of what on disk is valid."""
+        """Return numba's compiler, with our cache."""
         if self._compiler is None:
-            with _making:
+            with _compiler_lock:
                 if self._compiler is None:
-                    self._call = self._compiler = self._make()
+                    self._call = self._compiler = self._create_compiler()
         return self._compiler
 
     @property
     def stamp(self) -> str:
-        """What its code on disk must have been made of; "" where there is none."""
+        """Return the stamp of valid code on disk; "" if there is no compiled code."""
         _ = self.compiler
         return self._stamp
 
-    def _make(self) -> Any:
+    def _create_compiler(self) -> Any:
         import numba
 
         from sceneprint.geometry.kernel_cache import DisjointCompiler, KernelCache
 
         options: dict[str, Any] = {"pipeline_class": DisjointCompiler} if self._disjoint else {}
         compiler: Any = numba.njit(nogil=True, error_model="numpy", **options)(self.function)
-        if compiler is not self.function:  # as it is under NUMBA_DISABLE_JIT, to be debugged
+        if compiler is not self.function:  # NUMBA_DISABLE_JIT returns the function itself
             cache = KernelCache(self.function)
-            self._stamp = repr(cache.stamp(_made_of(self.function, self._known)))
+            self._stamp = repr(cache.stamp(_hash_dependencies(self.function, self._globals)))
             compiler._cache = cache
-        self._known = {}
+        self._globals = {}
         return compiler
 
 
@@ -133,35 +117,32 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def disjoint_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """As `kernel`, of a loop none of whose arrays shares memory with one that it writes.
+    """Compile a loop whose written arrays share memory with no other argument; see `kernel`.
 
-    Only so can it look up scattered numbers (gather) for several elements at once: elsewhere the
-    compiler must take each store for one that may change what is looked up next.
+    The compiler can then vectorize look-ups of scattered numbers (gather): no store changes them.
     """
     return cast(Callable[P, R], Kernel(function, disjoint=True))
 
 
 class _Prefetch:
-    """Ask for a row of a table that will be read soon: `prefetch(table, row)` in a kernel.
+    """Load a row of a table into the processor's caches before it is read, within a kernel.
 
-    Where rows are scattered over a table larger than the caches, each would be waited for. Only a
-    hint: it changes no result, and in Python, without a compiler, it does nothing. As a kernel
-    does, it imports numba when it is compiled.
+    It hides the latency of scattered rows, changes no result, and does nothing in plain Python.
     """
 
     def __call__(self, table: Any, row: Any) -> None:
-        """Nothing to do in Python."""
+        """Do nothing in plain Python."""
 
     @property
     def _defn(self) -> Any:
-        """What writes its code, for the stamp of kernels that use it."""
+        """Return the function that generates its code, for the stamps of kernels that use it."""
         from sceneprint.geometry.kernel_cache import prefetch_row
 
         return prefetch_row._defn
 
     @property
     def _numba_type_(self) -> Any:
-        """As numba sees it in a kernel."""
+        """Return the type that numba uses in a kernel."""
         from numba.core.registry import cpu_target
 
         from sceneprint.geometry.kernel_cache import prefetch_row
@@ -172,15 +153,15 @@ class _Prefetch:
 prefetch = _Prefetch()
 
 
-def cached_at(function: Any) -> tuple[str, bool]:
-    """Folder of a kernel's machine code, and whether it is there for this processor."""
+def code_folder(function: Any) -> tuple[str, bool]:
+    """Return the folder of a kernel's machine code, and whether it has code for this processor."""
     cache = getattr(function, "_cache", None)
-    found: tuple[str, bool] = ("", False) if cache is None else cache.place()
-    return found
+    folder: tuple[str, bool] = ("", False) if cache is None else cache.folder()
+    return folder
 
 
 def runs_here() -> bool:
-    """Whether code for `TARGET` runs where we compile for."""
+    """Return whether code for `TARGET` runs on the processor that numba compiles for."""
     from numba.core.registry import cpu_target
 
     from sceneprint.geometry.kernel_cache import runs_on
@@ -188,49 +169,49 @@ def runs_here() -> bool:
     return runs_on(cpu_target.target_context.codegen().magic_tuple()[2])
 
 
-def _made_of(function: Callable[..., Any], known: dict[str, Any]) -> str:
-    """What a kernel's code on disk must have been made of, but for its own file.
+def _hash_dependencies(function: Callable[..., Any], names: dict[str, Any]) -> str:
+    """Return a digest of the kernels and constants of other files that a kernel may contain.
 
-    Modules import what they use before they define anything. So all that may be built into a
-    kernel is known when it is decorated, but for what stands in its own file.
+    numba's own stamp covers the kernel's file only. Imports precede definitions in our modules,
+    so `names` holds every dependency on another file.
 
     Parameters
     ----------
-    known : names of its module and their values when it was decorated
+    names : global names of the kernel's module, and their values when it was decorated
     """
-    told = []
-    for name, value in known.items():
+    texts = []
+    for name, value in names.items():
         key = (function.__module__, name, id(value))
-        if key not in _TOLD:
-            _TOLD[key] = _named(name, value, function.__module__)
-        told.append(_TOLD[key])
-    return hashlib.sha256(";".join(sorted(filter(None, told))).encode()).hexdigest()
+        if key not in _DEPENDENCIES:
+            _DEPENDENCIES[key] = _dependency_text(name, value, function.__module__)
+        texts.append(_DEPENDENCIES[key])
+    return hashlib.sha256(";".join(sorted(filter(None, texts))).encode()).hexdigest()
 
 
-#: By module, name and value: what a kernel of the module may be made of, told once.
-_TOLD: dict[tuple[str, str, int], str] = {}
+#: Texts of `_dependency_text` by module, name and identity of the value.
+_DEPENDENCIES: dict[tuple[str, str, int], str] = {}
 
 
-def _named(name: str, value: object, module: str) -> str:
-    """What of a module's name can be built into its kernels; "": nothing, or its own file's."""
+def _dependency_text(name: str, value: object, module: str) -> str:
+    """Return the content that a global name can add to a kernel; "" if none or its own file's."""
     if name.startswith("__"):
         return ""
-    if isinstance(value, ModuleType):  # all that it has may be named by the kernel
+    if isinstance(value, ModuleType):  # a kernel may use any of its attributes
         ours = value.__name__.startswith("sceneprint.")
         inside = vars(value).items() if ours else ()
         return ";".join(
-            f"{name}.{key}={told}"
-            for key, one in sorted(inside)
-            if not key.startswith("__") and (told := _constant_text(one, module))
+            f"{name}.{key}={text}"
+            for key, attribute in sorted(inside)
+            if not key.startswith("__") and (text := _constant_text(attribute, module))
         )
-    told = _constant_text(value, module)
-    return f"{name}={told}" if told else ""
+    text = _constant_text(value, module)
+    return f"{name}={text}" if text else ""
 
 
 def _constant_text(value: Any, module: str) -> str:
-    """What of a value can be built into a kernel of a module; "": nothing, or its own file's."""
+    """Return the content that a value can add to a kernel; "" if none or its own file's."""
     if isinstance(value, tuple):
-        return f"({','.join(_constant_text(one, module) for one in value)})"
+        return f"({','.join(_constant_text(item, module) for item in value)})"
     if isinstance(value, bool | int | float | complex | str):
         return repr(value)
     if isinstance(value, np.ndarray):
@@ -239,22 +220,20 @@ def _constant_text(value: Any, module: str) -> str:
         return ""
     if isinstance(value, Kernel):
         return value.stamp
-    made = getattr(value, "_defn", None)  # an intrinsic, or `prefetch`
-    return "" if made is None else _code(made.__code__)
+    generator = getattr(value, "_defn", None)  # an intrinsic, or `prefetch`
+    return "" if generator is None else _code_text(generator.__code__)
 
 
-def _code(code: CodeType) -> str:
-    """The bytes of a function and of those within it."""
+def _code_text(code: CodeType) -> str:
+    """Return the bytecode of a function and of its inner functions."""
     inner = [
-        _code(one)
-        if isinstance(one, CodeType)
-        else repr(sorted(map(repr, one)) if isinstance(one, frozenset) else one)
-        for one in code.co_consts
+        _code_text(item)
+        if isinstance(item, CodeType)
+        else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
+        for item in code.co_consts
     ]
     return f"{code.co_code!r}{code.co_names}{inner}"
 
-
-# Values that depend on one frame alone.
 
 F = TypeVar("F")
 
@@ -262,25 +241,23 @@ F = TypeVar("F")
 def cached_per_frame(
     function: Callable[Concatenate[F, P], R],
 ) -> Callable[Concatenate[F, P], R]:
-    """Keep what a function returns of a surface, patches, or geometry, until that is freed.
+    """Cache results of a function of a surface, patches or a geometry until that is freed.
 
-    The first argument is known by its identity and must not change; the others must be hashable.
-    What is returned is shared, so callers must not write into it.
+    The first argument is compared by identity and must not change; the others must be hashable.
+    Results are shared, so callers must not write into them.
     """
-    kept: WeakKeyDictionary[F, dict[Hashable, R]] = WeakKeyDictionary()
+    results: WeakKeyDictionary[F, dict[Hashable, R]] = WeakKeyDictionary()
 
     @wraps(function)
     def cached(frame: F, /, *args: P.args, **kwargs: P.kwargs) -> R:
-        own = kept.setdefault(frame, {})
+        own = results.setdefault(frame, {})
         key = args, tuple(kwargs.items())
-        if key not in own:  # two threads may both work it out, and get the same
+        if key not in own:  # two threads may both compute it, with equal results
             own[key] = function(frame, *args, **kwargs)
         return own[key]
 
     return cached
 
-
-# Two halves of a computation at once, where a core is free for the second.
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -291,7 +268,7 @@ class Cores:
 
     Parameters
     ----------
-    count : of them; with 1 nothing runs at once
+    count : number of cores; with 1 nothing runs in parallel
     """
 
     def __init__(self, count: int) -> None:
@@ -301,20 +278,20 @@ class Cores:
         self._pool = ThreadPoolExecutor(max(count - 1, 1), thread_name_prefix="half")
 
     @contextmanager
-    def lent(self) -> Iterator[None]:
-        """What runs within may take a second core wherever `both` is called."""
+    def shared(self) -> Iterator[None]:
+        """Occupy a core, and let calls of `run_both` within the context use a second one."""
         with self._lock:
             self._busy += 1
-        token = _lent.set(self)
+        token = _cores.set(self)
         try:
             yield
         finally:
-            _lent.reset(token)
+            _cores.reset(token)
             with self._lock:
                 self._busy -= 1
 
-    def both(self, first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
-        """See `both` of this module."""
+    def run_both(self, first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
+        """Run two computations, in parallel if a core is free; see `run_both` of this module."""
         with self._lock:
             free = self._busy < self._count
             self._busy += free
@@ -326,7 +303,7 @@ class Cores:
                 return first(), later.result()
             finally:
                 if not later.cancel():
-                    later.exception()  # it ends before its arguments do
+                    later.exception()  # wait: it may still use arguments of the caller
         finally:
             with self._lock:
                 self._busy -= 1
@@ -336,14 +313,14 @@ class Cores:
         self._pool.shutdown()
 
 
-_lent: ContextVar[Cores | None] = ContextVar("cores", default=None)
+_cores: ContextVar[Cores | None] = ContextVar("cores", default=None)
 
 
-def both(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
-    """The results of two computations that share nothing they write.
+def run_both(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
+    """Return the results of two computations that write no common memory.
 
-    They run at once where `Cores.lent` allows and a core is free, else one after the other. What
-    the first raises is raised, else what the second does.
+    They run in parallel within `Cores.shared` if a core is free, else one after the other.
+    Exceptions of the first take precedence.
     """
-    cores = _lent.get()
-    return (first(), second()) if cores is None else cores.both(first, second)
+    cores = _cores.get()
+    return (first(), second()) if cores is None else cores.run_both(first, second)

@@ -1,10 +1,8 @@
-"""How numba compiles kernels, and where their machine code is kept: in numba's folders, or in
-those that a wheel or an image brought.
+"""Find machine code of kernels in numba's folders, or in those of a wheel or an image.
 
-numba keeps code by the processor that it was compiled on. What comes with an installation was
-compiled for any processor of a kind (`TARGET`). It is found in numba's folder and beside the
-sources, whether that folder may be written to or not. Loaded apart from the kernels: it imports
-numba, which takes long.
+numba files code under the processor that compiled it. Code that comes with an installation was
+compiled for `TARGET` and lies in numba's folder or beside the sources, which may be read-only.
+This module imports numba, which takes long, so `kernel` imports it on the first call.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
 
 
 class DisjointCompiler(Compiler):
-    """Compiles kernels none of whose arrays shares memory with one that they write."""
+    """Compile kernels whose written arrays share memory with no other argument."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -36,9 +34,9 @@ class DisjointCompiler(Compiler):
 
 
 def _prefetch_row(_context: Any, table: Any, row: Any) -> Any:
-    """Ask for the first 128 bytes, two cache lines, of a row of a C-contiguous table.
+    """Prefetch the first 128 bytes (two cache lines) of a row of a C-contiguous table.
 
-    Arguments are types; the answer is a signature, and what writes the code of a call.
+    Arguments are numba types. Returns the signature and the generator of a call's code.
     """
     signature = types.void(table, row)
 
@@ -53,11 +51,11 @@ def _prefetch_row(_context: Any, table: Any, row: Any) -> Any:
         )
         start = builder.bitcast(array.data, byte.as_pointer())
         start = builder.gep(start, [builder.mul(at, length)])
-        # to be read, and to be kept in all levels of the cache, as data
-        how = [ir.Constant(number, value) for value in (0, 3, 1)]
+        # for reading, into all levels of the cache, as data
+        flags = [ir.Constant(number, value) for value in (0, 3, 1)]
         for offset in (0, 64):
             line = builder.gep(start, [ir.Constant(ir.IntType(64), offset)])
-            builder.call(function, [line, *how])
+            builder.call(function, [line, *flags])
         return context.get_dummy_value()
 
     return signature, generate
@@ -67,10 +65,10 @@ prefetch_row: Any = intrinsic(_prefetch_row)
 
 
 class _BesideTheSource(InTreeCacheLocator):
-    """The folder of a package that may not be written to, where no other folder may be either."""
+    """Locate code beside the sources if no folder is writable."""
 
     def ensure_cache_path(self) -> None:
-        """Nothing is written to it."""
+        """Accept a read-only folder: nothing is written to it."""
 
 
 class _Locations(CompileResultCacheImpl):
@@ -78,12 +76,7 @@ class _Locations(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """The machine code of one kernel on disk.
-
-    Parameters
-    ----------
-    function : the kernel
-    """
+    """The machine code of one kernel on disk."""
 
     _impl_class = _Locations
 
@@ -91,51 +84,51 @@ class KernelCache(FunctionCache):
         super().__init__(function)
         locator = self._impl.locator
         beside = InTreeCacheLocator(function, locator._py_file).get_cache_path()
-        self._brought = IndexDataCacheFile(
+        self._shipped = IndexDataCacheFile(
             beside, self._impl.filename_base, self._cache_file._source_stamp
         )
         self._read_only = isinstance(locator, _BesideTheSource)
 
-    def stamp(self, made_of: str) -> object:
-        """Have code be valid only if it was made of this; returns that and its own file."""
-        stamp = (self._cache_file._source_stamp, made_of)
-        self._cache_file._source_stamp = self._brought._source_stamp = stamp
+    def stamp(self, dependencies: str) -> object:
+        """Require code on disk to have this digest of dependencies; return the whole stamp."""
+        stamp = (self._cache_file._source_stamp, dependencies)
+        self._cache_file._source_stamp = self._shipped._source_stamp = stamp
         return stamp
 
-    def place(self) -> tuple[str, bool]:
-        """Folder of valid code for this processor and whether there is any."""
+    def folder(self) -> tuple[str, bool]:
+        """Return the folder of valid code for this processor, and whether it has any."""
         target = cpu_target.target_context.codegen().magic_tuple()
-        brought = self._brought_for(target)
-        for file in (self._brought, self._cache_file):
-            if brought is not None and any(one[1] == brought for one in file._load_index()):
+        shipped = self._shipped_target(target)
+        for file in (self._shipped, self._cache_file):
+            if shipped is not None and any(key[1] == shipped for key in file._load_index()):
                 return file._cache_path, True
-        found = any(one[1] == target for one in self._cache_file._load_index())
-        return "" if self._read_only else self._cache_path, found
+        compiled = any(key[1] == target for key in self._cache_file._load_index())
+        return "" if self._read_only else self._cache_path, compiled
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep code for the next process, where there is a folder for it."""
+        """Save code for the next process if the folder is writable."""
         if not self._read_only:
             super().save_overload(sig, data)
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Code that was brought, or that was compiled here; None where it is yet to be."""
+        """Return shipped or locally compiled code; None if there is none."""
         signature, target, code = self._index_key(sig, target_context.codegen())
-        brought = self._brought_for(target)
-        for file in (self._brought, self._cache_file) if brought is not None else ():
-            data = file.load((signature, brought, code))
+        shipped = self._shipped_target(target)
+        for file in (self._shipped, self._cache_file) if shipped is not None else ():
+            data = file.load((signature, shipped, code))
             if data is not None:
                 return self._impl.rebuild(target_context, data)
         return super()._load_overload(sig, target_context)
 
     @staticmethod
-    def _brought_for(target: tuple[str, str, str]) -> tuple[str, str, str] | None:
-        """What brought code was compiled for, if it runs where code for `target` does."""
+    def _shipped_target(target: tuple[str, str, str]) -> tuple[str, str, str] | None:
+        """Return the target of shipped code; None if it does not run on `target`."""
         triple, name, features = target
         if name not in (TARGET, binding.get_host_cpu_name()) or not runs_on(features):
-            return None  # an operator wants code for another processor
+            return None  # an operator configured another processor
         return triple, TARGET, TARGET_FEATURES
 
 
 def runs_on(features: str) -> bool:
-    """Whether a processor has what brought code needs; "+avx2,-avx512bw,..." as LLVM has it."""
+    """Return whether a processor with these LLVM features ("+avx2,...") runs shipped code."""
     return set(TARGET_FEATURES.split(",")) <= set(features.split(","))

@@ -1,9 +1,6 @@
-"""Rigid transforms as (4, 4) matrices: to move, to invert, to compare, to fit, to average.
+"""Apply, invert, compare, fit and average rigid transforms, as (4, 4) matrices.
 
-poses (n, 4, 4)  --average_poses-->  PoseAverage
-directions (n, 3)  --mean_direction-->  (3,)
-
-x_b = T_b_a @ x_a. Translations in metres, angles in radians.
+x_b = T_b_a @ x_a. Translations are in metres, angles in radians.
 """
 
 from __future__ import annotations
@@ -19,7 +16,7 @@ from sceneprint.types import Floats, Ints64
 
 
 def inverse(T: Floats) -> Floats:
-    """T_a_b of T_b_a, exact for a rigid transform: (4, 4)."""
+    """Return T_a_b of T_b_a, (4, 4), exactly for a rigid transform."""
     result = np.eye(4)
     result[:3, :3] = T[:3, :3].T
     result[:3, 3] = -T[:3, :3].T @ T[:3, 3]
@@ -27,7 +24,7 @@ def inverse(T: Floats) -> Floats:
 
 
 def inverses(transforms: Floats) -> Floats:
-    """The inverse of each of (n, 4, 4) rigid transforms."""
+    """Return the inverses of (n, 4, 4) rigid transforms."""
     result = np.zeros_like(transforms)
     result[:, :3, :3] = transforms[:, :3, :3].transpose(0, 2, 1)
     result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], transforms[:, :3, 3])
@@ -35,61 +32,57 @@ def inverses(transforms: Floats) -> Floats:
     return result
 
 
-def moved(T: Floats, points: Floats) -> Floats:
-    """Points (n, 3) of frame a, in frame b, by T_b_a."""
+def transform_points(T: Floats, points: Floats) -> Floats:
+    """Return points (n, 3) of frame a in frame b, by T_b_a."""
     result: Floats = points @ T[:3, :3].T + T[:3, 3]
     return result
 
 
 def rotation_angle(R: Floats) -> float:
-    """||log R||, the angle of a rotation (3, 3), in [0, pi]."""
-    # by atan2 rather than acos: exact for angles near 0 as well
+    """Return the angle of a rotation (3, 3), ||log R||, in [0, pi]."""
+    # atan2 is exact for angles near 0, unlike acos
     sine = math.sqrt((R[2, 1] - R[1, 2]) ** 2 + (R[0, 2] - R[2, 0]) ** 2 + (R[1, 0] - R[0, 1]) ** 2)
     return math.atan2(sine, float(R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
 
 
-def difference(a: Floats, b: Floats) -> tuple[float, float]:
-    """How far apart two transforms between the same two frames are.
-
-    Returns
-    -------
-    metres between where they put the origin of the source frame, and radians between their
-    rotations
+def pose_difference(a: Floats, b: Floats) -> tuple[float, float]:
+    """Return the metres between the translations of two transforms, and the radians between
+    their rotations.
     """
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(a[:3, :3] @ b[:3, :3].T)
 
 
 def are_near(transforms: Floats, T: Floats, metres: float, radians: float) -> NDArray[np.bool_]:
-    """Which of some transforms (n, 4, 4) are no farther than that from T in both, (n,)."""
+    """Return a mask (n,) of the transforms (n, 4, 4) within `metres` and `radians` of T."""
     apart = np.linalg.norm(transforms[:, :3, 3] - T[:3, 3], axis=1)
     cosines = (np.einsum("nij,ij->n", transforms[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
-    found: NDArray[np.bool_] = (apart <= metres) & (cosines >= math.cos(radians))
-    return found
+    near: NDArray[np.bool_] = (apart <= metres) & (cosines >= math.cos(radians))
+    return near
 
 
-def distinct(
+def select_distinct(
     transforms: Floats, scores: Floats, metres: float, radians: float, most: int
 ) -> list[int]:
-    """Indices of the best few transforms (n, 4, 4) that differ from each other, best first.
+    """Return the indices of the best transforms that differ from each other, best first.
 
     Parameters
     ----------
-    transforms, scores : one for one, greater is better
-    metres, radians : two that are nearer than both are one
-    most : of them
+    transforms, scores : (n, 4, 4) and (n,); greater scores are better
+    metres, radians : transforms within both of a better one are omitted
+    most : maximum number of indices
     """
     order = np.argsort(-scores, kind="stable")
     chosen = np.empty(min(most, len(order)), np.int64)
-    found = _choose(np.ascontiguousarray(transforms), order, metres, math.cos(radians), chosen)
-    kept: list[int] = chosen[:found].tolist()
-    return kept
+    count = _select(np.ascontiguousarray(transforms), order, metres, math.cos(radians), chosen)
+    indices: list[int] = chosen[:count].tolist()
+    return indices
 
 
 @kernel
-def _choose(
+def _select(
     transforms: Floats, order: Ints64, metres: float, cosine: float, chosen: Ints64
 ) -> int:  # fmt: skip
-    """Those in an order that are near none chosen before, as `are_near` has it; how many."""
+    """Fill `chosen` with transforms that are not near an earlier choice; return their number."""
     found = 0
     for i in order:
         if found == len(chosen):
@@ -112,7 +105,7 @@ def _choose(
 
 
 def nearest_rotation(M: Floats) -> Floats:
-    """The rotation (3, 3) nearest to a matrix, in the least-squares sense."""
+    """Return the rotation (3, 3) nearest to a matrix in the least-squares sense."""
     u, _, vt = np.linalg.svd(M)
     fix = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
     result: Floats = u @ fix @ vt
@@ -121,10 +114,10 @@ def nearest_rotation(M: Floats) -> Floats:
 
 @kernel
 def rotation_of_covariance(H: Floats, R: Floats) -> None:
-    """The rotation R (3, 3) that maximises trace(R H^T), for H = sum of b a^T: Horn 1987.
+    """Write to R the rotation (3, 3) that maximises trace(R H^T) for H = sum b a^T (Horn 1987).
 
-    The unit quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix,
-    found by cyclic Jacobi rotations.
+    Its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix,
+    computed by cyclic Jacobi rotations.
     """
     N = np.empty((4, 4))
     # H[i, j] = sum b_i a_j; Horn's S_xy = sum a_x b_y = H[y, x]
@@ -179,8 +172,8 @@ def rotation_of_covariance(H: Floats, R: Floats) -> None:
 
 
 @kernel
-def turned(R: Floats, omega: Floats, result: Floats) -> None:
-    """result = exp([omega]x) R, by Rodrigues' formula; omega (3,) radians."""
+def apply_rotation(R: Floats, omega: Floats, result: Floats) -> None:
+    """Write exp([omega]x) R to `result`, by Rodrigues' formula; omega (3,) radians."""
     angle = np.sqrt(omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2)
     a, b = 1.0, 0.5  # sin(angle) / angle and (1 - cos(angle)) / angle^2, at 0
     if angle > 1e-9:
@@ -205,7 +198,7 @@ def turned(R: Floats, omega: Floats, result: Floats) -> None:
 
 @kernel
 def solve_positive(A: Floats, b: Floats, x: Floats) -> bool:
-    """Solve A x = b by Cholesky; A (n, n) symmetric is overwritten. False where not positive."""
+    """Solve A x = b by Cholesky and overwrite A (n, n), symmetric. False if not positive."""
     n = len(b)
     for j in range(n):
         diagonal = A[j, j]
@@ -232,29 +225,25 @@ def solve_positive(A: Floats, b: Floats, x: Floats) -> bool:
     return True
 
 
-# Several poses averaged robustly, as the votes of matches.
-
-
 @dataclass(frozen=True)
 class AveragingParameters:
-    """Which votes agree."""
+    """The distances within which a vote agrees with the medoid."""
 
-    agree_m: float = 0.15  #: with the medoid, metres
-    agree_rad: float = math.radians(10.0)
+    agree_m: float = 0.15  #: metres
+    agree_rad: float = math.radians(10.0)  #: radians
 
 
 @dataclass(frozen=True, eq=False)
 class PoseAverage:
-    """The pose that most votes agree on.
+    """The pose on which most votes agree.
 
     Parameters
     ----------
     T : (4, 4) T_parent_sensor
-    spread_m, spread_rad : root mean square difference of the votes that agree from T; 0 where
-        there is one
-    support : how many votes agree
-    votes : how many there were
-    members : (support,) which of them agree, rising
+    spread_m, spread_rad : root mean square difference of the agreeing votes from T
+    support : number of votes that agree
+    votes : number of all votes
+    members : (support,) ascending indices of the votes that agree
     """
 
     T: Floats
@@ -266,10 +255,10 @@ class PoseAverage:
 
 
 def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAverage:
-    """The mean of the votes near their medoid.
+    """Return the mean of the votes near their medoid.
 
-    The medoid is the vote with most others near it, and among those with equally many the one to
-    which they are nearest; ties fall to the earlier, which ranked higher.
+    The medoid is the vote with most others near it; of equals, the vote with the nearest
+    others, then the earlier, which ranks higher.
 
     Parameters
     ----------
@@ -277,13 +266,13 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
 
     Raises
     ------
-    ValueError : no poses, or not (n, 4, 4).
+    ValueError : there are no poses, or they are not (n, 4, 4)
     """
     p = p or AveragingParameters()
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise ValueError(f"poses of shape {poses.shape}, not (n, 4, 4) with n of 1 or more")
-    apart = np.array([[difference(a, b) for b in poses] for a in poses])
-    # one measure of both: how many tolerances apart
+    apart = np.array([[pose_difference(a, b) for b in poses] for a in poses])
+    # metres and radians in one unit: tolerances
     scaled = np.hypot(apart[..., 0] / p.agree_m, apart[..., 1] / p.agree_rad)
     near = (apart[..., 0] <= p.agree_m) & (apart[..., 1] <= p.agree_rad)
     cost = np.where(near, scaled, 0.0).sum(axis=1)
@@ -292,23 +281,21 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     T = np.eye(4)
     T[:3, :3] = nearest_rotation(members[:, :3, :3].sum(axis=0))
     T[:3, 3] = members[:, :3, 3].mean(axis=0)
-    left = np.array([difference(T, one) for one in members])
-    metres, radians = np.sqrt((left**2).mean(axis=0)).tolist()
-    which = np.flatnonzero(near[medoid])
-    return PoseAverage(T, metres, radians, len(members), len(poses), which)
+    residuals = np.array([pose_difference(T, member) for member in members])
+    metres, radians = np.sqrt((residuals**2).mean(axis=0)).tolist()
+    indices = np.flatnonzero(near[medoid])
+    return PoseAverage(T, metres, radians, len(members), len(poses), indices)
 
 
 def mean_direction(directions: Floats, within: float) -> Floats | None:
-    """The mean of those unit vectors that most of the others are near: (3,), of length 1.
+    """Return the mean direction, (3,) of length 1, of the largest group of unit vectors.
+
+    None if at most half of the vectors agree.
 
     Parameters
     ----------
-    directions : (n, 3)
-    within : radians that two may differ by
-
-    Returns
-    -------
-    direction : or None where there are none, or no more than half of them agree
+    directions : (n, 3) unit vectors
+    within : maximum angle between two that agree, radians
     """
     near = directions @ directions.T >= math.cos(within)
     agree = near.sum(axis=1)
@@ -319,32 +306,34 @@ def mean_direction(directions: Floats, within: float) -> Floats | None:
     return result
 
 
-# Gravity: the transforms that are left where both frames know which way is up.
-
-#: Unit vectors (3,), up in the coordinates of source and target; None where it is not known.
+#: Unit vectors (3,), up in the coordinates of source and target; None if unknown.
 Ups = tuple[Floats | None, Floats | None]
 NO_UPS: Ups = (None, None)
 
 
 @dataclass(frozen=True)
 class GravityParameters:
-    """How far transforms may tilt against `up`; the room is for its noise."""
+    """The maximum tilts of transforms against `up`, with room for its noise; radians."""
 
-    gate: float = math.radians(15.0)  #: of two patches that correspond, their angles to up
-    proposed_tilt: float = math.radians(20.0)  #: most of a hypothesis that is yet to be refined
-    refined_tilt: float = math.radians(10.0)  #: most of one that is refined: beyond, `up` is wrong
-    rival_tilt: float = math.radians(20.0)  #: from which on a rival is impossible
-    floor_tilt: float = math.radians(30.0)  #: within which of `up` a frame's floor is looked for
-    floor_stride: int = 7  #: of the pixels that it is looked for among
+    gate: float = math.radians(15.0)  #: greatest difference of two corresponding patches' slopes
+    proposed_tilt: float = math.radians(20.0)  #: greatest tilt of an unrefined hypothesis
+    refined_tilt: float = math.radians(10.0)  #: greatest tilt of a refined pose
+    rival_tilt: float = math.radians(20.0)  #: least tilt at which a rival is impossible
+    floor_tilt: float = math.radians(30.0)  #: greatest angle between a floor's normal and `up`
+    floor_stride: int = 7  #: stride of the pixels in the search for the floor
 
 
 def tilts(transforms: Floats, ups: Ups) -> Floats:
-    """Angles between up carried over by each transform and up as the target has it: (n,) radians.
+    """Return the angles between the transformed `up` of the source and that of the target.
 
     Parameters
     ----------
     transforms : (n, 4, 4) T_target_source
-    ups : of source and target; 0 for all where one is not known
+    ups : up vectors of source and target; if one is unknown, all angles are 0
+
+    Returns
+    -------
+    angles : (n,) radians
     """
     source, target = ups
     if source is None or target is None:
@@ -356,19 +345,19 @@ def tilts(transforms: Floats, ups: Ups) -> Floats:
 
 
 def tilt_of(T: Floats | None, ups: Ups) -> float | None:
-    """By how much one transform tilts, radians; None where that cannot be said."""
+    """Return the tilt of one transform, radians; None if it or an `up` is unknown."""
     if T is None or ups[0] is None or ups[1] is None:
         return None
     return float(tilts(T[None], ups)[0])
 
 
 def are_level(transforms: Floats, ups: Ups, most: float) -> NDArray[np.bool_]:
-    """Which transforms tilt by no more than that: all of them where an up is not known."""
+    """Return a mask of the transforms that tilt by at most `most`: all if an `up` is unknown."""
     level: NDArray[np.bool_] = tilts(transforms, ups) <= most
     return level
 
 
 def slopes(normals: Floats, up: Floats) -> Floats:
-    """Angles of normals (n, 3) to up: (n,) radians, 0 for floors and pi/2 for walls."""
+    """Return the angles of normals (n, 3) to up, (n,) radians: 0 for floors, pi/2 for walls."""
     angles: Floats = np.arccos(np.clip(normals @ up, -1.0, 1.0))
     return angles

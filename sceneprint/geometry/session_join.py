@@ -1,25 +1,21 @@
-"""How two runs lie to each other: the associations to believe, and the transform most agree on.
+"""Judge associations between two runs by loops, and fit the transform between the runs.
 
-edges, poses of both runs  --verdicts-->  agree, disagree, alone
-votes T_a_b, each at its place  --join-->  Join
+edges, paths of both runs  --judge_edges-->  EdgeVerdicts
+votes T_a_b with positions  --join_sessions-->  SessionJoin
 
-A wrong transform may look perfect to both frames that it joins. But a robot that took both frames
-took others beside them, and knows how it moved from one to the next: two edges a short way apart
-are a loop, from a frame over one edge, along the other run, back over the other edge and along the
-first run. Where it does not close, one of the edges is wrong. Odometry is believed over short ways
-only, so poses that drift do no harm, and no run need know where the other began (pairwise
-consistency: Mangelson et al., ICRA 2018, with odometry's doubt as a tolerance).
+A wrong transform may look perfect to both of its frames. Two edges close to each other form a loop
+with the odometry between their frames; if it does not close, one of the edges is wrong. Loops use
+odometry over short ways only, so drift does no harm and the runs need no common origin (pairwise
+consistency: Mangelson et al., ICRA 2018, with the odometry's uncertainty as a tolerance).
 
-Two edges of one viewpoint share their mistakes: what looks like another place from there looks like
-it in every frame that a robot takes while it stands still. So an edge counts as supported only
-where a loop closes with an edge whose frame was taken from elsewhere, on either run. Nor do all
-edges together tell the sides of a symmetric object apart, since all are mistaken by the same turn.
-The run itself does: an edge within one run that lies farther from its odometry than any odometry
-drifts is not supported.
+Edges of one viewpoint share their errors. So an edge is supported only if it closes a loop with an
+edge of another viewpoint on either run. Loops cannot tell the sides of a symmetric object apart,
+because all edges are wrong by the same rotation; within one run, edges that deviate from its
+odometry by more than odometry drifts are therefore not supported.
 
 Each association of a frame of run b with a frame of run a is a vote for the transform between
-their parent frames. Votes are compared where their frames are, never at the origin of b: a degree
-is nothing there, and metres at an origin far away.
+their parent frames. Votes are compared at their frames, not at the origin of b: a degree moves a
+distant origin by metres.
 """
 
 from __future__ import annotations
@@ -32,20 +28,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.rigid import distinct, nearest_rotation, rotation_angle
+from sceneprint.geometry.rigid import nearest_rotation, rotation_angle, select_distinct
 from sceneprint.types import Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """What associations say of two parent frames.
+    """The transforms between two parent frames that associations vote for.
 
     Parameters
     ----------
     transforms : (n, 4, 4) T_a_b
-    views : (n, 4, 4) T_b_source, where the frame of each was
-    source, target : (n,) its frames in b and in a
-    weights : (n,) positive
+    views : (n, 4, 4) T_b_source, poses of the source frames
+    source, target : (n,) identifiers of the frames in b and in a
+    weights : (n,) positive weights
     """
 
     transforms: Floats
@@ -56,50 +52,48 @@ class Votes:
 
     @property
     def places(self) -> Floats:
-        """Where the frame of each was, (n, 3) metres in b."""
+        """Return the positions of the source frames, (n, 3) metres in b."""
         places: Floats = self.views[:, :3, 3]
         return places
 
 
-def votes_of(
+def association_votes(
     transforms: Floats, source_poses: Floats, target_poses: Floats,
     source: NDArray[np.int64], target: NDArray[np.int64], weights: Floats,
 ) -> Votes:  # fmt: skip
-    """Associations as votes.
+    """Return associations as votes.
 
     Parameters
     ----------
     transforms : (n, 4, 4) T_target_source
     source_poses, target_poses : (n, 4, 4) T_b_source, T_a_target
-    source, target, weights : as in Votes
+    source, target, weights : fields of Votes
     """
     R = source_poses[:, :3, :3].transpose(0, 2, 1)
-    whole = np.zeros_like(transforms)
-    there = target_poses @ transforms
-    whole[:, :3, :3] = there[:, :3, :3] @ R
+    votes = np.zeros_like(transforms)
+    in_a = target_poses @ transforms
+    votes[:, :3, :3] = in_a[:, :3, :3] @ R
     places = source_poses[:, :3, 3]
-    whole[:, :3, 3] = there[:, :3, 3] - np.einsum("nij,nj->ni", whole[:, :3, :3], places)
-    whole[:, 3, 3] = 1.0
-    return Votes(whole, source_poses, source, target, weights)
+    votes[:, :3, 3] = in_a[:, :3, 3] - np.einsum("nij,nj->ni", votes[:, :3, :3], places)
+    votes[:, 3, 3] = 1.0
+    return Votes(votes, source_poses, source, target, weights)
 
-
-# Runs: where a robot was, frame by frame, and how far it went from one to the next.
 
 Ints64 = NDArray[np.int64]
 
-#: The way across a gap in odometry, metres: no loop reaches over it.
-_BROKEN = 1e6
+#: Length of a gap in odometry, metres: longer than any loop.
+_GAP_M = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class RobotPath:
-    """Where a robot was, frame by frame.
+    """The poses of a robot frame by frame.
 
     Parameters
     ----------
-    poses : (m, 4, 4) T_parent_sensor; NaN where not known
-    metres, radians : (m,) way up to each frame; very long across a gap in odometry, NaN without a
-        pose
+    poses : (m, 4, 4) T_parent_sensor; NaN if unknown
+    metres, radians : (m,) path length up to each frame, very long across a gap in odometry;
+        `metres` is NaN without a pose
     """
 
     poses: Floats
@@ -107,13 +101,13 @@ class RobotPath:
     radians: Floats
 
 
-def run_of(poses: Floats, parents: Ints64) -> RobotPath:
-    """A run from the poses of its frames, in the order in which they were taken.
+def robot_path(poses: Floats, parents: Ints64) -> RobotPath:
+    """Return the path of a run.
 
     Parameters
     ----------
-    poses : (m, 4, 4) T_parent_sensor; NaN where not known
-    parents : (m,) which parent frame each is given in; odometry is broken where it changes
+    poses : (m, 4, 4) T_parent_sensor in the order of time; NaN if unknown
+    parents : (m,) identifiers of the parent frames; odometry has a gap at each change
     """
     known = np.isfinite(poses).all(axis=(1, 2))
     metres, radians = np.zeros(len(poses)), np.zeros(len(poses))
@@ -123,7 +117,7 @@ def run_of(poses: Floats, parents: Ints64) -> RobotPath:
             far_m += float(np.linalg.norm(poses[i, :3, 3] - poses[last, :3, 3]))
             far_rad += rotation_angle(poses[i, :3, :3] @ poses[last, :3, :3].T)
         elif last >= 0:
-            far_m += _BROKEN
+            far_m += _GAP_M
         metres[i], radians[i], last = far_m, far_rad, i
     metres[~known] = np.nan
     return RobotPath(poses, metres, radians)
@@ -131,20 +125,20 @@ def run_of(poses: Floats, parents: Ints64) -> RobotPath:
 
 @dataclass(frozen=True)
 class CycleParameters:
-    """When a loop of two edges closes."""
+    """The tolerances within which a loop of two edges closes."""
 
-    close_m: float = 0.07  #: what may be left of a loop without a way, metres
-    close_rad: float = math.radians(4.0)
-    drift: float = 0.05  #: of a way: metres a metre, and radians a radian
-    most_drift: float = 0.2  #: of a way of any length, beyond which its edge is not supported
-    reach_m: float = 1.0  #: longest way along either run, metres; past it odometry says nothing
-    reach_rad: float = math.radians(60.0)
-    view_m: float = 0.1  #: frames of a run that are nearer than this were taken from one viewpoint
-    view_rad: float = math.radians(6.0)  #: unless they are turned by more than this
-    most_loops: int = 4_000_000  #: that are held; the reach is shortened until there are no more
+    close_m: float = 0.07  #: greatest residual of a loop of length zero, metres
+    close_rad: float = math.radians(4.0)  #: and radians
+    drift: float = 0.05  #: drift of odometry within a loop, metres per metre, radians per radian
+    most_drift: float = 0.2  #: greatest plausible drift between any two frames of a run
+    reach_m: float = 1.0  #: greatest path length between the edges of a loop, metres
+    reach_rad: float = math.radians(60.0)  #: and radians
+    view_m: float = 0.1  #: greatest distance of two frames of one viewpoint, metres
+    view_rad: float = math.radians(6.0)  #: and radians
+    most_loops: int = 4_000_000  #: maximum number of loops; more shorten the reach
 
     def scaled(self, scale: float) -> CycleParameters:
-        """Return these numbers with all lengths multiplied by `scale`."""
+        """Return these parameters with all lengths multiplied by `scale`."""
         lengths = {name: scale * getattr(self, name) for name in ("close_m", "reach_m", "view_m")}
         return replace(self, **lengths)
 
@@ -155,9 +149,9 @@ class LoopEdges:
 
     Parameters
     ----------
-    source, target : (n,) places of the frames in their runs
+    source, target : (n,) indices of the frames in their runs
     transforms : (n, 4, 4) T_target_source
-    weights : (n,) how far each is believed, positive
+    weights : (n,) positive weights
     """
 
     source: Ints64
@@ -170,33 +164,33 @@ class LoopEdges:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdicts:
-    """What the loops say of each edge.
+class EdgeVerdicts:
+    """The evidence of loops for each edge.
 
     Parameters
     ----------
-    kept : (n,) not outvoted
-    loops : (n,) loops with edges that were kept
-    closed : (n,) how many of them close; an edge without any was checked by nothing
-    supported : (n,) kept, one of those that close has an edge of another viewpoint, and the
-        odometry of one run does not contradict it
+    accepted : (n,) whether other edges do not outvote it
+    loops : (n,) number of loops with accepted edges; 0 if the edge is unchecked
+    closed : (n,) number of them that close
+    supported : (n,) whether it is accepted, closes a loop with an edge of another viewpoint, and
+        agrees with the odometry of its run
     """
 
-    kept: NDArray[np.bool_]
+    accepted: NDArray[np.bool_]
     loops: Ints64
     closed: Ints64
     supported: NDArray[np.bool_]
 
 
-def verdicts(
+def judge_edges(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters | None = None,
     *, within_run: bool = False,
-) -> Verdicts:  # fmt: skip
-    """Take edges out, the most outvoted first, until none is outvoted.
+) -> EdgeVerdicts:  # fmt: skip
+    """Reject edges, the most outvoted first, until no edge is outvoted.
 
     Parameters
     ----------
-    source, target : the runs of their frames; the same one twice for loop closures
+    source, target : runs of their frames; the same run twice for loop closures
     within_run : whether both are the same run
     """
     p = p or CycleParameters()
@@ -207,37 +201,36 @@ def verdicts(
     twice = np.concatenate([closing, closing])
     order = np.argsort(both, kind="stable")
     starts = np.searchsorted(both[order], np.arange(n + 1))
-    kept = np.ones(n, np.bool_)
-    _outvote(starts, others[order], twice[order], edges.weights, kept)
-    loops = np.bincount(both, kept[others], n).astype(np.int64)
-    closed = np.bincount(both, kept[others] & twice, n).astype(np.int64)
-    telling = np.concatenate([closing & elsewhere] * 2)
-    supported = kept & (np.bincount(both, kept[others] & telling, n) > 0)
+    accepted = np.ones(n, np.bool_)
+    _outvote(starts, others[order], twice[order], edges.weights, accepted)
+    loops = np.bincount(both, accepted[others], n).astype(np.int64)
+    closed = np.bincount(both, accepted[others] & twice, n).astype(np.int64)
+    independent = np.concatenate([closing & elsewhere] * 2)
+    supported = accepted & (np.bincount(both, accepted[others] & independent, n) > 0)
     if within_run:
-        supported &= _drifted_so_far(edges, source, p)
-    return Verdicts(kept, loops, closed, supported)
+        supported &= _match_odometry(edges, source, p)
+    return EdgeVerdicts(accepted, loops, closed, supported)
 
 
-def _drifted_so_far(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDArray[np.bool_]:
-    """Which edges of a run lie as near its odometry as the way between their frames allows."""
+def _match_odometry(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDArray[np.bool_]:
+    """Return a mask of the edges of a run that its odometry does not contradict."""
     here, there = run.poses[edges.source], run.poses[edges.target]
-    # where the run has the source, and where the edge puts it, in the run's frame
-    put = there @ edges.transforms
-    metres = np.linalg.norm(put[:, :3, 3] - here[:, :3, 3], axis=1)
-    cosines = (np.einsum("nij,nij->n", put[:, :3, :3], here[:, :3, :3]) - 1.0) / 2.0
+    predicted = there @ edges.transforms  # pose of the source according to the edge
+    metres = np.linalg.norm(predicted[:, :3, 3] - here[:, :3, 3], axis=1)
+    cosines = (np.einsum("nij,nij->n", predicted[:, :3, :3], here[:, :3, :3]) - 1.0) / 2.0
     way = np.abs(run.metres[edges.source] - run.metres[edges.target])
     turn = np.abs(run.radians[edges.source] - run.radians[edges.target])
     most = np.minimum(p.close_rad + p.most_drift * turn, math.pi)
     near = (metres <= p.close_m + p.most_drift * way) & (cosines >= np.cos(most))
-    allowed: NDArray[np.bool_] = near | (way >= _BROKEN)
+    allowed: NDArray[np.bool_] = near | (way >= _GAP_M)
     return allowed
 
 
 def _loops(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters
 ) -> tuple[Ints64, Ints64, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pairs of edges near each other on both runs, which of them close, and which are of two
-    viewpoints on either run.
+    """Return pairs of edges that are near on both runs, whether their loops close, and whether
+    they have different viewpoints on either run.
     """
     ways = np.stack(
         [
@@ -269,7 +262,7 @@ def _loops(
 def _are_elsewhere(
     poses: Floats, firsts: Ints64, seconds: Ints64, p: CycleParameters
 ) -> NDArray[np.bool_]:
-    """Which pairs of poses (n, 4, 4) are two viewpoints."""
+    """Return a mask of the pairs of poses (n, 4, 4) with different viewpoints."""
     a, b = poses[firsts], poses[seconds]
     metres = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
     cosines = (np.einsum("nij,nij->n", a[:, :3, :3], b[:, :3, :3]) - 1.0) / 2.0
@@ -279,7 +272,7 @@ def _are_elsewhere(
 
 @kernel
 def _are_near(ways: Floats, i: int, j: int, limits: Floats) -> bool:
-    # false for NaN as well: frames without a pose make no loops
+    # NaN compares false, so frames without a pose form no loops
     near: bool = (
         abs(ways[i, 0] - ways[j, 0]) <= limits[0]
         and abs(ways[i, 1] - ways[j, 1]) <= limits[1]
@@ -300,7 +293,7 @@ def _near(ways: Floats, limits: Floats) -> int:
 
 @kernel
 def _left(here: Floats, there: Floats, transforms: Floats, i: int, j: int) -> tuple[float, float]:
-    """Metres and radians that are left of the loop over edges i and j, at the source of j."""
+    """Return the residual of the loop over edges i and j at the source of j: metres, radians."""
     # T_parent_parent of i, applied to the source of j; and the same of j
     R, t = np.zeros((2, 3, 3)), np.zeros((2, 3))
     for k in range(2):
@@ -318,7 +311,7 @@ def _left(here: Floats, there: Floats, transforms: Floats, i: int, j: int) -> tu
             for b in range(3):
                 for c in range(3):
                     R[k, a, b] += M[a, c] * here[e, b, c]
-        # where it puts the source of j
+        # position of the source of j
         for a in range(3):
             t[k, a] = m[a]
             for b in range(3):
@@ -362,7 +355,7 @@ def _outvote(
     starts: Ints64, others: Ints64, closing: NDArray[np.bool_], weights: Floats,
     kept: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """While the votes against an edge outweigh those for it, take the worst edge out."""
+    """Reject the worst edge while the votes against it outweigh those for it."""
     n = len(kept)
     against = np.zeros(n)
     for i in range(n):
@@ -380,44 +373,42 @@ def _outvote(
             against[others[k]] -= -weights[worst] if closing[k] else weights[worst]
 
 
-# The transform that most associations of two runs agree on.
-
 Strength = Literal["strong", "weak"]
 
 
 @dataclass(frozen=True)
 class JoiningParameters:
-    """Which votes agree, and how many must."""
+    """The tolerances within which votes agree, and the agreement that a join needs."""
 
-    agree_m: float = 0.2  #: of a vote's place under the transform, metres
-    agree_rad: float = math.radians(6.0)
-    sigma_m: float = 0.04  #: of a single vote, metres: what its place counts
-    sigma_rad: float = math.radians(1.2)  #: and its rotation
-    hypotheses: int = 300  #: votes that are tried as the transform, at most
-    rounds: int = 8  #: of fitting again to the votes that agree
-    least_votes: int = 3  #: that agree
-    least_frames: int = 2  #: of either run, that these are of
-    view_m: float = 0.1  #: and they were not all taken within this of one another, metres
-    view_rad: float = math.radians(6.0)  #: or they are turned by more than this
-    rival: float = 0.5  #: share of the support from which on another transform leaves it open
-    strong_votes: int = 10
-    strong_frames: int = 5
-    strong_share: float = 0.5  #: of all votes
-    strong_extent_m: float = 1.0  #: that they reach over: at one place all may be wrong alike
+    agree_m: float = 0.2  #: greatest difference at a vote's position, metres
+    agree_rad: float = math.radians(6.0)  #: and radians
+    sigma_m: float = 0.04  #: standard deviation of a vote's position, metres
+    sigma_rad: float = math.radians(1.2)  #: and rotation, radians
+    hypotheses: int = 300  #: maximum number of votes that are tried as the transform
+    rounds: int = 8  #: iterations of the fit
+    least_votes: int = 3  #: minimum number of agreeing votes
+    least_frames: int = 2  #: minimum number of their frames in either run
+    view_m: float = 0.1  #: greatest distance of two frames of one viewpoint, metres
+    view_rad: float = math.radians(6.0)  #: and radians
+    rival: float = 0.5  #: share of the support at which another transform prevents a join
+    strong_votes: int = 10  #: minimum number of agreeing votes of a strong join
+    strong_frames: int = 5  #: minimum number of their frames in either run
+    strong_share: float = 0.5  #: minimum share of all votes
+    strong_extent_m: float = 1.0  #: minimum extent of the frames: at one place all may be wrong
 
 
 @dataclass(frozen=True, eq=False)
 class SessionJoin:
-    """The transform that most votes agree on.
+    """The transform on which most votes agree.
 
     Parameters
     ----------
-    T : (4, 4) T_a_b; None where too few agree, or another has nearly as many
-    agree : (n,) which votes agree with it, or with the best there is
-    spread_m, spread_rad : root mean square of what they differ by, where their frames are
-    rival : votes for the best other transform, among those that do not agree
-    strength : strong, or weak where few agree; None without a transform
-    reason : a short sentence
+    T : (4, 4) T_a_b; None if too few votes agree, or nearly as many agree on another
+    agree : (n,) mask of the votes that agree with it, or with the best transform
+    spread_m, spread_rad : root mean square of their differences at their frames
+    rival : number of the other votes that agree on the best other transform
+    strength : strong, or weak if few votes agree; None without a transform
+    reason : short sentence that explains the result
     """
 
     T: Floats | None
@@ -430,40 +421,40 @@ class SessionJoin:
 
     @property
     def support(self) -> int:
-        """How many votes agree."""
+        """Return the number of votes that agree."""
         return int(self.agree.sum())
 
 
-def join(votes: Votes, seed: int = 0, p: JoiningParameters | None = None) -> SessionJoin:
-    """The transform with the heaviest support, fitted to all votes that agree with it.
+def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = None) -> SessionJoin:
+    """Return the transform with the heaviest support, fitted to the votes that agree with it.
 
-    Each vote is tried as the transform (of many, `hypotheses` of them by lot), and the one that
-    most agree with is fitted again to these until the rounds are over. Votes of one frame count
-    as one between them, so that a frame that was found often does not outweigh the rest.
+    Each vote (a random sample of `hypotheses` if there are more) is tried as the transform, and
+    the best is refitted to the votes that agree. The votes of one frame share a weight of one, so
+    that a frame with many matches does not outweigh the rest.
 
     Parameters
     ----------
-    votes : see Votes; at least one
-    seed : of the lot, 0 or more
+    votes : at least one vote
+    seed : seed of the sample, 0 or more
 
     Raises
     ------
-    ValueError : no votes.
+    ValueError : there are no votes
     """
     p = p or JoiningParameters()
     n = len(votes.transforms)
     if n == 0:
-        raise ValueError("nothing votes")
+        raise ValueError("there are no votes")
     weights = votes.weights / np.bincount(votes.source)[votes.source]
     every = np.ones(n, np.bool_)
-    best = _best(votes, weights, _sampled_votes(np.arange(n), seed, p), every, p)
+    best = _best(votes, weights, _sample(np.arange(n), seed, p), every, p)
     T, agree = _fitted(votes, weights, votes.transforms[best], p)
     others, rivals = ~agree, np.zeros(n, np.bool_)
     if others.any():
-        second = _best(votes, weights, _sampled_votes(np.flatnonzero(others), seed, p), others, p)
+        second = _best(votes, weights, _sample(np.flatnonzero(others), seed, p), others, p)
         rivals = _agreeing(votes, votes.transforms[second], p) & others
     strength, reason = _belief(votes, weights, agree, rivals, p)
-    metres, radians = _apart(votes, T)
+    metres, radians = _differences(votes, T)
     return SessionJoin(
         None if strength is None else T,
         agree,
@@ -479,49 +470,49 @@ def _belief(
     votes: Votes, weights: Floats, agree: NDArray[np.bool_], rivals: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> tuple[Strength | None, str]:  # fmt: skip
-    """How far to believe what some votes agree on, and why."""
+    """Return the strength of a join, None if it is refused, and the reason."""
     n, support = len(agree), int(agree.sum())
     frames = min(len(np.unique(each[agree])) for each in (votes.source, votes.target))
-    told = f"{support} of {n} associations agree"
+    reason = f"{support} of {n} associations agree"
     if support < p.least_votes or frames < p.least_frames:
         return None, (
-            f"{told}, of {frames} frames: {p.least_votes} of {p.least_frames} frames of either "
-            "are needed"
+            f"{reason}, from {frames} frames: at least {p.least_votes} from {p.least_frames} "
+            "frames of either session are required"
         )
-    if len(distinct(votes.views[agree], np.zeros(support), p.view_m, p.view_rad, 2)) < 2:
-        return None, f"{told}, all of one viewpoint: nothing from elsewhere supports them"
+    if len(select_distinct(votes.views[agree], np.zeros(support), p.view_m, p.view_rad, 2)) < 2:
+        return None, f"{reason}, all from one viewpoint: another viewpoint must support them"
     if weights[rivals].sum() >= p.rival * weights[agree].sum():
-        return None, f"{told}, and {int(rivals.sum())} on another transform"
+        return None, f"{reason}, and {int(rivals.sum())} on another transform"
     if frames < p.strong_frames or support < max(p.strong_votes, p.strong_share * n):
-        return "weak", told
+        return "weak", reason
     extent = float(np.linalg.norm(np.ptp(votes.places[agree], axis=0)))
     if extent < p.strong_extent_m:
-        return "weak", f"{told}, all within {extent:.2f} m"
-    return "strong", told
+        return "weak", f"{reason}, all within {extent:.2f} m"
+    return "strong", reason
 
 
-def _sampled_votes(among: NDArray[np.intp], seed: int, p: JoiningParameters) -> NDArray[np.intp]:
-    """All of them, or as many by lot as are tried."""
-    if len(among) <= p.hypotheses:
-        return among
+def _sample(indices: NDArray[np.intp], seed: int, p: JoiningParameters) -> NDArray[np.intp]:
+    """Return all indices, or a random sample of `p.hypotheses` of them."""
+    if len(indices) <= p.hypotheses:
+        return indices
     rng = np.random.default_rng(seed)
-    return np.sort(rng.choice(among, p.hypotheses, replace=False))
+    return np.sort(rng.choice(indices, p.hypotheses, replace=False))
 
 
-def _apart(votes: Votes, T: Floats) -> tuple[Floats, Floats]:
-    """By how much each vote differs from a transform, at its place."""
+def _differences(votes: Votes, T: Floats) -> tuple[Floats, Floats]:
+    """Return the metres and radians by which votes differ from a transform at their positions."""
     shifts = np.einsum("nij,nj->ni", votes.transforms[:, :3, :3] - T[:3, :3], votes.places)
     shifts += votes.transforms[:, :3, 3] - T[:3, 3]
-    return np.linalg.norm(shifts, axis=1), np.linalg.norm(_turns(votes, T), axis=1)
+    return np.linalg.norm(shifts, axis=1), np.linalg.norm(_rotation_vectors(votes, T), axis=1)
 
 
-def _turns(votes: Votes, T: Floats) -> Floats:
-    """(n, 3) rotation vectors from a transform to each vote, in frame a."""
+def _rotation_vectors(votes: Votes, T: Floats) -> Floats:
+    """Return the rotation vectors from a transform to each vote, (n, 3) in frame a."""
     D = votes.transforms[:, :3, :3] @ T[:3, :3].T
     axes = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], 1)
     sines = np.linalg.norm(axes, axis=1)
     angles = np.arctan2(sines, np.trace(D, axis1=1, axis2=2) - 1.0)
-    # near a half turn the axis is lost, and nothing that far off is fitted to
+    # near a half turn the axis is undefined, but no vote that far off enters the fit
     turns: Floats = axes * np.where(sines > 1e-9, angles / np.maximum(sines, 1e-9), 0.5)[:, None]
     half = (sines <= 1e-9) & (angles > 1.0)
     turns[half] = (math.pi, 0.0, 0.0)
@@ -529,7 +520,7 @@ def _turns(votes: Votes, T: Floats) -> Floats:
 
 
 def _agreeing(votes: Votes, T: Floats, p: JoiningParameters) -> NDArray[np.bool_]:
-    metres, radians = _apart(votes, T)
+    metres, radians = _differences(votes, T)
     agree: NDArray[np.bool_] = (metres <= p.agree_m) & (radians <= p.agree_rad)
     return agree
 
@@ -538,7 +529,7 @@ def _best(
     votes: Votes, weights: Floats, chosen: NDArray[np.intp], among: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> int:  # fmt: skip
-    """Of the chosen votes the one that the heaviest others agree with; the first of equals."""
+    """Return the chosen vote with the heaviest support among others; the first of equals."""
     support = [
         float(weights[_agreeing(votes, votes.transforms[i], p) & among].sum()) for i in chosen
     ]
@@ -548,29 +539,29 @@ def _best(
 def _fitted(
     votes: Votes, weights: Floats, T: Floats, p: JoiningParameters
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """A transform fitted to the votes that agree with it, and these."""
-    agree = _agreeing(votes, T, p)  # at least the vote that it is of
+    """Fit a transform to the votes that agree with it; return it and their mask."""
+    agree = _agreeing(votes, T, p)  # at least the vote that proposed it
     for _ in range(p.rounds):
         step = _step(votes, weights * agree, T, p)
         now = _agreeing(votes, step, p)
-        if not now.any():  # two that hardly agree may leave their mean to none
+        if not now.any():  # the mean of two distant votes may agree with neither
             break
         T, agree = step, now
     return T, agree
 
 
 def _step(votes: Votes, weights: Floats, T: Floats, p: JoiningParameters) -> Floats:
-    """One Gauss-Newton step on places and rotations, with Cauchy's weights."""
-    said = np.einsum("nij,nj->ni", votes.transforms[:, :3, :3], votes.places)
-    said += votes.transforms[:, :3, 3]
-    put = votes.places @ T[:3, :3].T + T[:3, 3]
-    shifts, turns = said - put, _turns(votes, T)
+    """Take a Gauss-Newton step on positions and rotations, with Cauchy weights."""
+    voted = np.einsum("nij,nj->ni", votes.transforms[:, :3, :3], votes.places)
+    voted += votes.transforms[:, :3, 3]
+    places = votes.places @ T[:3, :3].T + T[:3, 3]
+    shifts, turns = voted - places, _rotation_vectors(votes, T)
     scaled = (shifts**2).sum(1) / p.sigma_m**2 + (turns**2).sum(1) / p.sigma_rad**2
     w = weights / (1.0 + scaled / 6.0)
-    middle = (w[:, None] * put).sum(0) / w.sum()
+    middle = (w[:, None] * places).sum(0) / w.sum()
     # x moves by omega x (x - middle) + tau
-    J = np.zeros((len(put), 3, 6))
-    x, y, z = (put - middle).T
+    J = np.zeros((len(places), 3, 6))
+    x, y, z = (places - middle).T
     J[:, 0, 1], J[:, 0, 2] = z, -y
     J[:, 1, 0], J[:, 1, 2] = -z, x
     J[:, 2, 0], J[:, 2, 1] = y, -x
@@ -580,13 +571,10 @@ def _step(votes: Votes, weights: Floats, T: Floats, p: JoiningParameters) -> Flo
     A[:3, :3] += np.eye(3) * w.sum() / p.sigma_rad**2
     b[:3] += (w[:, None] * turns).sum(0) / p.sigma_rad**2
     step = np.linalg.solve(A, b)
+    a, b, c = step[:3]
     result = np.eye(4)
-    result[:3, :3] = nearest_rotation((np.eye(3) + _cross(step[:3])) @ T[:3, :3])
-    turned = result[:3, :3] @ T[:3, :3].T
-    result[:3, 3] = turned @ (T[:3, 3] - middle) + middle + step[3:]
+    cross = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
+    result[:3, :3] = nearest_rotation((np.eye(3) + cross) @ T[:3, :3])
+    turn = result[:3, :3] @ T[:3, :3].T
+    result[:3, 3] = turn @ (T[:3, 3] - middle) + middle + step[3:]
     return result
-
-
-def _cross(v: Floats) -> Floats:
-    x, y, z = v
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -20,7 +20,7 @@ from sceneprint.engine.products import associations
 from sceneprint.engine.products.edge_consensus import finish_association
 from sceneprint.engine.products.join_upkeep import JoinUpkeep
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
-from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import PathFrame
@@ -115,8 +115,8 @@ def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine],
     T, true = np.array(join.transform.matrix), inverse(ORIGINS["bob/b"]) @ ORIGINS["ann/a"]
     for edge in engine.associations.edges("hall", told.job_id).items:
         here = pose_of(engine, edge.from_frame)
-        assert difference(T @ here, true @ here)[0] < 0.02
-    assert difference(T, true)[1] < np.radians(0.5)
+        assert pose_difference(T @ here, true @ here)[0] < 0.02
+    assert pose_difference(T, true)[1] < np.radians(0.5)
     number_events(engine.store.database)
     with engine.store.database.read() as connection:
         kind = events.c.kind == "association.found"
@@ -172,7 +172,7 @@ def test_edges_hold_against_the_truth(engine: Engine, work_off: Callable[[Engine
     for edge in edges:
         here = ORIGINS["ann/a"] @ pose_of(engine, edge.from_frame)
         there = ORIGINS["bob/b"] @ pose_of(engine, edge.to_frame)
-        metres, radians = difference(inverse(there) @ here, np.array(edge.transform.matrix))
+        metres, radians = pose_difference(inverse(there) @ here, np.array(edge.transform.matrix))
         assert metres < 0.05
         assert radians < np.radians(2.0)
         assert edge.information is not None
@@ -312,7 +312,7 @@ def test_graphs(
     poses = [np.array(vertex["pose"]["matrix"]) for vertex in whole["vertices"]]
     for edge in whole["edges"]:  # all vertices are in one frame, and edges agree with them
         T = inverse(poses[edge["first"]]) @ poses[edge["second"]]
-        metres, radians = difference(T, np.array(edge["matrix"]))
+        metres, radians = pose_difference(T, np.array(edge["matrix"]))
         assert metres < (0.06 if edge["kind"] == "association" else 1e-9)
         assert radians < (np.radians(2.0) if edge["kind"] == "association" else 1e-6)
     text = engine.associations.graph("hall", name)

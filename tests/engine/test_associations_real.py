@@ -12,7 +12,7 @@ import numpy as np
 
 from sceneprint.engine import Engine
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.types import Floats
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.sessions import NewAssociation
@@ -59,13 +59,13 @@ def test_halves_with_unrelated_origins_are_joined(
     T, wanted = np.array(join.transform.matrix), origins["first"] @ inverse(origins["second"])
     for frame_id in (one.frame_id for one in empty.list_frames("hall").items):
         here = origins["second"] @ true[frame_id]
-        metres, radians = difference(T @ here, wanted @ here)
+        metres, radians = pose_difference(T @ here, wanted @ here)
         assert metres < 0.06
         assert radians < math.radians(2.0)
     edges = empty.associations.edges("hall", told.job_id).items
     assert len(edges) >= 15
     for edge in edges:
         truth = inverse(true[edge.to_frame]) @ true[edge.from_frame]
-        metres, radians = difference(truth, np.array(edge.transform.matrix))
+        metres, radians = pose_difference(truth, np.array(edge.transform.matrix))
         assert metres < 0.1
         assert radians < math.radians(10.0)

@@ -14,7 +14,7 @@ from sceneprint.engine.serializers import transform
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
 from sceneprint.formats.export import points_of
 from sceneprint.geometry.registration.icp import adjoint
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.types import Geometry
@@ -266,7 +266,7 @@ def test_a_guided_match_is_labelled_and_had_again(
     answer = empty.queries.upload(["hall"], asking.data, meta, Query())
     assert answer.location is not None
     assert (answer.status, answer.location.support, answer.location.guided) == ("found", 5, 3)
-    assert difference(np.array(answer.location.pose.matrix), asking.pose)[0] < 0.02
+    assert pose_difference(np.array(answer.location.pose.matrix), asking.pose)[0] < 0.02
     guided = [one for one in answer.matches if one.validation.search == "guided"]
     assert len(guided) == 3
     for match in answer.matches:
@@ -278,7 +278,7 @@ def test_a_guided_match_is_labelled_and_had_again(
         assert match.predicted is not None
         assert match.transform is not None
         predicted, found = (np.array(T.matrix) for T in (match.predicted, match.transform))
-        assert difference(predicted, found)[0] < 0.05
+        assert pose_difference(predicted, found)[0] < 0.05
 
 
 def test_guided_matches_are_searched_for_where_the_answer_is_undecided(
@@ -303,6 +303,6 @@ def test_guided_matches_are_searched_for_where_the_answer_is_undecided(
     assert {one.validation.search for one in answer.matches} == {"correspondences"}
     first = answer.alternatives[0]
     assert first.support > 2  # that many had guided the others, which vote now as well
-    assert difference(np.array(first.pose.matrix), asking.pose)[0] < 0.02
+    assert pose_difference(np.array(first.pose.matrix), asking.pose)[0] < 0.02
     assert first.evidence is not None
     assert first.evidence.rival_weight >= 0.8  # the two frames that are off vote for another pose

@@ -11,7 +11,7 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
 from sceneprint.formats.export import points_of
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.geometry.validation.inspection import STEP_COLOURS, patches_at
 from sceneprint.pipeline import Signature
 from sceneprint.types import Geometry
@@ -55,7 +55,7 @@ def test_the_points_of_a_frame(full: Engine, prepared: Prepared, ids: Ids) -> No
         full.points.frame("hall", ids(full)[3], "base")
     pose = np.array(full.get_frame("hall", ids(full)[3]).pose.matrix)  # type: ignore[union-attr]
     _, _, there = rows_of(full.points.frame("hall", ids(full)[3], "parent").make())
-    assert there == pytest.approx(moved(pose, points.astype(float)), abs=1e-4)
+    assert there == pytest.approx(transform_points(pose, points.astype(float)), abs=1e-4)
 
 
 @pytest.mark.parametrize("by", ["aligned", "none"])

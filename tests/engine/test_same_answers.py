@@ -11,7 +11,7 @@ import pytest
 
 from sceneprint.engine import Engine
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.pipeline import Signer
 from sceneprint.types import Floats
 from sceneprint_client.api import Answer, Query
@@ -69,7 +69,7 @@ def see_same(served: Answer, evaluated: JudgedAnswer, truth: Floats) -> None:
     if served.location is not None:
         poses = [served.location]
         assert served.location.strength == evaluated.strength
-        off = difference(np.array(served.location.pose.matrix), truth)
+        off = pose_difference(np.array(served.location.pose.matrix), truth)
         assert (evaluated.error.metres, evaluated.error.radians) == pytest.approx(off, abs=1e-6)
     for pose, place in zip(poses, evaluated.places, strict=False):
         assert pose.confidence == pytest.approx(place.confidence, abs=1e-6)

@@ -13,7 +13,7 @@ import pytest
 from sceneprint.engine import Engine
 from sceneprint.engine.products.session_differences import POINTS
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
-from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint_client.api import JobState
 from sceneprint_client.api.sessions import GONE, NEW, Difference, NewDifference
 from sceneprint_client.surface_encoding import SurfacePoints, decode_points
@@ -74,7 +74,7 @@ def test_what_came_is_new_and_what_went_is_gone(compared: Any, work_off: WorkOff
     ]  # fmt: skip
     # what is new lies on the box of one of the frames
     new = found.points[found.patches == NEW]
-    depths = np.stack([moved(inverse(T), new)[:, 2] for T in poses])
+    depths = np.stack([transform_points(inverse(T), new)[:, 2] for T in poses])
     assert (np.abs(depths - BOX_M).min(axis=0) < 0.05).mean() > 0.95
     back = difference(engine, work_off, "b", "a")
     assert back.result is not None

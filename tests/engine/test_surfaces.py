@@ -19,7 +19,7 @@ from sceneprint.engine.maps import map_surface, surface_job
 from sceneprint.engine.maps.map_surface import SurfaceUpkeep
 from sceneprint.engine.maps.surface_job import surface_points
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotFound
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import numbers_of_runs, stops_of
@@ -116,7 +116,7 @@ def oracle(engine: Engine, cell_m: float) -> dict[str, dict[Any, list[Any]]]:
             continue
         geometry = engine.store.geometries.read(blobs[number])
         own: dict[Any, list[Floats]] = {}
-        for point in moved(np.array(stop.pose), surface_points(geometry)):
+        for point in transform_points(np.array(stop.pose), surface_points(geometry)):
             own.setdefault(tuple(np.floor(point / cell_m).astype(int).tolist()), []).append(point)
         cells = found.setdefault(stop.parent, {})
         for key, some in own.items():
@@ -395,7 +395,7 @@ def test_a_spot_is_seen_by_the_frames_that_have_a_point_there(engine: Engine) ->
         if stop.parent != parent.parent_frame:
             continue
         pose = np.array(stop.pose)
-        points = moved(pose, surface_points(engine.store.geometries.read(blobs[number])))
+        points = transform_points(pose, surface_points(engine.store.geometries.read(blobs[number])))
         if np.linalg.norm(points - spot, axis=1).min() <= 2 * cell_m:
             expected.append((float(np.linalg.norm(pose[:3, 3] - spot)), stop.id))
     assert len(expected) > 2

@@ -14,7 +14,7 @@ from PIL import Image
 
 import sceneprint as sp
 from sceneprint.cli import main
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.models import Model, save_model
 from sceneprint_lab.evaluation.report import seven_scenes_table
 
@@ -155,7 +155,7 @@ def answer_by_library(
     there = sp.localize([sp.QueryFrame(query, matches)], poses[0:12:2], None, views_of)
     assert there is not None  # so that the test says something
     assert there.average is not None
-    metres, radians = difference(there.average.T, poses[i])
+    metres, radians = pose_difference(there.average.T, poses[i])
     return {
         "status": "found",
         "strength": there.strength,

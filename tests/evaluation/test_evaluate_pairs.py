@@ -13,7 +13,7 @@ import pytest
 from sceneprint.cli import main
 from sceneprint.formats.export import write_ply
 from sceneprint.fusion import open3d
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.models import Model, save_model
 from sceneprint.types import Floats
 from sceneprint_lab.evaluation.pair_run import BINS, METHODS, points_of, register
@@ -114,7 +114,7 @@ def test_baselines_find_a_cloud_again() -> None:
         found = register(scale * points, scale * moved, open3d("A test"), scale=scale)
         assert tuple(found) == METHODS
         for one in found.values():
-            metres, radians = difference(one.refined, apart)
+            metres, radians = pose_difference(one.refined, apart)
             assert metres < 0.01 * scale
             assert radians < 0.01
             assert {"normals", "features", "ICP"} < set(one.stages)

@@ -15,7 +15,7 @@ from sceneprint.geometry.registration.overlap import (
     plane_view,
     plane_weights,
 )
-from sceneprint.geometry.rigid import difference, inverse, inverses, moved
+from sceneprint.geometry.rigid import inverse, inverses, pose_difference, transform_points
 from sceneprint.geometry.validation.acceptance import (
     AmbiguityParameters,
     best_alternative,
@@ -67,8 +67,8 @@ def test_symmetries_are_motions_that_leave_a_main_plane_in_itself() -> None:
     for T in found:
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
-        of_floor = np.abs(moved(T, floor)[:, 1] - 1.4).max()
-        of_wall = np.abs(moved(T, wall)[:, 2] - 3.0).max()
+        of_floor = np.abs(transform_points(T, floor)[:, 1] - 1.4).max()
+        of_wall = np.abs(transform_points(T, wall)[:, 2] - 3.0).max()
         assert min(of_floor, of_wall) < 1e-9
 
 
@@ -80,7 +80,9 @@ def test_quarter_turns_about_the_middle_of_each_plane() -> None:
     axes = np.abs(turns(found)) / sizes[:, None]
     assert sorted(axes.argmax(axis=1).tolist()) == [1, 1, 1, 2, 2, 2]
     middle = ROOM.means[:40].mean(axis=0)
-    about_floor = [T for T in found if np.linalg.norm(moved(T, middle[None]) - middle) < 1e-9]
+    about_floor = [
+        T for T in found if np.linalg.norm(transform_points(T, middle[None]) - middle) < 1e-9
+    ]
     assert len(about_floor) == 3
     # the three of a plane are powers of the first
     powers = [np.linalg.matrix_power(about_floor[0], k) for k in (1, 2, 3)]
@@ -98,7 +100,7 @@ def test_planes_and_directions_are_taken_by_area() -> None:
     for k, start, n, count in ((0, 0, 10, 3), (1, 10, 9, 3), (2, 19, 8, 3), (3, 27, 7, 0)):
         middle = stair.means[start : start + n].mean(axis=0)
         assert abs(middle[1]) == pytest.approx(0.3 * k)
-        held = [np.linalg.norm(moved(T, middle[None]) - middle) < 1e-9 for T in found]
+        held = [np.linalg.norm(transform_points(T, middle[None]) - middle) < 1e-9 for T in found]
         assert sum(held) == count
     blank = on_planes(([0, -1, 0], -1.0, 10, 0.0))
     assert symmetries(blank, P).shape == (0, 4, 4)
@@ -140,7 +142,7 @@ def test_far_from_equals_the_difference() -> None:
     turn = Rotation.from_rotvec(rng.normal(0, math.radians(8), (300, 3))).as_matrix()
     others[:, :3, :3] = turn @ T[:3, :3]
     others[:, :3, 3] = T[:3, 3] + rng.normal(0, 0.12, (300, 3))
-    apart = [difference(T, other) for other in others]
+    apart = [pose_difference(T, other) for other in others]
     far = [metres > P.rival_m or radians > P.rival_rad for metres, radians in apart]
     assert 50 < sum(far) < 250
     np.testing.assert_array_equal(far_from(T, others, P), others[far])

@@ -12,13 +12,13 @@ from sceneprint.geometry.cells import (
     MOST_TILES,
     TimeScale,
     ViewStamp,
-    coarser,
-    encoded,
-    fused,
-    joined,
-    seen_cells,
+    coarsen_cells,
+    encode_cells,
+    fuse_cells,
+    merge_cells,
+    remove_tile,
     time_scale,
-    without,
+    view_cells,
 )
 from sceneprint_client.surface_encoding import NO_SESSION, NO_TIME
 
@@ -45,7 +45,7 @@ def test_points_go_to_their_cells() -> None:
             [np.nan, 0.0, 0.0], [1e300, 0.0, 0.0],
         ]
     )  # fmt: skip
-    found = seen_cells(points, CELL_M, ViewStamp(7, 5.0, 2))
+    found = view_cells(points, CELL_M, ViewStamp(7, 5.0, 2))
     assert set(found) == {(0, 0, 0), (-1, 0, 0), (1, 0, 0)}
     (first,) = found[0, 0, 0]
     assert (first["key"], first["views"], first["number"], first["session"]) == (0, 1, 7, 2)
@@ -60,7 +60,7 @@ def test_cells_are_those_of_one_point_after_the_other() -> None:
     expected: dict[Any, list[Any]] = {}
     for point in points:
         expected.setdefault(tuple(np.floor(point / CELL_M).astype(int).tolist()), []).append(point)
-    found = seen_cells(points, CELL_M, ViewStamp(1, None, NO_SESSION))
+    found = view_cells(points, CELL_M, ViewStamp(1, None, NO_SESSION))
     cells = {
         (64 * x + key % 64, 64 * y + key // 64 % 64, 64 * z + key // 64**2): sums / 256
         for (x, y, z), rows in found.items()
@@ -76,7 +76,7 @@ def test_cells_are_those_of_one_point_after_the_other() -> None:
 def test_a_view_of_points_all_over_fills_few_tiles() -> None:
     far = (np.arange(2000.0)[:, None] + 0.5) * [TILE_M, 0.0, 0.0]
     twice = far[700:800] + np.array([0.0, 0.1, 0.0])
-    found = seen_cells(np.concatenate([far, twice]), CELL_M, ViewStamp(1, 0.0, 0))
+    found = view_cells(np.concatenate([far, twice]), CELL_M, ViewStamp(1, 0.0, 0))
     assert len(found) == MOST_TILES
     assert sum(len(rows) for rows in found.values()) == MOST_TILES + 100  # the fullest are kept
 
@@ -86,11 +86,11 @@ def test_views_fuse_in_any_order() -> None:
     views = []
     for number, taken in enumerate([5.0, None, 9.0, 9.0, None]):
         points = rng.uniform(0.0, 1.0, (3000, 3))
-        views.append(seen_cells(points, CELL_M, ViewStamp(number, taken, number))[0, 0, 0])
-    whole = fused(views)
-    assert fused([views[i] for i in (3, 1, 4, 0, 2)]).tobytes() == whole.tobytes()
-    parts = [fused(views[:2]), fused(views[2:])]
-    assert fused(parts).tobytes() == whole.tobytes()
+        views.append(view_cells(points, CELL_M, ViewStamp(number, taken, number))[0, 0, 0])
+    whole = fuse_cells(views)
+    assert fuse_cells([views[i] for i in (3, 1, 4, 0, 2)]).tobytes() == whole.tobytes()
+    parts = [fuse_cells(views[:2]), fuse_cells(views[2:])]
+    assert fuse_cells(parts).tobytes() == whole.tobytes()
     keys = [set(view["key"].tolist()) for view in views]
     assert set(whole["key"].tolist()) == set.union(*keys)
     for one in whole:
@@ -98,7 +98,7 @@ def test_views_fuse_in_any_order() -> None:
         assert one["views"] == len(seen)
         # the last by time, then by number; one without a time counts before all others
         assert one["session"] == max(seen, key=lambda i: ((0, -1, 1, 1, -1)[i], i))
-    assert len(fused([])) == 0
+    assert len(fuse_cells([])) == 0
 
 
 def test_a_tile_as_it_is_given_out() -> None:
@@ -109,13 +109,13 @@ def test_a_tile_as_it_is_given_out() -> None:
             row(64**3 - 1, (0, 0, 0), 10**6, 1e9, 5),
         ]
     )
-    cells = encoded(rows, TimeScale(80.0, 8.0))
+    cells = encode_cells(rows, TimeScale(80.0, 8.0))
     assert cells["at"].tolist() == [[0, 0, 0], [255, 6, 5], [252, 252, 252]]
     assert cells["seen"].tolist() == [16, 32, 255]  # 16 log2 of 2, 4, and more than 16 bits
     assert cells["session"].tolist() == [NO_SESSION, 4, 5]
     assert cells["taken"].tolist() == [NO_TIME, 2, NO_TIME - 1]
     assert cells.tobytes()[8:16] == bytes([255, 6, 5, 32, 4, 0, 2, 0])
-    assert set(encoded(rows, None)["taken"].tolist()) == {NO_TIME}
+    assert set(encode_cells(rows, None)["taken"].tolist()) == {NO_TIME}
 
 
 def test_the_next_level_by_hand() -> None:
@@ -126,19 +126,19 @@ def test_the_next_level_by_hand() -> None:
             row(4, (128, 0, 0), 7, -np.inf, 3),
         ]
     )  # fmt: skip
-    fine = encoded(rows, TimeScale(0.0, 1.0))
-    found = coarser({(5, 0, 0): fine})  # the second quarter of its tile
+    fine = encode_cells(rows, TimeScale(0.0, 1.0))
+    found = coarsen_cells({(5, 0, 0): fine})  # the second quarter of its tile
     # places 0 and 12 of 256 in the tile are 64 and 67 of the next level's; 18 is 68
     assert found["at"].tolist() == [[65, 0, 0], [68, 0, 0]]
     assert found["seen"].tolist() == [32, 48]
     assert found["session"].tolist() == [2, 3]
     assert found["taken"].tolist() == [60, NO_TIME]
-    assert len(without(found, (5, 0, 0))) == 0
-    assert without(found, (6, 0, 0)).tobytes() == found.tobytes()
-    other = coarser({(4, 0, 0): fine})
-    both = coarser({(4, 0, 0): fine, (5, 0, 0): fine})
-    assert joined(found, other).tobytes() == both.tobytes()
-    assert joined(without(both, (4, 0, 0)), other).tobytes() == both.tobytes()
+    assert len(remove_tile(found, (5, 0, 0))) == 0
+    assert remove_tile(found, (6, 0, 0)).tobytes() == found.tobytes()
+    other = coarsen_cells({(4, 0, 0): fine})
+    both = coarsen_cells({(4, 0, 0): fine, (5, 0, 0): fine})
+    assert merge_cells(found, other).tobytes() == both.tobytes()
+    assert merge_cells(remove_tile(both, (4, 0, 0)), other).tobytes() == both.tobytes()
 
 
 @pytest.mark.parametrize(("first", "last"), [(1000.0, 1000.0), (0.0, 1e6), (-5.0, 3e9)])

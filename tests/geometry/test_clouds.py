@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.surface.cloud import CloudParameters, principal_axes, within_range
+from sceneprint.geometry.surface.cloud import CloudParameters, principal_axes, select_in_range
 from sceneprint.types import Cloud
 
 P = CloudParameters(minimum_points=3)
@@ -18,9 +18,9 @@ P = CloudParameters(minimum_points=3)
 def test_points_out_of_range_are_left_out() -> None:
     ranges = np.array([0.29, 0.31, 1.0, 9.99, 10.01, 500.0])
     points = (ranges[:, None] * np.array([0.6, 0.0, -0.8])).astype(np.float32)
-    np.testing.assert_array_equal(within_range(Cloud(points), P), points[1:4])
+    np.testing.assert_array_equal(select_in_range(Cloud(points), P), points[1:4])
     # nothing is known of ranges where there is no viewpoint
-    np.testing.assert_array_equal(within_range(Cloud(points, has_viewpoint=False), P), points)
+    np.testing.assert_array_equal(select_in_range(Cloud(points, has_viewpoint=False), P), points)
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def test_out_of_range_names_the_range_and_what_to_do(
 ) -> None:
     cloud = cloud_scenes.room(500)
     with pytest.raises(UselessFrame, match=r"0 of its 500 .* 0\.3 to 10 m.* median") as caught:
-        within_range(Cloud(cloud.points * np.float32(factor), name="scan"), P)
+        select_in_range(Cloud(cloud.points * np.float32(factor), name="scan"), P)
     assert says in str(caught.value)
     assert "lidar" in str(caught.value)
     assert str(caught.value).startswith("scan: ")
@@ -40,7 +40,7 @@ def test_out_of_range_names_the_range_and_what_to_do(
 
 def test_too_few_points_are_none_of_the_range() -> None:
     with pytest.raises(UselessFrame, match=r"10 points are too few .* at least 64"):
-        within_range(Cloud(np.ones((10, 3), np.float32)), CloudParameters())
+        select_in_range(Cloud(np.ones((10, 3), np.float32)), CloudParameters())
 
 
 def test_axes_are_eigenvectors_signed_by_skew(cloud_scenes: ModuleType) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration import alignment as module
 from sceneprint.geometry.registration.alignment import ConsensusParameters, consensus
-from sceneprint.geometry.rigid import difference, inverse, moved
+from sceneprint.geometry.rigid import inverse, pose_difference, transform_points
 from sceneprint.types import Floats, Ints32, Patches
 
 P = ConsensusParameters()
@@ -25,7 +25,9 @@ def motion(rng: np.random.Generator) -> Floats:
 
 
 def carried(patches: Patches, T: Floats) -> Patches:
-    return replace(patches, means=moved(T, patches.means), normals=patches.normals @ T[:3, :3].T)
+    return replace(
+        patches, means=transform_points(T, patches.means), normals=patches.normals @ T[:3, :3].T
+    )
 
 
 def mirrored(patches: Patches) -> Patches:
@@ -42,7 +44,7 @@ def with_outliers(rng: np.random.Generator, n: int, share: float) -> Ints32:
 
 def explained(a: Patches, b: Patches, pairs: Ints32, T: Floats) -> int:
     """How many correspondences a transform explains."""
-    off = np.linalg.norm(moved(T, a.means[pairs[:, 0]]) - b.means[pairs[:, 1]], axis=1)
+    off = np.linalg.norm(transform_points(T, a.means[pairs[:, 0]]) - b.means[pairs[:, 1]], axis=1)
     cosine = (a.normals[pairs[:, 0]] @ T[:3, :3].T * b.normals[pairs[:, 1]]).sum(axis=1)
     return int(((off < P.inlier_distance) & (cosine > P.inlier_cosine)).sum())
 
@@ -161,8 +163,10 @@ def test_noise_is_averaged_out(scenes: ModuleType) -> None:
     b = carried(a, T)
     b = replace(b, means=b.means + rng.normal(0, 0.03, b.means.shape))
     found = consensus(a, b, with_outliers(rng, 150, 0.7), P)
-    metres, radians = difference(found[0], T)
-    middle = moved(found[0], a.means.mean(axis=0)[None]) - moved(T, a.means.mean(axis=0)[None])
+    metres, radians = pose_difference(found[0], T)
+    middle = transform_points(found[0], a.means.mean(axis=0)[None]) - transform_points(
+        T, a.means.mean(axis=0)[None]
+    )
     assert np.linalg.norm(middle) < 0.02  # 3 cm of noise in each of some 45
     assert np.degrees(radians) < 1.0
     assert metres < 0.05

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.geometry.kernel import Cores, both
+from sceneprint.geometry.kernel import Cores, run_both
 
 
 @pytest.fixture
@@ -39,28 +39,28 @@ def threads_of(halves: int = 2) -> list[str]:
     def note() -> None:
         names.append(threading.current_thread().name)
 
-    both(note, note)
+    run_both(note, note)
     assert len(names) == halves
     return sorted(names)
 
 
 def test_halves_run_at_once_where_a_core_is_free(two: Cores) -> None:
-    with two.lent():
-        assert both(*meeting()) == (1, 2)
-        assert both(lambda: both(lambda: 1, lambda: 2), lambda: 3) == ((1, 2), 3)
+    with two.shared():
+        assert run_both(*meeting()) == (1, 2)
+        assert run_both(lambda: run_both(lambda: 1, lambda: 2), lambda: 3) == ((1, 2), 3)
 
 
 def test_halves_run_in_turn_without_a_free_core(two: Cores) -> None:
     own = threading.current_thread().name
     assert threads_of() == [own, own]  # not lent
-    with two.lent():
+    with two.shared():
         assert threads_of() != [own, own]
-        with two.lent():  # as by another query
+        with two.shared():  # as by another query
             assert threads_of() == [own, own]
         assert threads_of() != [own, own]  # given back
     assert threads_of() == [own, own]
     alone = Cores(1)
-    with alone.lent():
+    with alone.shared():
         assert threads_of() == [own, own]
     alone.close()
 
@@ -75,8 +75,8 @@ def test_a_half_takes_no_core_of_its_own_half(two: Cores) -> None:
         inner.append((threading.current_thread().name, threads_of()))
         barrier.wait(PATIENCE_S)
 
-    with two.lent():
-        both(half, half)
+    with two.shared():
+        run_both(half, half)
     assert len(inner) == 2
     assert all(names == [own, own] for own, names in inner)
 
@@ -91,9 +91,9 @@ def test_what_a_half_raises_is_raised_and_the_core_is_free_again(two: Cores, len
 
     def ask(first: Callable[[], int], second: Callable[[], int]) -> tuple[int, int]:
         if not lent:
-            return both(first, second)
-        with two.lent():
-            return both(first, second)
+            return run_both(first, second)
+        with two.shared():
+            return run_both(first, second)
 
     with pytest.raises(ValueError, match="first"):
         ask(fail("first"), lambda: 2)
@@ -101,5 +101,5 @@ def test_what_a_half_raises_is_raised_and_the_core_is_free_again(two: Cores, len
         ask(lambda: 1, fail("second"))
     with pytest.raises(ValueError, match="first"):
         ask(fail("first"), fail("second"))
-    with two.lent():
-        assert both(*meeting()) == (1, 2)
+    with two.shared():
+        assert run_both(*meeting()) == (1, 2)

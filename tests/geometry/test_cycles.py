@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.rigid import difference, inverse, inverses
+from sceneprint.geometry.rigid import inverse, inverses, pose_difference
 from sceneprint.geometry.session_join import (
     CycleParameters,
     LoopEdges,
     RobotPath,
-    run_of,
-    verdicts,
+    judge_edges,
+    robot_path,
 )
 from sceneprint.types import Floats
 
@@ -35,7 +35,7 @@ def walk(rng: np.random.Generator, n: int, metres: float = 0.05, degrees: float 
 
 
 def a_run(poses: Floats, parents: list[int] | None = None) -> RobotPath:
-    return run_of(poses, np.array(parents or [0] * len(poses), np.int64))
+    return robot_path(poses, np.array(parents or [0] * len(poses), np.int64))
 
 
 def edges_between(
@@ -71,9 +71,9 @@ def oracle(
             # over f: from k to m; over e: from k along the run to i, to j, along the run to m
             along = inverse(source.poses[i]) @ source.poses[k]
             over = inverse(target.poses[m]) @ target.poses[j] @ edges.transforms[e] @ along
-            metres, radians = difference(over, edges.transforms[f])
+            metres, radians = pose_difference(over, edges.transforms[f])
             back = inverse(target.poses[j]) @ target.poses[m] @ edges.transforms[f] @ inverse(along)
-            metres = max(metres, difference(back, edges.transforms[e])[0])
+            metres = max(metres, pose_difference(back, edges.transforms[e])[0])
             found[e, f] = metres <= p.close_m + p.drift * sum(
                 ways
             ) and radians <= p.close_rad + p.drift * sum(turns)
@@ -89,7 +89,7 @@ def test_loops_are_those_of_the_oracle(seed: int) -> None:
     expected = oracle(edges, source, target, p)
     assert any(expected.values())
     assert not all(expected.values())
-    found = verdicts(edges, source, target)
+    found = judge_edges(edges, source, target)
     kept = np.ones(len(edges), bool)
     while True:  # the most outvoted first
         against = np.zeros(len(edges))
@@ -102,7 +102,7 @@ def test_loops_are_those_of_the_oracle(seed: int) -> None:
         if against.max() <= 0:
             break
         kept[int(np.argmax(against))] = False
-    np.testing.assert_array_equal(found.kept, kept)
+    np.testing.assert_array_equal(found.accepted, kept)
     for e in range(len(edges)):
         own = [closes for pair, closes in expected.items()
                if e in pair and kept[pair[0] if pair[1] == e else pair[1]]]  # fmt: skip
@@ -120,8 +120,8 @@ def test_wrong_edges_are_outvoted_and_right_ones_are_not() -> None:
     for e in wrong:
         edges.transforms[e] = edges.transforms[e] @ moved_by(rng, 0.6, 30.0)
     elsewhere = moved_by(rng, 5.0, 90.0)
-    found = verdicts(edges, a_run(here), a_run(elsewhere @ there))
-    assert set(np.flatnonzero(~found.kept)) == set(wrong)
+    found = judge_edges(edges, a_run(here), a_run(elsewhere @ there))
+    assert set(np.flatnonzero(~found.accepted)) == set(wrong)
 
 
 def test_odometry_that_drifts_does_no_harm() -> None:
@@ -133,17 +133,19 @@ def test_odometry_that_drifts_does_no_harm() -> None:
         step[:3, 3] *= 1.03
         drifting.append(drifting[-1] @ step @ moved_by(rng, 0.003, 0.15))
     drifted = np.array(drifting)
-    assert difference(inverse(true[0]) @ true[-1], inverse(drifted[0]) @ drifted[-1])[0] > 0.1
+    assert pose_difference(inverse(true[0]) @ true[-1], inverse(drifted[0]) @ drifted[-1])[0] > 0.1
     source = np.arange(150, 300)
     target = source - 150
     exact = np.array([inverse(true[j]) @ true[i] for i, j in zip(source, target, strict=True)])
     run = a_run(drifted)
-    found = verdicts(LoopEdges(source, target, exact, np.ones(150)), run, run, within_run=True)
-    assert found.kept.all()
+    found = judge_edges(LoopEdges(source, target, exact, np.ones(150)), run, run, within_run=True)
+    assert found.accepted.all()
     assert (found.loops > 0).all()
     assert found.supported.all()
     blind = CycleParameters(reach_m=1e3, reach_rad=1e3, drift=0.0)
-    assert not verdicts(LoopEdges(source, target, exact, np.ones(150)), run, run, blind).kept.all()
+    assert not judge_edges(
+        LoopEdges(source, target, exact, np.ones(150)), run, run, blind
+    ).accepted.all()
 
 
 def test_by_hand() -> None:
@@ -153,17 +155,17 @@ def test_by_hand() -> None:
     transforms = np.tile(np.eye(4), (3, 1, 1))
     transforms[1, 1, 3] = 0.2
     every = np.arange(3)
-    found = verdicts(LoopEdges(every, every, transforms, np.ones(3)), a_run(poses), a_run(poses))
-    assert found.kept.tolist() == [True, False, True]
+    found = judge_edges(LoopEdges(every, every, transforms, np.ones(3)), a_run(poses), a_run(poses))
+    assert found.accepted.tolist() == [True, False, True]
     assert found.loops.tolist() == [1, 2, 1]
     assert found.closed.tolist() == [1, 0, 1]
     # 5 % of 0.2 m of way on either side is what a loop may be off besides
     transforms[1, 1, 3] = 0.0
     transforms[2, 1, 3] = 0.07 + 0.05 * 0.2 + 1e-6
     edges = LoopEdges(every, every, transforms, np.ones(3))
-    assert verdicts(edges, a_run(poses), a_run(poses)).closed.tolist() == [2, 1, 1]
+    assert judge_edges(edges, a_run(poses), a_run(poses)).closed.tolist() == [2, 1, 1]
     transforms[2, 1, 3] = 0.07 + 0.05 * 0.4 + 1e-6
-    assert verdicts(edges, a_run(poses), a_run(poses)).kept.tolist() == [True, True, False]
+    assert judge_edges(edges, a_run(poses), a_run(poses)).accepted.tolist() == [True, True, False]
 
 
 def line(*x: float) -> Floats:
@@ -180,8 +182,8 @@ def test_an_edge_of_the_same_viewpoint_supports_nothing() -> None:
         source, onto = np.array(chosen), np.array(target)
         transforms = inverses(there[onto]) @ here[source]
         edges = LoopEdges(source, onto, transforms, np.ones(len(source)))
-        told = verdicts(edges, a_run(here), a_run(there))
-        assert told.kept.all()
+        told = judge_edges(edges, a_run(here), a_run(there))
+        assert told.accepted.all()
         assert (told.closed == len(source) - 1).all()
         return told.supported.tolist()
 
@@ -206,11 +208,11 @@ def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other() -> None:
     source, run = np.arange(20, 40), a_run(poses)
     alike = LoopEdges(source, source - 20, np.tile(np.eye(4), (20, 1, 1)), np.ones(20))
     # all edges are turned alike, so that they agree with each other and with nothing else
-    found = verdicts(alike, run, run)
-    assert found.kept.all()
+    found = judge_edges(alike, run, run)
+    assert found.accepted.all()
     assert found.supported.all()
-    within = verdicts(alike, run, run, within_run=True)
-    assert within.kept.all()
+    within = judge_edges(alike, run, run, within_run=True)
+    assert within.accepted.all()
     assert not within.supported.any()
     # right ones are 4 m apart, over a way of 6.3 m that may be wrong by a fifth
     true = inverses(poses[source - 20]) @ poses[source]
@@ -218,11 +220,11 @@ def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other() -> None:
         transforms = true.copy()
         transforms[:, 2, 3] += metres
         edges = LoopEdges(source, source - 20, transforms, np.ones(20))
-        found = verdicts(edges, run, run, within_run=True)
+        found = judge_edges(edges, run, run, within_run=True)
         assert found.supported.tolist() == [supported] * 20
     # a gap in the odometry allows everything
     gap = a_run(poses, [0] * 20 + [1] * 20)
-    assert verdicts(alike, gap, gap, within_run=True).supported.all()
+    assert judge_edges(alike, gap, gap, within_run=True).supported.all()
 
 
 def test_what_disagrees_supports_nothing() -> None:
@@ -230,8 +232,8 @@ def test_what_disagrees_supports_nothing() -> None:
     transforms = np.tile(np.eye(4), (2, 1, 1))
     transforms[1, 1, 3] = 0.5
     every = np.arange(2)
-    found = verdicts(LoopEdges(every, every, transforms, np.ones(2)), a_run(here), a_run(here))
-    assert found.kept.sum() == 1
+    found = judge_edges(LoopEdges(every, every, transforms, np.ones(2)), a_run(here), a_run(here))
+    assert found.accepted.sum() == 1
     assert not found.supported.any()
 
 
@@ -249,18 +251,18 @@ def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken() -> None
     edges = LoopEdges(every, every, transforms, np.ones(4))
     lost = poses.copy()
     lost[1] = np.nan
-    found = verdicts(edges, a_run(lost), a_run(poses))
+    found = judge_edges(edges, a_run(lost), a_run(poses))
     assert found.loops.tolist() == [2, 0, 2, 2]
-    assert found.kept.all()
-    found = verdicts(edges, a_run(poses, [0, 0, 1, 1]), a_run(poses))
+    assert found.accepted.all()
+    found = judge_edges(edges, a_run(poses, [0, 0, 1, 1]), a_run(poses))
     assert found.loops.tolist() == [1, 1, 1, 1]
 
 
 def test_no_edges() -> None:
     run = a_run(np.tile(np.eye(4), (2, 1, 1)))
     none = np.empty(0, np.int64)
-    found = verdicts(LoopEdges(none, none, np.empty((0, 4, 4)), np.empty(0)), run, run)
-    assert len(found.kept) == len(found.loops) == len(found.closed) == 0
+    found = judge_edges(LoopEdges(none, none, np.empty((0, 4, 4)), np.empty(0)), run, run)
+    assert len(found.accepted) == len(found.loops) == len(found.closed) == 0
 
 
 def test_the_reach_is_shortened_rather_than_memory_taken() -> None:
@@ -268,7 +270,7 @@ def test_the_reach_is_shortened_rather_than_memory_taken() -> None:
     here = walk(rng, 100)
     edges = edges_between(rng, here, here, 200, 0.001, 0.1)
     run = a_run(here)
-    every = verdicts(edges, run, run)
-    few = verdicts(edges, run, run, CycleParameters(most_loops=500))
+    every = judge_edges(edges, run, run)
+    few = judge_edges(edges, run, run, CycleParameters(most_loops=500))
     assert 0 < few.loops.sum() <= 1000 < every.loops.sum()
-    assert few.kept.all()
+    assert few.accepted.all()

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.surface.depth_image import DepthParameters, halved, halvings, inverse_depth
+from sceneprint.geometry.surface.depth_image import (
+    DepthParameters,
+    halve_camera,
+    halvings,
+    inverse_depth,
+)
 from sceneprint.types import DepthFrame, Floats32, Intrinsics
 
 
@@ -73,7 +78,7 @@ def test_twice_halved_by_hand() -> None:
 
 def test_halved_camera_sees_the_same_points() -> None:
     camera = Intrinsics(640, 481, 585.0, 570.0, 320.25, 239.5)
-    half = halved(camera)
+    half = halve_camera(camera)
     assert (half.width, half.height) == (320, 240)
     for x, y, z in ((0.3, -0.2, 1.5), (-1.0, 0.7, 3.0)):
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -105,7 +110,7 @@ def test_map_is_bounded_whatever_the_sensor() -> None:
     for width, height, focal_length in ((2896, 2896, 50.0), (640, 480, 585.0), (3200, 2400, 3e3)):
         camera = Intrinsics(width, height, focal_length, focal_length, 0, 0)
         for _ in range(halvings(camera, KINECT)):
-            camera = halved(camera)
+            camera = halve_camera(camera)
         assert camera.width * camera.height <= 160 * 120 * 4
         assert camera.fx <= 146 * math.sqrt(2)
 

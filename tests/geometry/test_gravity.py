@@ -21,10 +21,10 @@ from sceneprint.geometry.rigid import (
     NO_UPS,
     GravityParameters,
     are_level,
-    difference,
     inverse,
     inverses,
     mean_direction,
+    pose_difference,
     slopes,
     tilt_of,
     tilts,
@@ -149,7 +149,7 @@ def test_an_exact_up_and_one_with_noise_lose_nothing(rooms: list[Views]) -> None
                 if before.status == "accepted":
                     assert told.status == "accepted"
                     assert told.T_match_query is not None
-                    metres, radians = difference(told.T_match_query, true)
+                    metres, radians = pose_difference(told.T_match_query, true)
                     assert metres < 0.05
                     assert radians < math.radians(2)
                     assert told.tilt_rad == pytest.approx(0.0, abs=math.radians(1 + 2 * noise))

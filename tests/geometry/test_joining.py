@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.rigid import difference, inverse, inverses
-from sceneprint.geometry.session_join import JoiningParameters, Votes, join, votes_of
+from sceneprint.geometry.rigid import inverse, inverses, pose_difference
+from sceneprint.geometry.session_join import (
+    JoiningParameters,
+    Votes,
+    association_votes,
+    join_sessions,
+)
 from sceneprint.types import Floats
 
 
@@ -40,7 +45,7 @@ def seen(
         transforms[i] = rigid(rng, 1.0)
     order = rng.permutation(n)
     source = np.arange(n)
-    return votes_of(
+    return association_votes(
         transforms[order], b[order], a[order], source, source, rng.choice([0.5, 1.0], n)
     )
 
@@ -56,12 +61,12 @@ def test_a_known_transform_among_as_many_outliers(seed: int) -> None:
     rng = np.random.default_rng(seed)
     true = rigid(rng, 10.0)
     votes = seen(rng, true, 30, 30)
-    found = join(votes, seed)
+    found = join_sessions(votes, seed)
     assert found.T is not None
     assert (found.support, found.strength) == (30, "strong")
     assert at_places(votes, found.T, true) < 0.02
-    assert difference(found.T, true)[1] < math.radians(0.4)
-    left = [difference(found.T @ place_of(p), T @ place_of(p))[0]
+    assert pose_difference(found.T, true)[1] < math.radians(0.4)
+    left = [pose_difference(found.T @ place_of(p), T @ place_of(p))[0]
             for T, p in zip(votes.transforms, votes.places, strict=True)]  # fmt: skip
     inside = np.array(left)[found.agree]
     assert found.spread_m == pytest.approx(math.sqrt((inside**2).mean()))
@@ -82,13 +87,10 @@ def test_support_is_that_of_an_exhaustive_search(seed: int) -> None:
     p = JoiningParameters()
 
     def agree(i: int, j: int) -> bool:
-        return all(
-            difference(
-                votes.transforms[i] @ place_of(votes.places[k]),
-                votes.transforms[j] @ place_of(votes.places[k]),
-            )[0] <= p.agree_m
-            for k in (i, j)
-        ) and difference(votes.transforms[i], votes.transforms[j])[1] <= p.agree_rad  # fmt: skip
+        a, b = votes.transforms[i], votes.transforms[j]
+        places = [place_of(votes.places[k]) for k in (i, j)]
+        near = all(pose_difference(a @ T, b @ T)[0] <= p.agree_m for T in places)
+        return near and pose_difference(a, b)[1] <= p.agree_rad
 
     n = len(votes.transforms)
     pairs = {(i, j) for i, j in combinations(range(n), 2) if agree(i, j)}
@@ -97,7 +99,7 @@ def test_support_is_that_of_an_exhaustive_search(seed: int) -> None:
          if all(pair in pairs for pair in combinations(group, 2))),
         key=len,
     )  # fmt: skip
-    assert set(np.flatnonzero(join(votes).agree)) == best
+    assert set(np.flatnonzero(join_sessions(votes).agree)) == best
     assert len(best) == 6
 
 
@@ -108,8 +110,8 @@ def test_the_inverse_votes_for_the_inverse() -> None:
     a = np.array([true @ pose for pose in b])
     T = np.tile(np.eye(4), (12, 1, 1))
     n = np.arange(12)
-    there = join(votes_of(T, b, a, n, n, np.ones(12)))
-    back = join(votes_of(inverses(T), a, b, n, n, np.ones(12)))
+    there = join_sessions(association_votes(T, b, a, n, n, np.ones(12)))
+    back = join_sessions(association_votes(inverses(T), a, b, n, n, np.ones(12)))
     assert there.T is not None
     assert back.T is not None
     np.testing.assert_allclose(there.T, true, atol=1e-9)
@@ -122,12 +124,12 @@ def test_two_answers_with_as_many_votes_are_none() -> None:
     first, second = rigid(rng, 3.0), rigid(rng, 3.0)
     a = np.array([(first if i % 2 else second) @ pose for i, pose in enumerate(b)])
     n, T = np.arange(20), np.tile(np.eye(4), (20, 1, 1))
-    found = join(votes_of(T, b, a, n, n, np.ones(20)))
+    found = join_sessions(association_votes(T, b, a, n, n, np.ones(20)))
     assert (found.T, found.strength, found.support, found.rival) == (None, None, 10, 10)
     assert "another transform" in found.reason
     # of which one has half as much again, and a third of it: then it is believed
     weights = np.where(n % 2, 1.0, 0.45)
-    assert join(votes_of(T, b, a, n, n, weights)).T is not None
+    assert join_sessions(association_votes(T, b, a, n, n, weights)).T is not None
 
 
 def test_too_few_votes_or_too_few_frames_are_none() -> None:
@@ -135,13 +137,16 @@ def test_too_few_votes_or_too_few_frames_are_none() -> None:
     true = rigid(rng, 3.0)
     b = np.array([rigid(rng, 1.0, 20.0) for _ in range(12)])
     a, T, n = true @ b, np.tile(np.eye(4), (12, 1, 1)), np.arange(12)
-    assert join(votes_of(T[:2], b[:2], a[:2], n[:2], n[:2], np.ones(2))).T is None
-    assert join(votes_of(T[:3], b[:3], a[:3], n[:3], n[:3], np.ones(3))).strength == "weak"
+    assert join_sessions(association_votes(T[:2], b[:2], a[:2], n[:2], n[:2], np.ones(2))).T is None
+    assert (
+        join_sessions(association_votes(T[:3], b[:3], a[:3], n[:3], n[:3], np.ones(3))).strength
+        == "weak"
+    )
     one = np.zeros(12, np.int64)
-    assert join(votes_of(T, b, a, one, n, np.ones(12))).T is None
-    assert join(votes_of(T, b, a, n, n, np.ones(12))).strength == "strong"
-    with pytest.raises(ValueError, match="nothing votes"):
-        join(votes_of(T[:0], b[:0], a[:0], n[:0], n[:0], np.ones(0)))
+    assert join_sessions(association_votes(T, b, a, one, n, np.ones(12))).T is None
+    assert join_sessions(association_votes(T, b, a, n, n, np.ones(12))).strength == "strong"
+    with pytest.raises(ValueError, match="there are no votes"):
+        join_sessions(association_votes(T[:0], b[:0], a[:0], n[:0], n[:0], np.ones(0)))
 
 
 def test_many_frames_of_one_place_join_nothing() -> None:
@@ -159,7 +164,7 @@ def test_many_frames_of_one_place_join_nothing() -> None:
                 "within 0.00 m": "weak"}  # fmt: skip
     for said, b in reaching.items():
         T = np.array([rigid(rng, 0.01, 0.4) for _ in range(30)])
-        found = join(votes_of(T, b, true @ b, n, n, np.ones(30)))
+        found = join_sessions(association_votes(T, b, true @ b, n, n, np.ones(30)))
         assert (found.support, found.strength) == (30, expected[said])
         assert said in found.reason
         assert (found.T is None) is (expected[said] is None)
@@ -178,7 +183,9 @@ def test_a_frame_that_was_found_often_counts_once() -> None:
     source = np.array([*range(8), *([8] * 6), *([9] * 6)])
     b = b[source]
     a = np.where((source < 8)[:, None, None], true @ b, wrong @ b)
-    found = join(votes_of(np.tile(np.eye(4), (20, 1, 1)), b, a, source, np.arange(20), np.ones(20)))
+    found = join_sessions(
+        association_votes(np.tile(np.eye(4), (20, 1, 1)), b, a, source, np.arange(20), np.ones(20))
+    )
     assert found.support == 8
     assert found.T is not None
     np.testing.assert_allclose(found.T, true, atol=1e-9)
@@ -189,7 +196,7 @@ def test_many_votes_are_tried_by_lot_and_the_same_lot_again() -> None:
     true = rigid(rng, 5.0)
     votes = seen(rng, true, 400, 400)
     p = JoiningParameters(hypotheses=20)
-    found = join(votes, 7, p)
+    found = join_sessions(votes, 7, p)
     assert found.T is not None
     assert found.support >= 395
-    np.testing.assert_array_equal(found.T, join(votes, 7, p).T)
+    np.testing.assert_array_equal(found.T, join_sessions(votes, 7, p).T)

@@ -111,15 +111,15 @@ def test_the_marks_are_the_same_in_every_process() -> None:
 
 
 ALONE = """
-from sceneprint.geometry.kernel import cached_at, kernel
+from sceneprint.geometry.kernel import code_folder, kernel
 
 @kernel
 def thrice(x):
     return x * 3
 
-before = cached_at(thrice)[1]
+before = code_folder(thrice)[1]
 value = thrice(5.0)
-folder, there = cached_at(thrice)
+folder, there = code_folder(thrice)
 print(value, sum(thrice.stats.cache_hits.values()), before, there, folder)
 """
 
@@ -177,7 +177,7 @@ def test_a_row_is_asked_for_and_nothing_else_happens() -> None:
 
 def test_what_asks_for_a_row_is_part_of_the_mark(monkeypatch: pytest.MonkeyPatch) -> None:
     mark = kernel_module._constant_text(prefetch, "a.module")
-    assert mark == kernel_module._code(kernel_cache._prefetch_row.__code__)
+    assert mark == kernel_module._code_text(kernel_cache._prefetch_row.__code__)
 
     def nothing(_context: Any, table: Any, row: Any) -> Any:
         return numba.types.void(table, row), lambda context, *_: context.get_dummy_value()

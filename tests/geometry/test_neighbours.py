@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sceneprint.geometry.surface.cloud import mixed
-from sceneprint.geometry.surface.voxels import Links, least_axis, linked, plane_facing, plane_seen
+from sceneprint.geometry.surface.cloud import hash_key
+from sceneprint.geometry.surface.voxels import (
+    Links,
+    fit_inverse_planes,
+    fit_planes,
+    least_axis,
+    link_points,
+)
 from sceneprint.types import Floats
 
 
@@ -30,15 +36,15 @@ def test_links_are_all_pairs_that_are_near(spread: float) -> None:
     seeds = rng.uniform(-spread, spread, (12, 3))
     places = np.repeat(seeds, 20, axis=0) + rng.normal(size=(240, 3))
     heights = rng.uniform(0, 3, 240)
-    assert of(linked(places, heights)) == naive(places, heights)
+    assert of(link_points(places, heights)) == naive(places, heights)
 
 
 def test_cells_that_share_a_slot_do_so_under_one_secret_only() -> None:
     """Nobody can know which cells make a table slow; what is found does not depend on it."""
     keys, mask = np.arange(200_000, dtype=np.int64) << 21, (1 << 20) - 1
-    same = [int(key) for key in keys if mixed(key, 5) & mask < 1 << 12]
+    same = [int(key) for key in keys if hash_key(key, 5) & mask < 1 << 12]
     assert len(same) > 500
-    assert len({mixed(key, 77) & mask for key in same}) > 0.98 * len(same)
+    assert len({hash_key(key, 77) & mask for key in same}) > 0.98 * len(same)
 
 
 def test_links_do_not_depend_on_the_secret(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -46,19 +52,19 @@ def test_links_do_not_depend_on_the_secret(monkeypatch: pytest.MonkeyPatch) -> N
     made = []
     for secret in (0, 2**61 + 12345):
         monkeypatch.setattr("secrets.randbits", lambda _, secret=secret: secret)
-        made.append(linked(places, np.zeros(500)))
+        made.append(link_points(places, np.zeros(500)))
     assert made[0].offsets.tobytes() == made[1].offsets.tobytes()
     assert made[0].indices.tobytes() == made[1].indices.tobytes()
 
 
 def test_no_points_no_links() -> None:
-    assert len(linked(np.empty((0, 3)), np.empty(0)).indices) == 0
+    assert len(link_points(np.empty((0, 3)), np.empty(0)).indices) == 0
 
 
 def test_links_among_those_kept() -> None:
     rng = np.random.default_rng(4)
     places = rng.uniform(-1.5, 1.5, (80, 3))
-    links = linked(places, np.zeros(80))
+    links = link_points(places, np.zeros(80))
     keep, held = rng.random(80) < 0.7, rng.random(len(links.indices)) < 0.8
     number = {int(i): k for k, i in enumerate(np.flatnonzero(keep))}
     wanted: list[set[int]] = [set() for _ in number]
@@ -66,7 +72,7 @@ def test_links_among_those_kept() -> None:
     for i, j, is_held in zip(sources.tolist(), links.indices.tolist(), held, strict=True):
         if is_held and i in number and j in number:
             wanted[number[i]].add(number[j])
-    assert of(links.among(keep, held)) == wanted
+    assert of(links.select(keep, held)) == wanted
 
 
 def test_surfaces_one_behind_the_other_do_not_touch() -> None:
@@ -74,15 +80,15 @@ def test_surfaces_one_behind_the_other_do_not_touch() -> None:
     front = np.column_stack([x, np.zeros(10), np.zeros(10)])
     behind = front + np.array([0, 0, 0.2])
     at, normals = np.concatenate([front, behind]), np.tile([0.0, 0.0, -1.0], (20, 1))
-    links = linked(at / 0.5, np.zeros(20))
+    links = link_points(at / 0.5, np.zeros(20))
     touching = links.touching(at / 0.5, 0.7, at, normals, np.full(20, 0.05))
-    there = of(links.among(np.ones(20, np.bool_), touching))
+    there = of(links.select(np.ones(20, np.bool_), touching))
     for i, found in enumerate(there):
         assert found == {j for j in range(20) if i // 10 == j // 10 and 0 < abs(i - j) <= 3}
     # where one lies on the other's plane, as at a crease, they do
     normals[10:] = [1.0, 0.0, 0.0]
     touching = links.touching(at / 0.5, 0.7, at, normals, np.full(20, 0.05))
-    assert 10 in of(links.among(np.ones(20, np.bool_), touching))[0]
+    assert 10 in of(links.select(np.ones(20, np.bool_), touching))[0]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -99,10 +105,10 @@ def test_least_axis_is_the_eigenvector_of_the_least(seed: int) -> None:
 def test_facing_normals_are_numpys_components() -> None:
     rng = np.random.default_rng(6)
     places = rng.uniform(-2, 2, (400, 3)) * [1, 1, 0.02] + [0, 0, 5]
-    links = linked(places, np.zeros(400))
+    links = link_points(places, np.zeros(400))
     normals, at = np.zeros_like(places), places.copy()
     limits = np.array([5.0, 1e-9])
-    plane_facing(places, links.offsets, links.indices, 10.0, limits, normals, at)
+    fit_planes(places, links.offsets, links.indices, 10.0, limits, normals, at)
     for i, found in enumerate(of(links)):
         group = places[sorted({i, *found})]
         if len(group) < 5:
@@ -122,10 +128,10 @@ def test_seen_planes_are_exact_beside_a_step() -> None:
     rays = np.column_stack([np.full(len(y), 3.0), y, z])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     q = np.where(y < 0, rays @ left, rays @ right)
-    links = linked(rays / 0.06, -np.log(q) / 0.05)
+    links = link_points(rays / 0.06, -np.log(q) / 0.05)
     planes = np.zeros_like(rays)
     gates, limits = np.array([0.05, 0.006, 0.006]), np.array([6.0, 0.0])
-    plane_seen(q, rays, links.offsets, links.indices, gates, limits, planes)
+    fit_inverse_planes(q, rays, links.offsets, links.indices, gates, limits, planes)
     inner = np.abs(z) < 0.9
     for side, a in ((y < 0, left), (y > 0, right)):
         found = planes[side & inner & (np.abs(y) < 0.9)]

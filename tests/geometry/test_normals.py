@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from sceneprint.geometry.surface.depth_image import (
     DepthParameters,
     NormalParameters,
+    fit_surface,
     inverse_depth,
-    surface,
 )
 from sceneprint.types import DepthFrame, Floats, Floats32, Intrinsics, Surface
 
@@ -28,7 +28,7 @@ KINECT = Intrinsics(160, 120, 146.25, 146.25, 79.5, 59.5)
 
 
 def fit(q: Floats | Floats32, camera: Intrinsics, p: NormalParameters = PARAMETERS) -> Surface:
-    return surface(np.ascontiguousarray(q, np.float32), camera, p)
+    return fit_surface(np.ascontiguousarray(q, np.float32), camera, p)
 
 
 def tilted(degrees: float, about: float) -> Floats:

@@ -6,7 +6,7 @@ from types import ModuleType
 
 import numpy as np
 
-from sceneprint.geometry.surface.depth_image import NormalParameters, surface
+from sceneprint.geometry.surface.depth_image import NormalParameters, fit_surface
 from sceneprint.types import Floats, Intrinsics
 
 CAMERA = Intrinsics(26, 18, 40.0, 37.0, 12.0, 9.5)
@@ -68,7 +68,7 @@ def test_equals_least_squares_pixel_by_pixel(scenes: ModuleType) -> None:
     q[:2, :3] = 0.0
     # the oracle works on what the kernel is given
     given = q.astype(np.float32)
-    seen = surface(given, CAMERA, PARAMETERS)
+    seen = fit_surface(given, CAMERA, PARAMETERS)
     expected = np.zeros(q.shape, bool)
     for v in range(q.shape[0]):
         for u in range(q.shape[1]):

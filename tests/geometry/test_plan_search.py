@@ -18,7 +18,7 @@ from sceneprint.geometry.registration.plan_search import (
     up_of,
 )
 from sceneprint.geometry.retrieval.ranking import Ranking
-from sceneprint.geometry.rigid import difference, distinct, inverse, moved
+from sceneprint.geometry.rigid import inverse, pose_difference, select_distinct, transform_points
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import associate, geometry_of, validate
 from sceneprint.signing import see
@@ -58,7 +58,7 @@ def building() -> tuple[Floats, Floats]:
 def seen_from(T: Floats) -> Surface:
     """All of the building in a sensor's coordinates, as points in no order."""
     points, normals = building()
-    points, normals = moved(inverse(T), points), normals @ T[:3, :3]
+    points, normals = transform_points(inverse(T), points), normals @ T[:3, :3]
     shape = (1, len(points))
     return Surface(
         points[None].astype(np.float32), normals[None].astype(np.float32),
@@ -76,7 +76,7 @@ def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0, roll: float
 
 def nearest(found: Floats, true: Floats) -> tuple[float, float, int]:
     """Metres and degrees of the hypothesis that is nearest to a transform, and its rank."""
-    errors = [difference(T, true) for T in found]
+    errors = [pose_difference(T, true) for T in found]
     best = min(range(len(errors)), key=lambda k: errors[k][0] + errors[k][1])
     return errors[best][0], math.degrees(errors[best][1]), best
 
@@ -144,9 +144,13 @@ def test_the_axis_of_a_range_image_is_its_pole() -> None:
 
 def test_distinct_by_hand() -> None:
     transforms = np.stack([pose(x, 0, 0, yaw) for x, yaw in ((0, 0), (0.4, 0), (0.4, 20), (2, 0))])
-    assert distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 9) == [1, 3, 2]
-    assert distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 2) == [1, 3]
-    assert distinct(transforms[:0], np.empty(0), 0.5, 0.1, 5) == []
+    assert select_distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 9) == [
+        1,
+        3,
+        2,
+    ]
+    assert select_distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 2) == [1, 3]
+    assert select_distinct(transforms[:0], np.empty(0), 0.5, 0.1, 5) == []
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +184,9 @@ def test_a_query_upside_down_is_found_when_nothing_else_is_accepted(
     assert found.validation.status == "accepted"
     assert over.pose is not None
     assert found.validation.T_match_query is not None
-    metres, radians = difference(found.validation.T_match_query, inverse(first.pose) @ over.pose)
+    metres, radians = pose_difference(
+        found.validation.T_match_query, inverse(first.pose) @ over.pose
+    )
     assert metres < 0.3
     assert radians < math.radians(3)
     # a known up says at once what the other axes had to be tried for

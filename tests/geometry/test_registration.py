@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sceneprint.geometry.registration import icp as module
 from sceneprint.geometry.registration.icp import COARSE, FINE, RefinementParameters, refine
 from sceneprint.geometry.registration.overlap import sampled
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.models import Model
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats, Floats32, Surface
@@ -101,7 +101,7 @@ def test_an_exact_corner_is_found_exactly(scenes: ModuleType) -> None:
         found = refine(source, corner, start, replace(COARSE, iterations=20))
         np.testing.assert_array_equal(start, before)  # the caller's is left alone
         assert found is not None
-        metres, radians = difference(found.T, np.eye(4))
+        metres, radians = pose_difference(found.T, np.eye(4))
         assert metres < 1e-5
         assert radians < 1e-5
         R = found.T[:3, :3]
@@ -116,7 +116,7 @@ def test_a_room_is_found_to_a_millimetre(room_surface: Surface) -> None:
         assert coarse is not None
         fine = refine(source, room_surface, coarse.T, FINE)
         assert fine is not None
-        metres, radians = difference(fine.T, np.eye(4))
+        metres, radians = pose_difference(fine.T, np.eye(4))
         assert metres < 1e-3
         assert np.degrees(radians) < 0.05
         assert fine.points > 0.9 * len(source)

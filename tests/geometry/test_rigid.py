@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.rigid import (
-    difference,
+    apply_rotation,
     inverse,
-    moved,
     nearest_rotation,
+    pose_difference,
     rotation_angle,
     rotation_of_covariance,
     solve_positive,
-    turned,
+    transform_points,
 )
 from sceneprint.types import Floats
 
@@ -48,7 +48,9 @@ def test_inverse_equals_numpys() -> None:
         np.testing.assert_allclose(inverse(T), np.linalg.inv(T), atol=1e-12)
         np.testing.assert_array_equal(inverse(inverse(T))[:3, :3], T[:3, :3])
         x = rng.normal(size=(4, 3))
-        np.testing.assert_allclose(moved(inverse(T), moved(T, x)), x, atol=1e-12)
+        np.testing.assert_allclose(
+            transform_points(inverse(T), transform_points(T, x)), x, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize(
@@ -69,13 +71,13 @@ def test_difference_by_hand_and_without_a_favourite() -> None:
     a[:3, 3] = 1, 2, 3
     b[:3, 3] = 1, 5, 7
     b[:3, :3] = Rotation.from_euler("y", 0.3).as_matrix()
-    metres, radians = difference(a, b)
+    metres, radians = pose_difference(a, b)
     assert (metres, radians) == (5.0, pytest.approx(0.3, abs=1e-12))
-    assert difference(b, a) == pytest.approx((metres, radians), abs=1e-12)
-    assert difference(b, b) == (0.0, pytest.approx(0.0, abs=1e-15))
+    assert pose_difference(b, a) == pytest.approx((metres, radians), abs=1e-12)
+    assert pose_difference(b, b) == (0.0, pytest.approx(0.0, abs=1e-15))
     # the same motion of the target frame afterwards changes neither
     T = transform(np.random.default_rng(2))
-    assert difference(T @ a, T @ b) == pytest.approx((metres, radians), abs=1e-12)
+    assert pose_difference(T @ a, T @ b) == pytest.approx((metres, radians), abs=1e-12)
 
 
 def test_nearest_rotation() -> None:
@@ -156,7 +158,7 @@ def test_turned_equals_scipys(angle: float) -> None:
         axis = rng.normal(size=3)
         omega, R = angle * axis / np.linalg.norm(axis), Rotation.random(rng=rng).as_matrix()
         result = np.empty((3, 3))
-        turned(R, omega, result)
+        apply_rotation(R, omega, result)
         expected = Rotation.from_rotvec(omega).as_matrix() @ R
         np.testing.assert_allclose(result, expected, atol=1e-14)
 

@@ -17,7 +17,7 @@ from sceneprint.geometry.registration.sequence_alignment import (
     neighbour_sequences,
     sequence_correspondences,
 )
-from sceneprint.geometry.rigid import difference, inverse, moved
+from sceneprint.geometry.rigid import inverse, pose_difference, transform_points
 from sceneprint.geometry.validation.validation import ValidationParameters, validate
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
@@ -47,7 +47,9 @@ def scattered(seed: int, count: int) -> Patches:
 
 
 def carried(patches: Patches, T: Floats) -> Patches:
-    return replace(patches, means=moved(T, patches.means), normals=patches.normals @ T[:3, :3].T)
+    return replace(
+        patches, means=transform_points(T, patches.means), normals=patches.normals @ T[:3, :3].T
+    )
 
 
 def motion(seed: int) -> Floats:
@@ -170,7 +172,9 @@ def test_rigid_motion_changes_nothing() -> None:
     for seed in range(3):
         other = carried(patches, motion(seed))
         own, theirs = coarse(patches, P), coarse(other, P)
-        np.testing.assert_allclose(moved(motion(seed), own.means), theirs.means, atol=1e-9)
+        np.testing.assert_allclose(
+            transform_points(motion(seed), own.means), theirs.means, atol=1e-9
+        )
         a, b = neighbour_sequences(patches, own, P), neighbour_sequences(other, theirs, P)
         np.testing.assert_array_equal(a.lengths, b.lengths)
         np.testing.assert_allclose(a.symbols, b.symbols, atol=1e-7)
@@ -255,7 +259,7 @@ def test_two_views_are_aligned_by_sequences() -> None:
     found = validate(query, match, 0, p, matching="sequence")
     assert found.status == "accepted"
     assert found.T_match_query is not None
-    metres, radians = difference(found.T_match_query, inverse(poses[1]) @ poses[0])
+    metres, radians = pose_difference(found.T_match_query, inverse(poses[1]) @ poses[0])
     assert metres < 0.05
     assert radians < 0.03
     # not by the histograms behind one's back

@@ -12,16 +12,16 @@ from sceneprint.geometry.cells import (
     UNSEEN,
     SessionCells,
     ViewStamp,
-    add_views,
     cell_positions,
     cell_states,
     count_cells,
+    empty_counts,
     frame_verdicts,
-    no_verdicts,
-    seen_cells,
+    merge_views,
+    view_cells,
 )
 from sceneprint.geometry.registration.overlap import OverlapParameters
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.types import Bytes, Floats, Intrinsics, Surface
 from sceneprint_client.surface_encoding import NO_SESSION
 
@@ -57,16 +57,16 @@ def poses(count: int) -> list[Floats]:
 def cells_of(surface: Surface, sensors: list[Floats]) -> SessionCells:
     points = surface.points[surface.valid].astype(np.float64)
     views = [
-        seen_cells(moved(T, points), CELL_M, ViewStamp(i, None, NO_SESSION))
+        view_cells(transform_points(T, points), CELL_M, ViewStamp(i, None, NO_SESSION))
         for i, T in enumerate(sensors)
     ]
-    return add_views(add_views({}, views[:1]), views[1:])
+    return merge_views(merge_views({}, views[:1]), views[1:])
 
 
 def judged(cells: SessionCells, other: Surface, sensors: list[Floats]) -> tuple[Bytes, Floats]:
     """States of cells by what sensors of the other session see, and their depths."""
     positions = cell_positions(cells, CELL_M)
-    counts = no_verdicts(len(positions))
+    counts = empty_counts(len(positions))
     for T in sensors:
         counts.add(frame_verdicts(positions, other, T, P))
     return cell_states(counts, len(sensors)), positions[:, 2] - 30.0
@@ -104,7 +104,7 @@ def test_one_frame_of_several_is_not_enough_and_one_that_agrees_decides(
     cells = cells_of(full, [sensor])
     positions = cell_positions(cells, CELL_M)
     of_box = positions[:, 2] - 30.0 < 2.5
-    counts = no_verdicts(len(positions))
+    counts = empty_counts(len(positions))
     counts.add(frame_verdicts(positions, empty, sensor, P))
     assert (cell_states(counts, 1)[of_box] == CHANGED).all()  # the only frame there is
     assert (cell_states(counts, 2)[of_box] == UNSEEN).all()
@@ -112,12 +112,12 @@ def test_one_frame_of_several_is_not_enough_and_one_that_agrees_decides(
     assert (cell_states(counts, 2)[of_box] == CHANGED).all()
     counts.add(frame_verdicts(positions, full, sensor, P))
     assert (cell_states(counts, 3)[of_box] == SAME).all()
-    assert (cell_states(no_verdicts(2), 0) == UNSEEN).all()
+    assert (cell_states(empty_counts(2), 0) == UNSEEN).all()
 
 
 def test_cells_lie_at_the_mean_of_what_frames_saw_in_them() -> None:
     points = np.array([[0.01, 0.0, 0.0], [0.03, 0.04, 0.0], [-0.01, 0.0, 0.2]])
-    cells = add_views({}, [seen_cells(points, CELL_M, ViewStamp(0, None, NO_SESSION))])
+    cells = merge_views({}, [view_cells(points, CELL_M, ViewStamp(0, None, NO_SESSION))])
     assert count_cells(cells) == 2
     found = cell_positions(cells, CELL_M)
     np.testing.assert_allclose(found, [[-0.01, 0.0, 0.2], [0.02, 0.02, 0.0]], atol=CELL_M / 256)

@@ -10,11 +10,11 @@ import pytest
 
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.surface.cloud import CloudParameters
-from sceneprint.geometry.surface.range_image import _averaged as averaged
-from sceneprint.geometry.surface.range_image import _lifted as lifted
+from sceneprint.geometry.surface.range_image import _average_pixels as average_pixels
+from sceneprint.geometry.surface.range_image import _lift_surface as lift_surface
 from sceneprint.geometry.surface.range_image import (
     directions,
-    framed,
+    fit_camera,
     pole_of,
     range_image,
     to_angles,
@@ -141,8 +141,8 @@ def test_points_where_the_image_begins_are_in_its_first_column() -> None:
         points = np.stack([np.full(y.shape, x), y, z], axis=2).reshape(-1, 3).astype(np.float32)
         angles = np.empty((len(points), 3))
         to_angles(points, 2, angles)
-        camera = framed(angles, 2, replace(P, image_angle=0.0068 + 0.0089 * (x - 2)))
-        q, u = averaged(angles, camera, P)
+        camera = fit_camera(angles, 2, replace(P, image_angle=0.0068 + 0.0089 * (x - 2)))
+        q, u = average_pixels(angles, camera, P)
         u /= np.maximum(np.linalg.norm(u, axis=2, keepdims=True), 1e-9)
         cosines = (u * directions(camera)).sum(axis=2)[q > 0]
         assert cosines.min() > np.cos(camera.step)
@@ -218,7 +218,7 @@ def test_rays_meet_planes_as_numpy_has_it() -> None:
     rays = directions(camera)
     planes = rays * rng.uniform(0.04, 6, (20, 40, 1)) + rng.normal(0, 0.5, (20, 40, 3))
     planes[rng.random((20, 40)) < 0.2] = 0
-    found = lifted(planes, rays, camera, p)
+    found = lift_surface(planes, rays, camera, p)
     inverse, length = (planes * rays).sum(axis=2), np.linalg.norm(planes, axis=2)
     with np.errstate(invalid="ignore", divide="ignore"):
         cosine, r = inverse / length, 1 / inverse

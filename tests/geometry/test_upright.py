@@ -15,7 +15,7 @@ from sceneprint.geometry.surface.upright import (
     dominant_directions,
     estimate_units,
     estimate_up,
-    pieces_of,
+    flat_pieces,
 )
 from sceneprint.types import Floats, Floats32, Ints32
 from sceneprint_lab.synth.dataset import room_and_rng, synthesise_survey
@@ -145,7 +145,7 @@ def test_dominant_directions_of_a_tilted_box_are_its_normals() -> None:
     points[np.arange(len(points)), side] = (
         np.sign(points[np.arange(len(points)), side]) * (np.array([6, 4, 3])[side])
     )
-    found = dominant_directions(pieces_of(turned(points.astype(np.float32), R), None))
+    found = dominant_directions(flat_pieces(turned(points.astype(np.float32), R), None))
     assert len(found) == 3
     cosines = np.abs(found @ R)
     np.testing.assert_allclose(np.sort(cosines.max(axis=1)), 1.0, atol=1e-4)

@@ -17,7 +17,7 @@ from sceneprint.errors import ModelMismatch
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.alignment import Alignment, align, samples_of
 from sceneprint.geometry.registration.overlap import explained, overlap_counts, sampled
-from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.validation.validation import (
     PairValidation,
@@ -101,7 +101,7 @@ def content(v: PairValidation) -> tuple[object, ...]:
 def off(v: PairValidation, T: Floats) -> tuple[float, float]:
     """Metres and degrees from a transform."""
     assert v.T_match_query is not None
-    metres, radians = difference(v.T_match_query, T)
+    metres, radians = pose_difference(v.T_match_query, T)
     return metres, math.degrees(radians)
 
 
@@ -505,7 +505,7 @@ def test_refined_at_the_truth_stays_there(
     for query, match, T in pairs:
         found = refined_at(query, match, T)
         assert found is not None
-        metres, radians = difference(found, T)
+        metres, radians = pose_difference(found, T)
         assert metres < 0.03
         assert math.degrees(radians) < 1.0
     far = np.eye(4)

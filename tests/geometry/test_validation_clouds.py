@@ -19,7 +19,7 @@ from sceneprint.geometry.registration.overlap import (
     looked_up,
     sampled,
 )
-from sceneprint.geometry.rigid import difference, inverse, moved
+from sceneprint.geometry.rigid import inverse, pose_difference, transform_points
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,
     Evidence,
@@ -105,7 +105,10 @@ def rooms(made: Make) -> list[tuple[Room, list[View]]]:
 def fused(rooms: list[tuple[Room, list[View]]], made: Make) -> list[list[Geometry]]:
     """The same points in the room's coordinates, of nobody's view."""
     return [
-        [made(Cloud(moved(v.T, v.points).astype(np.float32), has_viewpoint=False)) for v in views]
+        [
+            made(Cloud(transform_points(v.T, v.points).astype(np.float32), has_viewpoint=False))
+            for v in views
+        ]
         for _, views in rooms
     ]
 
@@ -113,7 +116,7 @@ def fused(rooms: list[tuple[Room, list[View]]], made: Make) -> list[list[Geometr
 def off(v: PairValidation, T: Floats) -> tuple[float, float]:
     """Metres and degrees from a transform."""
     assert v.T_match_query is not None, v.reason
-    metres, radians = difference(v.T_match_query, T)
+    metres, radians = pose_difference(v.T_match_query, T)
     return metres, math.degrees(radians)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import InvalidRequest
-from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.geometry.views import Renderer, ViewParameters, choose_views, view_parameters
 from sceneprint.geometry.views.free_space import candidate_places, find_floors
 from sceneprint.geometry.views.plan import level_axes
@@ -139,7 +139,7 @@ def test_a_surface_that_is_seen_from_behind_is_missing_and_hides_what_is_behind_
 def test_a_scanner_sees_all_around() -> None:
     p = replace(view_parameters(read_model("lidar").parameters), nearest=0.1)
     T = looking((2.0, 3.0, 1.0), 0.7, 0.1)
-    points = moved(T, Renderer(room(), p).view(T).astype(float))
+    points = transform_points(T, Renderer(room(), p).view(T).astype(float))
     to_wall = np.minimum(np.abs(points), np.abs(points - ROOM)).min(axis=1)
     assert to_wall.max() < 1e-3
     rays = (points - T[:3, 3]) @ T[:3, :3]
@@ -208,7 +208,7 @@ def test_blocks_out_of_view_hold_nothing_that_is_seen() -> None:
     T = inverse(looking((1.0, -2.0, 0.5), 0.8, 0.2))
     starts, ends = blocks.in_view(T, pinhole(CAMERA), (60, 80), 5.0)
     kept = set(np.concatenate([order[a:b] for a, b in zip(starts, ends, strict=True)]).tolist())
-    x, y, z = moved(T, points.astype(float)).T
+    x, y, z = transform_points(T, points.astype(float)).T
     u, v = 73 * x / z + 39.5, 73 * y / z + 29.5
     seen = (z > 0.01) & (z < 5) & (u > -0.5) & (u < 79.5) & (v > -0.5) & (v < 59.5)
     assert set(np.flatnonzero(seen).tolist()) <= kept
@@ -377,7 +377,7 @@ def _seen(renderer: Renderer, poses: Floats, points: Floats) -> np.ndarray:
     seen = np.zeros(len(points), bool)
     for T in poses:
         depth = renderer.view(T)
-        x, y, z = moved(inverse(T), points).T
+        x, y, z = transform_points(inverse(T), points).T
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = 73 * x / z + 39.5, 73 * y / z + 29.5
         inside = (z > 0.3) & (z < 3) & (u > -0.5) & (u < 79.49) & (v > -0.5) & (v < 59.49)

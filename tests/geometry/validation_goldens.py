@@ -148,8 +148,8 @@ def check_projecting(module: ModuleType) -> None:
         assert module.depth_at(array, points, 1, 2) == depth
         assert module.depth_at(array, points, 2, 1) == 0.0
     for power, grown in ((0, 1.0), (1, 1.5), (2, 2.25)):
-        assert module.grown(3.0, 2.0, power) == grown
-        assert module.grown(1.0, 2.0, power) == 1.0
+        assert module.growth_at(3.0, 2.0, power) == grown
+        assert module.growth_at(1.0, 2.0, power) == 1.0
 
 
 def check_targets(module: ModuleType) -> None:

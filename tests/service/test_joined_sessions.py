@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from sceneprint.geometry.rigid import difference, inverse
+from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_lab.synth import SynthRoom
 from tests.service.conftest import Server, Shot, until
@@ -122,7 +122,7 @@ def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms: Rooms) 
         assert pose["parent_frame"] == "ann/morning"
         assert frame.pose is not None
         at = ORIGINS["ann/morning"] @ np.array(pose["matrix"])
-        assert difference(at, frame.pose)[0] < 0.1
+        assert pose_difference(at, frame.pose)[0] < 0.1
         for match in answer["matches"]:
             matched.add((match["robot"], match["parent_frame"]))
             assert (match["pose_in_map"] or pose)["parent_frame"] == "ann/morning"
@@ -155,7 +155,7 @@ def test_frames_that_come_later_follow_the_join(rooms: Rooms) -> None:
     assert stored["pose"]["parent_frame"] == "ann/morning"
     assert frame.pose is not None
     here = ORIGINS["ann/morning"] @ np.array(stored["pose"]["matrix"])
-    assert difference(here, frame.pose)[0] < 0.1
+    assert pose_difference(here, frame.pose)[0] < 0.1
     assert stored["sent_pose"]["parent_frame"] == "bob/evening"
     np.testing.assert_allclose(stored["sent_pose"]["matrix"], np.array(shot.pose), atol=1e-12)
     # an edit in bob's frame follows the join too, and one in another frame does not
@@ -181,7 +181,7 @@ def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms: Rooms) -> None:
     )
     pose = answer["location"]["pose"]
     assert pose["parent_frame"] == "ann/morning"
-    assert difference(ORIGINS["ann/morning"] @ np.array(pose["matrix"]), frame.pose)[0] < 0.1
+    assert pose_difference(ORIGINS["ann/morning"] @ np.array(pose["matrix"]), frame.pose)[0] < 0.1
 
 
 def test_a_join_is_undone(rooms: Rooms) -> None:
@@ -214,7 +214,7 @@ def test_a_join_is_undone(rooms: Rooms) -> None:
         found.add(pose["parent_frame"])
         assert frame.pose is not None
         here = ORIGINS[pose["parent_frame"]] @ np.array(pose["matrix"])
-        assert difference(here, frame.pose)[0] < 0.1
+        assert pose_difference(here, frame.pose)[0] < 0.1
     assert found <= ORIGINS.keys()
     graph = client.get(f"{url}/graph", params={"format": "json"}).json()
     assert {one["pose"]["parent_frame"] for one in graph["vertices"]} == ORIGINS.keys()

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.errors import NotFound, NotIndexed
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.types import Floats
 from sceneprint_client import Client
 from sceneprint_client.api import Frame, FrameState
@@ -204,7 +204,7 @@ def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Fl
 def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit: int) -> Floats:
     """Return at most so many points (N, 3) of an indexed frame, moved by its pose."""
     try:
-        return moved(T, client.frame_points(map_name, frame_id, limit=limit).points)
+        return transform_points(T, client.frame_points(map_name, frame_id, limit=limit).points)
     except (NotFound, NotIndexed):
         return np.zeros((0, 3))
 

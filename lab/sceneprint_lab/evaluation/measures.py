@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.types import AnyFrame, Cloud, Floats
 from sceneprint_lab.evaluation.protocol import (
     VIEWS,
@@ -565,7 +565,7 @@ def voxels(frame: AnyFrame) -> Voxels:
     points = points_of(frame, PIXELS, FARTHEST)
     if frame.pose is None:
         raise ValueError(f"{frame.name} has no pose")
-    cells = np.floor(moved(frame.pose, points) / VOXEL).astype(np.int64)
+    cells = np.floor(transform_points(frame.pose, points) / VOXEL).astype(np.int64)
     # 21 bits for each axis: 20 km either way
     half = 1 << 20
     x, y, z = (cells + half).T

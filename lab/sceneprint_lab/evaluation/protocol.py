@@ -26,7 +26,7 @@ from sceneprint.formats.dataset import FrameSequence as Run
 from sceneprint.formats.dataset.sequences import natural
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.retrieval.ranking import Metric
-from sceneprint.geometry.rigid import difference, moved
+from sceneprint.geometry.rigid import pose_difference, transform_points
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.confidence import PlaceEvidence
 from sceneprint.geometry.validation.validation import (
@@ -255,7 +255,7 @@ def in_preferred_order(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
 
 def pose_error(T: Floats, truth: Floats) -> Error:
     """Return the difference of two (4, 4) rigid transforms between the same two frames."""
-    return Error(*difference(T, truth))
+    return Error(*pose_difference(T, truth))
 
 
 # How much two frames with known poses see of each other: the ground truth of retrieval.
@@ -344,13 +344,13 @@ def view_of(frame: AnyFrame) -> AnyView:
     y, x = np.mgrid[GRID // 2 : k.height : GRID, GRID // 2 : k.width : GRID]
     points = points_at(frame, y, x)
     points = points[points[..., 2] > 0]
-    return OverlapView(np.ascontiguousarray(moved(frame.pose, points)), frame.depth, k, frame.pose)
+    return OverlapView(np.ascontiguousarray(transform_points(frame.pose, points)), frame.depth, k, frame.pose)
 
 
 def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
     from scipy.spatial import KDTree
 
-    every = moved(pose, cloud.points.astype(np.float64))
+    every = transform_points(pose, cloud.points.astype(np.float64))
     some, most = (every[:: -(-len(every) // n)] for n in (SAMPLES, POINTS))
     return CloudView(some, KDTree(most), pose[:3, 3] if cloud.has_viewpoint else None)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sceneprint.errors import UselessFrame
-from sceneprint.geometry.rigid import turned
+from sceneprint.geometry.rigid import apply_rotation
 from sceneprint.geometry.views import view_parameters
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare
@@ -90,7 +90,7 @@ def with_flaws(
         drift = 0.9 * drift + rng.standard_normal(6) * np.repeat(share[1:], 3)
         if has_it and frame.pose is not None:
             T = frame.pose.copy()
-            turned(frame.pose[:3, :3], drift[3:], T[:3, :3])
+            apply_rotation(frame.pose[:3, :3], drift[3:], T[:3, :3])
             T[:3, 3] += drift[:3]
             flawed.append(replace(frame, pose=T))
     return flawed

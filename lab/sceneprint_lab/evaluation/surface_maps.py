@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from sceneprint.fusion import FusionParameters, fuse
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.geometry.views import Renderer, ViewParameters, ViewPlan, choose_views
 from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Intrinsics, ReferenceSurface
 
@@ -39,7 +39,7 @@ def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> Refer
         mesh, _ = fuse(depth, replace(_FUSION, voxel_m=voxel_m))
         return ReferenceSurface(mesh.points.astype(np.float32), mesh.triangles, np.zeros(3), up)
     points = np.concatenate(
-        [moved(T, points.astype(np.float64)) for points, T in clouds if T is not None]
+        [transform_points(T, points.astype(np.float64)) for points, T in clouds if T is not None]
     )
     _, cell, counts = np.unique(
         np.floor(points / voxel_m).astype(np.int64), axis=0,

@@ -23,7 +23,7 @@ from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.export import points_of, write_ply
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.pictures import depth_view, normals_view, onto, patches_view, picture, vista_of
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
@@ -421,7 +421,9 @@ class FrameFiles:
                 return write_ply(points, normals, comments=comments)
             to_name = np.array(matrix)
             turned = normals.astype(np.float64) @ to_name[:3, :3].T
-            return write_ply(moved(to_name, points.astype(np.float64)), turned, comments=comments)
+            return write_ply(
+                transform_points(to_name, points.astype(np.float64)), turned, comments=comments
+            )
 
         return Output(found.tag("cloud", frame.id, found.row.name, name, matrix), make)
 

@@ -32,7 +32,7 @@ from sceneprint.errors import (
 )
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.geometry.cells import FACTOR, TilePlace
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.store import Store, queue
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.audit_log import record_change
@@ -336,7 +336,7 @@ class MapSurfaces:
             geometry = read_geometry(self._store.blobs.get(frame.geometry))
         except (DamagedBlob, UnreadableGeometry):
             return False
-        apart = moved(np.array(frame.pose), surface_points(geometry)) - np.array(spot)
+        apart = transform_points(np.array(frame.pose), surface_points(geometry)) - np.array(spot)
         return bool(((apart * apart).sum(axis=1) <= within * within).any())
 
     def _mend(self, row: MapRow, tile: TileRow) -> None:

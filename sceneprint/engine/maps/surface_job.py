@@ -32,15 +32,15 @@ from sceneprint.geometry.cells import (
     TilePlace,
     TimeScale,
     ViewStamp,
-    coarser,
-    encoded,
-    fused,
-    joined,
-    seen_cells,
+    coarsen_cells,
+    encode_cells,
+    fuse_cells,
+    merge_cells,
+    remove_tile,
     time_scale,
-    without,
+    view_cells,
 )
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.store import Store
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.deletion import doom
@@ -88,7 +88,7 @@ def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
     data = store.blobs.get(tile.blob or "")
     if tile.level:
         return np.frombuffer(data, CELL)
-    return encoded(np.frombuffer(data, CELL_SUM), scale)
+    return encode_cells(np.frombuffer(data, CELL_SUM), scale)
 
 
 def scale_of(surface: SurfaceRow) -> TimeScale | None:
@@ -250,7 +250,7 @@ class SurfaceHandler:
             else:
                 last = touching[-1] if touching else last
             for key, parts in sums.items():
-                sums[key] = [fused(parts)]
+                sums[key] = [fuse_cells(parts)]
             if is_over():
                 break
         done = _Slice()
@@ -299,7 +299,7 @@ class SurfaceHandler:
             parts[key].append(sums)
         for key in done.damaged:
             del parts[key]  # made anew from all that touch it
-        changed = {key: fused(own) for key, own in parts.items()}
+        changed = {key: fuse_cells(own) for key, own in parts.items()}
         self._publish(surface, changed, done)
         progress["after"] = added[-1].number
         progress["done"] += len(added)
@@ -357,9 +357,9 @@ class SurfaceHandler:
             geometry = read_geometry(self._store.blobs.get(frame.geometry))
         except (DamagedBlob, UnreadableGeometry):
             return {}
-        points = moved(np.array(frame.pose), surface_points(geometry))
+        points = transform_points(np.array(frame.pose), surface_points(geometry))
         stamp = ViewStamp(frame.number, frame.captured_at, sessions.index(frame.session))
-        found = seen_cells(points, surface.cell_m, stamp)
+        found = view_cells(points, surface.cell_m, stamp)
         return {(frame.parent, place): cells for place, cells in found.items()}
 
     def _sums_of(self, tiles: Iterable[TileRow], done: _Slice) -> dict[_Key, CellSums]:
@@ -381,8 +381,8 @@ class SurfaceHandler:
         scale = scale_of(surface)
         parts: dict[_Key, Cells] = {}
         for (parent, place), rows in changed.items():
-            cells = encoded(rows, scale)
-            parts[parent, place] = coarser({place: cells})
+            cells = encode_cells(rows, scale)
+            parts[parent, place] = coarsen_cells({place: cells})
             values: dict[str, Any] | None = None
             if len(rows):
                 done.blobs.append(blob := self._store.blobs.put(rows.tobytes()))
@@ -412,9 +412,9 @@ class SurfaceHandler:
             parent, place = key
             kept = self._coarse_cells(before.get(key), done)
             for part in changed:
-                kept = without(kept, part)
-            cells = joined(kept, np.concatenate(list(changed.values())))
-            above[key] = coarser({place: cells})
+                kept = remove_tile(kept, part)
+            cells = merge_cells(kept, np.concatenate(list(changed.values())))
+            above[key] = coarsen_cells({place: cells})
             done.tiles[parent, level, place] = None
             if len(cells):
                 done.blobs.append(blob := self._store.blobs.put(cells.tobytes()))

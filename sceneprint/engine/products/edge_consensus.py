@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from sceneprint.engine.serializers import transform
 from sceneprint.geometry.session_join import (
     CycleParameters,
+    EdgeVerdicts,
     JoiningParameters,
     LoopEdges,
     RobotPath,
-    Verdicts,
-    join,
-    run_of,
-    verdicts,
-    votes_of,
+    association_votes,
+    join_sessions,
+    judge_edges,
+    robot_path,
 )
 from sceneprint.store.frame_queries import PathFrame
 from sceneprint.types import Floats
@@ -65,18 +65,18 @@ def finish_association(
         np.array([1.0 if item["strength"] == "strong" else _WEAK for item in found]),
     )
     cycles = CycleParameters().scaled(scale)
-    judged = verdicts(edges, *runs, cycles, within_run=len(asked.sessions) == 1)
+    judged = judge_edges(edges, *runs, cycles, within_run=len(asked.sessions) == 1)
     numbers = JoiningParameters(view_m=cycles.view_m)
     joins, agree = _joins(found, edges, runs, judged, stops, asked, numbers)
     confirmed = judged.supported | agree
     counts = {
-        "consistent": int(confirmed.sum()), "inconsistent": int((~judged.kept).sum()),
-        "unchecked": int((judged.kept & ~confirmed).sum()),
+        "consistent": int(confirmed.sum()), "inconsistent": int((~judged.accepted).sum()),
+        "unchecked": int((judged.accepted & ~confirmed).sum()),
     }  # fmt: skip
     told = [
         {"consistent": True if sure else None if kept else False, "loops": loops, "closed": closed}
         for sure, kept, loops, closed in zip(
-            confirmed.tolist(), judged.kept.tolist(), judged.loops.tolist(),
+            confirmed.tolist(), judged.accepted.tolist(), judged.loops.tolist(),
             judged.closed.tolist(), strict=True,
         )
     ]  # fmt: skip
@@ -89,17 +89,17 @@ def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int
         stop = stops.get(number)
         if stop is not None and stop.pose is not None and stop.parent is not None:
             poses[i], owners[i] = stop.pose, parents[stop.parent]
-    return run_of(poses, owners)
+    return robot_path(poses, owners)
 
 
 def _joins(
     found: list[dict[str, Any]], edges: LoopEdges, runs: tuple[RobotPath, RobotPath],
-    judged: Verdicts, stops: dict[int, PathFrame], asked: NewAssociation,
+    judged: EdgeVerdicts, stops: dict[int, PathFrame], asked: NewAssociation,
     numbers: JoiningParameters,
 ) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:  # fmt: skip
     """A consensus of each two parent frames that edges lead between, and the edges that agree."""
     between: dict[tuple[str, str], list[int]] = {}
-    for i in np.flatnonzero(judged.kept).tolist():
+    for i in np.flatnonzero(judged.accepted).tolist():
         ends = [stops.get(found[i][side]) for side in ("from", "to")]
         here, there = (None if end is None or end.pose is None else end.parent for end in ends)
         # loop closures within one frame correct its drift, and join nothing
@@ -110,8 +110,8 @@ def _joins(
         own: NDArray[np.intp] = np.array(chosen)
         source, target = edges.source[own], edges.target[own]
         poses: tuple[Floats, Floats] = (runs[0].poses[source], runs[1].poses[target])
-        votes = votes_of(edges.transforms[own], *poses, source, target, edges.weights[own])
-        one = join(votes, asked.seed, numbers)
+        votes = association_votes(edges.transforms[own], *poses, source, target, edges.weights[own])
+        one = join_sessions(votes, asked.seed, numbers)
         agree[own] = one.agree & (one.T is not None)
         first, second = (stops[found[chosen[0]][side]] for side in ("from", "to"))
         told.append(

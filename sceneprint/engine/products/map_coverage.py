@@ -36,7 +36,7 @@ from sceneprint.errors import (
     UnknownFrame,
     UnreadableGeometry,
 )
-from sceneprint.geometry.rigid import difference
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     PathFrame,
@@ -348,7 +348,7 @@ def _difference(
     """Metres and radians between a found pose and a frame's own, if they can be compared."""
     if pose is None or own is None or pose.parent_frame != parent:
         return None
-    return difference(np.array(pose.matrix), own)
+    return pose_difference(np.array(pose.matrix), own)
 
 
 def _is_within(off: tuple[float, float], request: NewMapCoverage) -> bool:

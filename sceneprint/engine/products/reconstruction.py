@@ -40,8 +40,13 @@ from sceneprint.fusion import (
     within,
 )
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.surface.coverage import added_areas, observed_volume, of_views, share_seen
-from sceneprint.geometry.surface.depth_image import doubled
+from sceneprint.geometry.surface.coverage import (
+    added_areas,
+    first_views,
+    observed_volume,
+    share_seen,
+)
+from sceneprint.geometry.surface.depth_image import double_resolution
 from sceneprint.store import Store, queue
 from sceneprint.store.frames import not_purged
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
@@ -133,7 +138,7 @@ def fused(
             "answer."
         )
     mesh, voxel = fuse(frames, p)
-    first = of_views(mesh, frames, BAND * voxel)
+    first = first_views(mesh, frames, BAND * voxel)
     added = added_areas(mesh, first, len(frames)).tolist()
     volume, _ = observed_volume(frames)
     as_mesh = wanted.output == "mesh"
@@ -167,7 +172,7 @@ def _own(
         with suppress(NotFound, FrameError, DamagedBlob, UnreadableGeometry):
             frame, source = _read(store, own, model_id, asked_at)
             return replace(frame, name="query"), source
-    return doubled(_frame(query, "query", np.eye(4))), "geometry"
+    return double_resolution(_frame(query, "query", np.eye(4))), "geometry"
 
 
 def _read(store: Store, view: JobView, model_id: str, asked_at: float) -> tuple[DepthFrame, Source]:
@@ -197,7 +202,9 @@ def _read(store: Store, view: JobView, model_id: str, asked_at: float) -> tuple[
     except DamagedBlob:
         if blob is None:
             raise
-        return doubled(_frame(read_geometry(store.blobs.get(blob)), view.frame_id, T)), "geometry"
+        return double_resolution(
+            _frame(read_geometry(store.blobs.get(blob)), view.frame_id, T)
+        ), "geometry"
 
 
 def _frame(geometry: Geometry, name: str, T: Floats) -> DepthFrame:

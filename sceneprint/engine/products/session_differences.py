@@ -36,16 +36,16 @@ from sceneprint.geometry.cells import (
     SessionCells,
     VerdictCounts,
     ViewStamp,
-    add_views,
     cell_positions,
     cell_states,
     count_cells,
+    empty_counts,
     frame_verdicts,
-    no_verdicts,
-    seen_cells,
+    merge_views,
+    view_cells,
 )
 from sceneprint.geometry.registration.overlap import OverlapParameters
-from sceneprint.geometry.rigid import moved
+from sceneprint.geometry.rigid import transform_points
 from sceneprint.store import Store, queue
 from sceneprint.store.frame_queries import (
     any_gone,
@@ -167,16 +167,16 @@ class Differences(Products[NewDifference, Difference]):
             if posed is None:
                 progress["skipped"] += 1
             else:
-                points = moved(posed[1], surface_points(posed[0]))
+                points = transform_points(posed[1], surface_points(posed[0]))
                 stamp = ViewStamp(number, None, NO_SESSION)
-                views[side].append(seen_cells(points, progress["cell_m"], stamp))
+                views[side].append(view_cells(points, progress["cell_m"], stamp))
                 held += count_cells(views[side][-1])
             progress["done"] += 1
             if is_over() or held > _HELD:
                 break
         for side in SIDES:
-            state.cells[side] = add_views(state.cells[side], views[side])
-            state.counts[side] = no_verdicts(count_cells(state.cells[side]))
+            state.cells[side] = merge_views(state.cells[side], views[side])
+            state.counts[side] = empty_counts(count_cells(state.cells[side]))
 
     def _judge(
         self, row: MapRow, progress: dict[str, Any], state: _State, is_over: IsOver,
@@ -246,7 +246,7 @@ class _State:
 
     def __init__(self) -> None:
         self.cells: dict[Side, SessionCells] = {side: {} for side in SIDES}
-        self.counts: dict[Side, VerdictCounts] = {side: no_verdicts(0) for side in SIDES}
+        self.counts: dict[Side, VerdictCounts] = {side: empty_counts(0) for side in SIDES}
 
     @classmethod
     def read(cls, data: bytes) -> _State:

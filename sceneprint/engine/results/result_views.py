@@ -33,7 +33,7 @@ from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, 
 from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.geometry.registration.overlap import sampled
 from sceneprint.geometry.retrieval.ranking import pairwise_distances, similarity
-from sceneprint.geometry.rigid import NO_UPS, Ups, inverse, moved
+from sceneprint.geometry.rigid import NO_UPS, Ups, inverse, transform_points
 from sceneprint.geometry.validation.inspection import (
     AGREES,
     VIOLATES,
@@ -545,6 +545,6 @@ def _encoded(
 ) -> bytes:  # fmt: skip
     at, normals = points[:, :3].astype(float), points[:, 3:].astype(float)
     if T is not None:
-        at, normals = moved(T, at), normals @ T[:3, :3].T
+        at, normals = transform_points(T, at), normals @ T[:3, :3].T
     patches = patches_at(points, geometry.patches)
     return encode_points(at, normals, patches, residuals, total=total, scale=scale)

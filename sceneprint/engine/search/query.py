@@ -411,12 +411,12 @@ class Queries:
         self._log.note(replace(row, listed=listed), stored, sorted(shown))
 
     def _steadily(self, maps: Sequence[str], ask: Callable[[list[MapRow]], Answer]) -> Answer:
-        with self._cores.lent():
+        with self._cores.shared():
             return steadily(self._store, maps, ask)
 
     def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
         """Compare two frames; see `compare`."""
-        with self._cores.lent():
+        with self._cores.shared():
             return compare(self._store, self._signers, a, b, how)
 
     def maps_of(

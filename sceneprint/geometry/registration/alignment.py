@@ -72,10 +72,10 @@ from sceneprint.geometry.rigid import (
     GravityParameters,
     Ups,
     are_level,
-    distinct,
     inverse,
     inverses,
     rotation_of_covariance,
+    select_distinct,
     slopes,
 )
 from sceneprint.types import (
@@ -547,7 +547,7 @@ def align(
     ups = source.up, target.up
     hypotheses = _voted(a, b, rng, p, matching, ups)
     scores = _scores(source, target, hypotheses, p, overlap_p)
-    chosen = distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
+    chosen = select_distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
     refined = refined_all(a.surface, b.surface, hypotheses[chosen], p.coarse)
     refined = refined[are_level(refined, ups, p.gravity.refined_tilt)]
     if not len(refined):
@@ -590,7 +590,7 @@ def align_scans(
     planned = plan_hypotheses(plans, p.plan)
     hypotheses = np.concatenate([voted, planned])
     scores = _scores(query, match, hypotheses, p, overlap_p)
-    chosen = distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
+    chosen = select_distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
     transforms, index = refined_with_index(a.surface, b.surface, hypotheses[chosen], p.coarse)
     if not index:
         return None

@@ -28,17 +28,17 @@ import numpy as np
 
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.geometry.registration.overlap import LookupTarget, nearest_alike, sampled, target_of
-from sceneprint.geometry.rigid import PoseAverage, rotation_angle, solve_positive, turned
+from sceneprint.geometry.rigid import PoseAverage, apply_rotation, rotation_angle, solve_positive
 from sceneprint.geometry.surface.camera import (
     BLOCK,
     depth_of,
     gather,
     gather_pixels,
-    grown,
+    growth_at,
     move_all,
     project_all,
-    transposed,
-    within,
+    select_inside,
+    transpose_points,
 )
 from sceneprint.types import PINHOLE, Floats, Floats32, Ints32, Surface, kind_of
 
@@ -151,7 +151,7 @@ def _weighed(
             (x[i] - points[at]) * mx + (y[i] - points[at + np.uint64(1)]) * my
             + (z[i] - points[at + np.uint64(2)]) * mz
         )  # fmt: skip
-        limit = gate * grown(depth[i], reference, power)
+        limit = gate * growth_at(depth[i], reference, power)
         own = np.uint64(start + places[i])
         nx, ny, nz = source[3, own], source[4, own], source[5, own]
         cosine = (
@@ -247,7 +247,7 @@ def _accumulate(
         count = min(BLOCK, source.shape[1] - start)
         move_all(source, T, start, count, moved)
         project_all(camera, moved, count, seen)
-        count = within(seen, count, edge, width - edge, 1.0, height - 1.0, places)
+        count = select_inside(seen, count, edge, width - edge, 1.0, height - 1.0, places)
         gather(moved, places, count, inside)
         gather(seen[2:], places, count, inside[3:])
         gather_pixels(seen, places, count, pixels)
@@ -324,9 +324,9 @@ def refine_in_place(
     before, turn = np.zeros((3, 3)), np.zeros((3, 3))
     used, squares = 0, 0.0
     room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
-    whole = few = transposed(source, 1)
+    whole = few = transpose_points(source, 1)
     if int(numbers[9]) > 1 and thinned > 0:
-        few = transposed(source, int(numbers[9]))
+        few = transpose_points(source, int(numbers[9]))
     for iteration in range(iterations):
         share = iteration / max(iterations - 1, 1)
         gate = numbers[1] * (numbers[2] / numbers[1]) ** share
@@ -357,11 +357,11 @@ def refine_in_place(
         for a in range(3):
             for b in range(3):
                 before[a, b] = T[a, b]
-        turned(before, step[:3], turn)
+        apply_rotation(before, step[:3], turn)
         for a in range(3):
             for b in range(3):
                 T[a, b] = turn[a, b]
-        turned(np.eye(3), step[:3], turn)
+        apply_rotation(np.eye(3), step[:3], turn)
         x, y, z = T[0, 3], T[1, 3], T[2, 3]
         for a in range(3):
             T[a, 3] = turn[a, 0] * x + turn[a, 1] * y + turn[a, 2] * z + step[3 + a]

@@ -25,13 +25,13 @@ from sceneprint.geometry.surface.camera import (
     depth_of,
     gather,
     gather_pixels,
-    grown,
+    growth_at,
     move_all,
     project_all,
-    transposed,
-    within,
+    select_inside,
+    transpose_points,
 )
-from sceneprint.geometry.surface.cloud import Ints64, mixed
+from sceneprint.geometry.surface.cloud import Ints64, hash_key
 from sceneprint.types import (
     Bytes,
     Floats,
@@ -77,7 +77,7 @@ class LookupTarget:
 @kernel
 def _slot(i: int, j: int, k: int, slots: int, secret: int) -> int:
     """Of a cube: slots is a power of two."""
-    return mixed((((i << 21) + j) << 21) + k, secret) & (slots - 1)
+    return hash_key((((i << 21) + j) << 21) + k, secret) & (slots - 1)
 
 
 @kernel
@@ -142,7 +142,7 @@ def _first_in_cubes(
             int(np.floor(points[n, 2] / cube)),
         )  # fmt: skip
         # twice, as cubes may be so many that three numbers do not fit in one
-        slot = mixed((mixed((i << 32) ^ j, secret) << 19) + k, secret) & mask
+        slot = hash_key((hash_key((i << 32) ^ j, secret) << 19) + k, secret) & mask
         while True:
             other = table[slot]
             if other < 0:
@@ -331,7 +331,7 @@ def _compare(
         seen, depth = depth_of(kind, a, b, c), moved[3, i]
         dx, dy, dz = moved[0, i] - a, moved[1, i] - b, moved[2, i] - c
         plane = abs(dx * mx + dy * my + dz * mz)
-        grow = grown(depth, reference, power)
+        grow = growth_at(depth, reference, power)
         own = np.uint64(start + places[i])
         nx, ny, nz = nxs[own], nys[own], nzs[own]
         cosine = (
@@ -366,7 +366,7 @@ def _sees_through(
             there = depth_at(camera, points, line, beside)
             if there > 0:
                 nearest = min(nearest, there)
-    margin: float = tolerances[3] * grown(depth, tolerances[4], tolerances[6])
+    margin: float = tolerances[3] * growth_at(depth, tolerances[4], tolerances[6])
     return depth < nearest - margin
 
 
@@ -385,7 +385,7 @@ def _look_up_seen(
         count = min(BLOCK, source.shape[1] - start)
         move_all(source, T, start, count, moved)
         project_all(camera, moved, count, seen)
-        count = within(seen, count, 0.0, width, 0.0, height, places)
+        count = select_inside(seen, count, 0.0, width, 0.0, height, places)
         gather(moved, places, count, inside)
         gather(seen[2:], places, count, inside[3:])
         gather_pixels(seen, places, count, pixels)
@@ -436,7 +436,7 @@ def _look_up(
     if camera[0] == 2:
         _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, said)
     else:
-        _look_up_seen(transposed(source, 1), points, normals, camera, T, tolerances, said)
+        _look_up_seen(transpose_points(source, 1), points, normals, camera, T, tolerances, said)
 
 
 @kernel

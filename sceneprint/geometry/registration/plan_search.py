@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.registration.overlap import one_of_each
-from sceneprint.geometry.rigid import distinct
+from sceneprint.geometry.rigid import select_distinct
 from sceneprint.types import Floats, Floats32, Ints32, Sphere, Surface
 
 #: Normals this near a candidate speak for it as up; twice as much as one across it.
@@ -319,7 +319,7 @@ def _laid(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> tuple[Floats
     flat[:, 1, 0], flat[:, 1, 1] = np.sin(angles), np.cos(angles)
     flat[:, :2, 3] = ((cells[:, ::-1] + p.side // 2) % p.side - p.side // 2) * p.cell
     # neighbouring yaws propose the same shifts: without them there is room for what differs
-    best = distinct(flat, values, 2 * p.cell, 3 * math.pi / p.n_yaws, p.n_kept)
+    best = select_distinct(flat, values, 2 * p.cell, 3 * math.pi / p.n_yaws, p.n_kept)
     lifts = _lifts(source, target, p)
     level = np.repeat(flat[best], len(lifts), axis=0)
     level[:, 2, 3] = np.tile(lifts, len(best))

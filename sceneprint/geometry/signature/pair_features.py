@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import TrainingError
-from sceneprint.geometry.kernel import cached_at, disjoint_kernel, kernel
+from sceneprint.geometry.kernel import code_folder, disjoint_kernel, kernel
 from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.types import Floats, Floats32, Ints32, Patches
 
@@ -608,4 +608,4 @@ def count_pairs(
 
 def compiled_at() -> tuple[str, bool]:
     """Folder of this code's machine code, and whether it is there."""
-    return cached_at(_count)
+    return code_folder(_count)

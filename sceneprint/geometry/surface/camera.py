@@ -40,7 +40,7 @@ def depth_of(kind: float, x: float, y: float, z: float) -> float:
 
 
 @kernel
-def _on_sphere(camera: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
+def _project_sphere(camera: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
     depth = np.sqrt(x * x + y * y + z * z)
     if not depth > camera[1]:
         return -1.0, -1.0, depth
@@ -66,11 +66,11 @@ def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float,
         if not z > camera[1]:
             return -1.0, -1.0, z
         return x / z * camera[2] + camera[4] + 0.5, y / z * camera[3] + camera[5] + 0.5, z
-    return _on_sphere(camera, x, y, z)
+    return _project_sphere(camera, x, y, z)
 
 
 @kernel
-def transposed(source: Floats32, step: int) -> Floats32:
+def transpose_points(source: Floats32, step: int) -> Floats32:
     """Every `step`-th of some points (N, 6), number by number: (6, n)."""
     chosen = np.empty((6, (len(source) + step - 1) // step), np.float32)
     for a in range(6):
@@ -99,7 +99,7 @@ def project_all(camera: Floats, points: Floats, count: int, out: Floats) -> None
 
 
 @disjoint_kernel
-def within(
+def select_inside(
     projected: Floats, count: int, left: float, right: float, top: float, bottom: float,
     places: Ints32,
 ) -> int:  # fmt: skip
@@ -138,7 +138,7 @@ def depth_at(camera: Floats, points: Floats32, line: int, column: int) -> float:
 
 
 @kernel
-def grown(depth: float, reference: float, power: float) -> float:
+def growth_at(depth: float, reference: float, power: float) -> float:
     """What lengths grow by at a depth: (depth / reference)^power, power 0, 1 or 2, at least 1."""
     ratio = depth / reference
     if power == 2:

@@ -1,9 +1,10 @@
-"""Input of Sec. III, clouds: which points are looked at, and in which axes.
+"""Select a cloud's points by range, compute its axes, and average points by cell (Sec. III).
 
-    points (N, 3)  --within_range-->  points of a model's range
-    points (N, 3)  --principal_axes-->  axes (3, 3) that turn with the cloud
+    points (N, 3)  --select_in_range-->  points within a model's range
+    points (N, 3)  --principal_axes-->  axes (3, 3) that rotate with the cloud
+    points (N, 3), axes  --average_cells-->  means (V, 4), side of a cell
 
-Every sum over points is one of whole numbers: it is the same in whatever order they come.
+Sums over points are sums of integers, so they do not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class CloudParameters:
     gap_cosine: float = 0.95  #: between the normals of its two sides
 
 
-def within_range(cloud: Cloud, p: CloudParameters) -> Floats32:
+def select_in_range(cloud: Cloud, p: CloudParameters) -> Floats32:
     """The points of a cloud that a model looks at: (M, 3) float32, C-contiguous.
 
     Parameters
@@ -203,7 +204,7 @@ def metric_cell(x: float, y: float, z: float, size: float) -> int:
 
 
 @kernel
-def mixed(key: int, secret: int) -> int:
+def hash_key(key: int, secret: int) -> int:
     """Where a key goes in a hash table whose size is a power of two.
 
     Who knows the hash can make a cloud all of whose cells share a slot, so there is a secret;
@@ -243,7 +244,7 @@ def _gather(
         else:
             key, shell = metric_cell(x, y, z, side), np.int64(0)
             scale, inverse = _STEPS / unit, 0.0
-        at = mixed(int(key * 1000003 + shell), secret) & mask
+        at = hash_key(int(key * 1000003 + shell), secret) & mask
         while table[at] >= 0 and (keys[table[at]] != key or bins[table[at]] != shell):
             at = (at + 1) & mask
         k = table[at]
@@ -264,7 +265,7 @@ def _gather(
 
 
 @kernel
-def _joined(keys: Ints64, bins: Ints64, order: Ints64, sums: Ints64, out: Ints64) -> int:
+def _merge_shells(keys: Ints64, bins: Ints64, order: Ints64, sums: Ints64, out: Ints64) -> int:
     """Cells in order of their keys; two in one direction, one behind the other, become one."""
     n, i = 0, 0
     while i < len(order):
@@ -287,7 +288,7 @@ def centroid(points: Floats32) -> Floats:
     return mean
 
 
-def thinned(
+def average_cells(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, unit: float, p: CloudParameters
 ) -> tuple[Floats, float]:
     """Means of the occupied cells (V, 4), and the side of a cell."""
@@ -303,5 +304,5 @@ def thinned(
         wider = max(math.sqrt(n / p.maximum_pixels), 1.05) if n > 0 else math.sqrt(_ROOM)
         side, step = side * wider, step * wider
     order = np.lexsort((bins[:n], keys[:n]))
-    n = _joined(keys[:n], bins[:n], order, sums, out)
+    n = _merge_shells(keys[:n], bins[:n], order, sums, out)
     return out[:n, 1:] / out[:n, :1] / _STEPS, side

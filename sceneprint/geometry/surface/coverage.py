@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint.geometry.kernel import kernel
-from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32
 
 #: A point is seen by a view that measures its depth within so many metres, and this share of it.
@@ -119,7 +119,7 @@ def share_seen(points: Floats, views: Sequence[DepthFrame]) -> float:
     return float((first >= 0).mean()) if len(points) else 0.0
 
 
-def of_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: float) -> Ints32:
+def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: float) -> Ints32:
     """(N,) the first view that sees each point of a mesh made of these views.
 
     Parameters
@@ -133,19 +133,19 @@ def of_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: float) 
 
 
 def added_areas(mesh: TriangleMesh, first: Ints32, views: int) -> Floats:
-    """(V,) square metres that each view adds to what those before it have seen.
+    """Return the area that each view adds to that of the views before, (V,) square metres.
 
     A triangle counts for the first view that sees one of its corners; the sum is the mesh's area.
 
     Parameters
     ----------
-    first : (N,) of `of_views`
-    views : their number
+    first : (N,) result of `first_views`
+    views : number of views
     """
     if not len(mesh.triangles):
         return np.zeros(views)
-    of = first[mesh.triangles].min(axis=1)
-    areas: Floats = np.bincount(of, mesh.areas(), minlength=views).astype(np.float64)
+    view = first[mesh.triangles].min(axis=1)
+    areas: Floats = np.bincount(view, mesh.areas(), minlength=views).astype(np.float64)
     return areas
 
 
@@ -180,7 +180,9 @@ def observed_volume(views: Sequence[DepthFrame]) -> tuple[float, float]:
     volume : cubic metres
     cell : edge of the cells it was counted in, metres; larger where the views reach far
     """
-    corners = [moved(view.pose, _outline(view)) for view in views if view.pose is not None]
+    corners = [
+        transform_points(view.pose, _outline(view)) for view in views if view.pose is not None
+    ]
     everything = np.concatenate(corners) if corners else np.zeros((0, 3))
     if not len(everything):
         return 0.0, CELL_M

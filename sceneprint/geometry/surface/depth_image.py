@@ -64,7 +64,7 @@ def _halve(q: Floats32, same_surface: float) -> Floats32:
     return half
 
 
-def halved(intrinsics: Intrinsics) -> Intrinsics:
+def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
     """The camera of an image reduced 2 x 2 (pixel centres at integers; odd edges fall off)."""
     return replace(
         intrinsics,
@@ -83,7 +83,7 @@ def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
     while min(camera.width, camera.height) >= 4 and (
         camera.fx > p.focal_length_px * 2**0.5 or camera.width * camera.height > p.maximum_pixels
     ):
-        camera, times = halved(camera), times + 1
+        camera, times = halve_camera(camera), times + 1
     return times
 
 
@@ -119,7 +119,7 @@ def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intr
         )
     q = _in_range(np.ascontiguousarray(frame.depth, np.float32), p.minimum_depth, p.maximum_depth)
     for _ in range(halvings(camera, p)):
-        q, camera = _halve(q, p.same_surface), halved(camera)
+        q, camera = _halve(q, p.same_surface), halve_camera(camera)
     n_valid = int(np.count_nonzero(q))
     if n_valid < p.minimum_valid:
         raise UselessFrame(_why_useless(frame, p))
@@ -152,7 +152,7 @@ SAME_SURFACE = 0.05
 
 
 @kernel
-def _doubled(depth: Floats32, same_surface: float) -> Floats32:
+def _double(depth: Floats32, same_surface: float) -> Floats32:
     height, width = depth.shape
     large = np.zeros((2 * height, 2 * width), np.float32)
     for y in range(2 * height):
@@ -177,7 +177,7 @@ def _doubled(depth: Floats32, same_surface: float) -> Floats32:
     return large
 
 
-def doubled(frame: DepthFrame) -> DepthFrame:
+def double_resolution(frame: DepthFrame) -> DepthFrame:
     """A frame of twice the width and height, interpolated where it sees one surface.
 
     Parameters
@@ -194,7 +194,7 @@ def doubled(frame: DepthFrame) -> DepthFrame:
         cx=2 * k.cx + 0.5, cy=2 * k.cy + 0.5,
     )  # fmt: skip
     depth = np.ascontiguousarray(frame.depth, np.float32)
-    return replace(frame, depth=_doubled(depth, SAME_SURFACE), intrinsics=camera)
+    return replace(frame, depth=_double(depth, SAME_SURFACE), intrinsics=camera)
 
 
 # Input of Sec. III: a map of inverse depth to points and unit normals.
@@ -337,7 +337,7 @@ def _lift(
             valid[y, x] = True
 
 
-def surface(q: Floats32, intrinsics: Intrinsics, p: NormalParameters) -> Surface:
+def fit_surface(q: Floats32, intrinsics: Intrinsics, p: NormalParameters) -> Surface:
     """Points and unit normals by a least-squares plane in inverse depth around each pixel.
 
     Parameters

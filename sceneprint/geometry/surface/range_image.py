@@ -1,10 +1,10 @@
-"""A cloud as its viewpoint saw it: a range image, and the plane seen in each pixel.
+"""Render a cloud from its viewpoint as a range image, and fit a plane in each pixel.
 
     points (N, 3)  --range_image-->  Surface (h, w) with camera Sphere
 
 On the sphere about the viewpoint the inverse range of a plane is linear in the direction u:
-1/r = a . u. A least-squares fit of a over a window gives normal and denoised point at once,
-always facing the viewpoint, as `depth_image.py` does in the image of a depth sensor.
+1/r = a . u. A least-squares fit of a over a window gives the normal and the denoised point, as in
+`depth_image.py`.
 """
 
 from __future__ import annotations
@@ -17,22 +17,18 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.kernel import cached_per_frame, kernel
-from sceneprint.geometry.surface.cloud import CloudParameters, within_range
+from sceneprint.geometry.surface.cloud import CloudParameters, select_in_range
 from sceneprint.geometry.surface.voxels import solve
 from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface
 
-# The camera of a range image: which pole, how wide, and where its pixels look.
-#
-# points (N, 3)  --to_angles-->  azimuth, elevation, range  --framed-->  Sphere
-
-#: Closer to an axis than this a point is near its poles: cosine of 30 degrees.
+#: Cosine of the angle to an axis within which a point is near its poles.
 _NEAR_POLE = math.cos(math.radians(30.0))
-#: An empty wedge of fewer pixels does not end the image.
+#: Greatest width of an empty wedge that does not end the image, pixels.
 _WEDGE_PX = 8
 
 
 def directions(camera: Sphere) -> Floats:
-    """Unit vectors (h, w, 3) through the centres of the pixels, in the sensor's axes."""
+    """Return the unit vectors (h, w, 3) through the centres of the pixels, in the sensor's axes."""
     azimuth = camera.left + camera.step * np.arange(camera.width)
     elevation = camera.top - camera.step * np.arange(camera.height)
     rays = np.empty((camera.height, camera.width, 3))
@@ -45,7 +41,7 @@ def directions(camera: Sphere) -> Floats:
 
 @kernel
 def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> None:
-    """How many points are near each axis: that cosine or more off it."""
+    """Count the points near each axis, by the cosine of their angle to it."""
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         limit = least * np.sqrt(x * x + y * y + z * z)
@@ -55,7 +51,7 @@ def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> 
 
 
 def pole_of(points: Floats32) -> int:
-    """The axis, z, y, x where they tie, that the fewest points are near."""
+    """Return the axis with the fewest points near it; of equals z, then y, then x."""
     near = np.zeros(3, np.int64)
     _near_axes(points, np.float32(_NEAR_POLE), near)
     return min((2, 1, 0), key=lambda axis: int(near[axis]))
@@ -63,7 +59,7 @@ def pole_of(points: Floats32) -> int:
 
 @kernel
 def to_angles(points: Floats32, pole: int, out: Floats) -> None:
-    """Azimuth, elevation and range of each point."""
+    """Write azimuth, elevation and range of each point to `out` (N, 3)."""
     first, second = (pole + 1) % 3, (pole + 2) % 3
     for i in range(len(points)):
         a, b = float(points[i, first]), float(points[i, second])
@@ -74,8 +70,8 @@ def to_angles(points: Floats32, pole: int, out: Floats) -> None:
         out[i, 2] = np.sqrt(flat + c * c)
 
 
-def framed(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
-    """The camera that shows all points, of steps so long that it has pixels for them."""
+def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
+    """Return the camera that shows all points, with steps that keep it within `maximum_pixels`."""
     low, high = float(angles[:, 1].min()), float(angles[:, 1].max())
     step = p.image_angle
     while True:
@@ -89,7 +85,7 @@ def framed(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
         top = (high + low) / 2 + (height - 1) / 2 * unit
         if ends[widest + 1] - ends[widest] <= _WEDGE_PX:
             first, width = 0, around
-        else:  # the image begins where the widest wedge without points ends
+        else:  # the image starts at the end of the widest empty wedge
             first = int(ends[widest + 1])
             width = max(int(ends[widest]) + around - first + 1, 2)
         if width * height <= p.maximum_pixels:
@@ -98,40 +94,34 @@ def framed(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
         step *= max(math.sqrt(width * height / p.maximum_pixels), 1.01)
 
 
-#: How much finer the pixels are that the points of a scan are taken from.
+#: Ratio of the resolutions of `spread_points` and of the range image.
 FINER = 2
-#: Points of a scan that are kept, at most; how many: docs/clouds.md.
+#: Maximum number of stored points of a scan; docs/clouds.md gives the measurements.
 SPREAD_POINTS = 8192
 
-#: Steps of a number from 0 to 1 in sums: those of 5 million points stay below 2^63.
+#: Steps of a number from 0 to 1 in sums: sums of 5 million points stay below 2^63.
 _STEPS = 2.0**38
-#: A window is at most so much wider than high.
+#: Greatest ratio of a window's width to its height.
 _WIDEST = 8.0
 
 
 def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
-    """What is seen from the viewpoint of a cloud, as an ordered map of points and normals.
+    """Return the nearest surfaces around the viewpoint of a cloud as a map of points and normals.
 
-    A pixel shows the nearest surface in its direction. Small gaps, as between the rings of a
-    spinning sensor, are closed where both sides lie on one plane.
+    Small gaps, as between the rings of a spinning sensor, are closed if both sides lie on one
+    plane. The camera is a Sphere cropped to the points; `pole_of` selects its pole.
 
     Parameters
     ----------
-    cloud : with a viewpoint
-    p : see CloudParameters
-
-    Returns
-    -------
-    surface : its camera is a Sphere, cropped to what is seen, whose pole is the axis (z, y, x
-        where they tie) that the fewest points are near
+    cloud : cloud with a viewpoint
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_points` points are within range, or pixels show one.
+    UselessFrame : fewer than `minimum_points` points are within range, or fewer pixels show one
     """
     pole, angles = _angles_of(cloud, p.minimum_range, p.maximum_range, p.minimum_points)
-    camera = framed(angles, pole, p)
-    q, u = _averaged(angles, camera, p)
+    camera = fit_camera(angles, pole, p)
+    q, u = _average_pixels(angles, camera, p)
     if int(np.count_nonzero(q)) < p.minimum_points:
         raise UselessFrame(
             f"{cloud.name or 'The cloud'}: {np.count_nonzero(q)} pixels of "
@@ -145,37 +135,35 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
     _fit(q, u, p.image_radius_px, camera.is_closed, flat, gates, limits, planes)
     rays = directions(camera)
     closed = planes.copy()
-    for view, target, ray, shown in (
-        (planes, closed, rays, q),
-        (_turned(planes), _turned(closed), _turned(rays), q.T),
-    ):
-        _close(view, target, ray, shown, p.gap_px, gates, p.gap_cosine)
-    return _lifted(closed, rays, camera, p)
+    _close(planes, closed, rays, q, p.gap_px, gates, p.gap_cosine)
+    by_row = [maps.transpose(1, 0, 2) for maps in (planes, closed, rays)]
+    _close(by_row[0], by_row[1], by_row[2], q.T, p.gap_px, gates, p.gap_cosine)
+    return _lift_surface(closed, rays, camera, p)
 
 
 @cached_per_frame
 def _angles_of(cloud: Cloud, nearest: float, farthest: float, least: int) -> tuple[int, Floats]:
-    """Pole of a cloud, and angles and range of each point; of its two images alike."""
+    """Return the pole of a cloud, and the angles and range of each point, for both its images."""
     limits = CloudParameters(
         minimum_range=nearest, maximum_range=farthest, minimum_points=least
     )  # fmt: skip
-    points = within_range(cloud, limits)
+    points = select_in_range(cloud, limits)
     pole, angles = pole_of(points), np.empty((len(points), 3))
     to_angles(points, pole, angles)
     return pole, angles
 
 
 def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
-    """Points in no order of a scan, finer than its range image: what fine refinement works on.
+    """Return unordered points of a scan, finer than its range image, for fine refinement.
 
-    A range image has a pixel each 0.9 degrees or so, which 30 m away is half a metre of wall and
-    several metres of ground. Where finer pixels fix no plane, as between rings far apart, the
-    points of the image itself are taken.
+    A pixel of the range image covers .9 degrees: half a metre of wall at 30 m, and several metres
+    of ground. If finer pixels determine no plane, as between distant rings, the image's own points
+    serve.
 
     Parameters
     ----------
-    cloud, p : of the image
-    image : of `range_image`
+    cloud, p : arguments of the image
+    image : result of `range_image`
 
     Returns
     -------
@@ -189,19 +177,15 @@ def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
     )
     both = range_image(cloud, finer), image
     points, normals, areas = (
-        np.concatenate([getattr(one, name)[one.valid] for one in both])[None]
+        np.concatenate([getattr(view, name)[view.valid] for view in both])[None]
         for name in ("points", "normals", "areas")
     )
     return Surface(points, normals, np.ones(areas.shape, np.bool_), areas, None)
 
 
-def _turned(maps: Floats) -> Floats:
-    return maps.transpose(1, 0, 2)
-
-
 @kernel
 def _nearest(angles: Floats, frame: Floats, pixel: NDArray[np.int64], nearest: Floats) -> None:
-    """Pixel of each point, and the nearest range in each pixel."""
+    """Write the pixel of each point, and the nearest range in each pixel."""
     height, width = nearest.shape
     step, left, top = frame[0], frame[1], frame[2]
     for i in range(len(angles)):
@@ -209,7 +193,7 @@ def _nearest(angles: Floats, frame: Floats, pixel: NDArray[np.int64], nearest: F
         if turn < 0:
             turn += around
         x = int(turn)
-        if x >= width:  # by rounding: just behind the last column, or just before the first
+        if x >= width:  # rounding: just after the last column, or just before the first
             x = 0 if turn > (width + around) / 2 else width - 1
         y = min(max(int((top - angles[i, 1]) / step + 0.5), 0), height - 1)
         pixel[i] = y * width + x
@@ -221,7 +205,7 @@ def _sum(
     angles: Floats, pixel: NDArray[np.int64], nearest: Floats, frame: Floats, share: float,
     pole: int, sums: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Points on the nearest surface: their number, inverse ranges and directions."""
+    """Sum the points on the nearest surface of each pixel: count, inverse ranges and directions."""
     first, second = (pole + 1) % 3, (pole + 2) % 3
     least, steps = frame[3], frame[4]
     for i in range(len(angles)):
@@ -239,7 +223,7 @@ def _sum(
 
 @kernel
 def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None:
-    """Means of what `_sum` has added up: inverse range (n,) and direction (n, 3)."""
+    """Write the means of the sums of `_sum`: inverse range (n,) and direction (n, 3)."""
     for k in range(len(sums)):
         count = float(max(sums[k, 0], 1))
         q[k] = float(sums[k, 1]) / count / _STEPS / least
@@ -247,9 +231,11 @@ def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None
             u[k, d] = float(sums[k, 2 + d]) / count / _STEPS
 
 
-def _averaged(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Floats, Floats]:
-    """Inverse range (h, w) of the nearest surface in each pixel, 0 for none, and the direction
-    (h, w, 3) it is the mean of: where 1/r = a . u, so are the means.
+def _average_pixels(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Floats, Floats]:
+    """Return the inverse range (h, w) of the nearest surface in each pixel, 0 if empty, and the
+    mean direction (h, w, 3) of its points.
+
+    On a plane 1/r = a . u the means satisfy the same equation.
     """
     shape = (camera.height, camera.width)
     least = max(p.minimum_range, 1e-9)
@@ -274,10 +260,10 @@ def _fit(
     limits: Floats,
     planes: Floats,
 ) -> None:
-    """a of 1/r = a . u around every pixel that shows something; left 0 where nothing fixes it.
+    """Write a of 1/r = a . u around every pixel with a point; 0 if its window determines no plane.
 
-    Two passes: what is near in range, then what is near the plane. flat: cosine of each row's
-    elevation; towards the poles pixels are narrow, and windows of more columns.
+    The first pass selects by range, the second by distance to the plane. flat: cosine of each row's
+    elevation; narrow pixels towards the poles get wider windows.
     """
     height, width = q.shape
     b, a = np.zeros(3), np.zeros(3)
@@ -329,9 +315,9 @@ def _close(
     planes: Floats, out: Floats, rays: Floats, q: Floats, longest: int, gates: Floats,
     cosine: float,
 ) -> None:  # fmt: skip
-    """Fill gaps of each column whose two sides are planes that agree across it.
+    """Fill gaps of each column between planes that agree across the gap.
 
-    Not where something else was seen, as a wire before a wall: nobody saw through it.
+    A gap with another surface in it, as a wire before a wall, stays: nothing was seen behind it.
     """
     height, width = planes.shape[0], planes.shape[1]
     for x in range(width):
@@ -366,7 +352,7 @@ def _lift(
     planes: Floats, rays: Floats, flat: Floats, numbers: Floats,
     points: Floats32, normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Where the rays meet the planes. numbers: least cosine, least range, most, squared step."""
+    """Intersect rays and planes. numbers: least cosine, least and greatest range, squared step."""
     for y in range(len(planes)):
         for x in range(planes.shape[1]):
             a, ray = planes[y, x], rays[y, x]
@@ -374,7 +360,7 @@ def _lift(
             length = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
             if not length > 0 or not inverse / length >= numbers[0]:
                 continue
-            # at most twice as far as the sensor reaches, and at least half as far as it begins
+            # between half the sensor's least range and twice its greatest
             if not (inverse * numbers[2] * 2 > 1 and inverse * numbers[1] < 2):
                 continue
             for d in range(3):
@@ -385,11 +371,11 @@ def _lift(
             valid[y, x] = True
 
 
-def _lifted(planes: Floats, rays: Floats, camera: Sphere, p: CloudParameters) -> Surface:
+def _lift_surface(planes: Floats, rays: Floats, camera: Sphere, p: CloudParameters) -> Surface:
     shape = (camera.height, camera.width)
     flat = np.cos(camera.top - camera.step * np.arange(camera.height))
     numbers = np.array([p.minimum_cosine, p.minimum_range, p.maximum_range, camera.step**2])
-    points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
+    points, normals = np.zeros((2, *shape, 3), np.float32)
     areas, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
     _lift(planes, rays, flat, numbers, points, normals, areas, valid)
     return Surface(points, normals, valid, areas, camera)

@@ -1,14 +1,13 @@
-"""Input of Sec. III, clouds: points to voxels, each a mean of points and the plane it lies on.
+"""Average a cloud's points to voxels, each with the plane through its neighbours (Sec. III).
 
     Cloud (N)  --voxels-->  Voxels (V), a Surface (1, V)
-    inverse ranges (N), directions (N, 3), Links  --plane_seen-->    planes
-    places (N, 3), Links                          --plane_facing-->  normals, feet
+    inverse ranges (N), directions (N, 3), Links  --fit_inverse_planes-->  planes
+    places (N, 3), Links                          --fit_planes-->          normals, feet
+    places (N, 3), heights (N)                    --link_points-->         Links
 
-About a viewpoint voxels grow with range, as those of VCCS do for a cloud of one camera (Papon
-2013): a cell is a bin of direction, on the cube, and of the logarithm of range, so that a voxel
-is to a cloud what a pixel is to a depth image. Without a viewpoint all are of one size. The grid
-lies in the cloud's own axes: turning the cloud turns the voxels with it. The plane of a voxel goes
-through its neighbours.
+About a viewpoint voxels grow with range, as in VCCS for a cloud of one camera (Papon 2013): a cell
+is a bin of direction, on the cube, and of the logarithm of range. Without a viewpoint all cells
+have one size. The grid lies in the cloud's own axes, so it rotates with the cloud.
 """
 
 from __future__ import annotations
@@ -24,15 +23,13 @@ from sceneprint.errors import UselessFrame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.surface.cloud import (
     CloudParameters,
+    average_cells,
     centroid,
-    mixed,
+    hash_key,
     principal_axes,
-    thinned,
-    within_range,
+    select_in_range,
 )
 from sceneprint.types import Cloud, Floats, Floats32, Ints32, Surface
-
-# The plane through the neighbours of each point.
 
 Ints64 = NDArray[np.int64]
 
@@ -41,7 +38,7 @@ Ints64 = NDArray[np.int64]
 def solve(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, b: Floats, out: Floats
 ) -> float:
-    """out = A^-1 b of a symmetric 3 x 3 matrix A; its determinant, and no `out` where <= 0."""
+    """Solve A x = b, A symmetric 3 x 3; return det A. `out` is x if the determinant is > 0."""
     cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     det = xx * cxx + xy * cxy + xz * cxz
     if det > 0:
@@ -53,13 +50,13 @@ def solve(
 
 
 @kernel
-def plane_seen(
+def fit_inverse_planes(
     q: Floats, u: Floats, offsets: Ints64, indices: Ints32, gates: Floats, limits: Floats,
     planes: Floats,
 ) -> None:  # fmt: skip
-    """a of 1/r = a . u among the neighbours of each point; left 0 where nothing fixes it.
+    """Write a of 1/r = a . u among the neighbours of each point; 0 if they determine no plane.
 
-    Two passes, as in `range_image.py`: what is near in range, then what is near the plane.
+    The first pass selects by range, the second by distance to the plane.
     """
     a, b = np.zeros(3), np.zeros(3)
     for i in range(len(q)):
@@ -96,9 +93,10 @@ def plane_seen(
 
 @kernel
 def least_axis(m: Floats, values: Floats, axis: Floats) -> None:
-    """Eigenvalues of a symmetric 3 x 3 matrix, by Jacobi, and the eigenvector of the least.
+    """Write the eigenvalues of a symmetric 3 x 3 matrix, and the eigenvector of the least, by
+    Jacobi.
 
-    `m` is used up.
+    `m` is overwritten.
     """
     v = np.eye(3)
     for _ in range(8):
@@ -131,14 +129,14 @@ def least_axis(m: Floats, values: Floats, axis: Floats) -> None:
 
 
 @kernel
-def plane_facing(
+def fit_planes(
     places: Floats, offsets: Ints64, indices: Ints32, gate: float, limits: Floats,
     normals: Floats, at: Floats,
 ) -> None:  # fmt: skip
-    """Principal components of the neighbours of each point, towards the origin.
+    """Write the normals of planes through the neighbours of each point, towards the origin.
 
-    `at` becomes the point's foot on the plane. Two passes: all, then what is near the plane.
-    Left 0 where nothing fixes it.
+    `at` becomes the point's foot on the plane. The first pass uses all neighbours, the second those
+    near the plane. Normals are 0 if the neighbours determine no plane.
     """
     m, values, axis, mean = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3)
     for i in range(len(places)):
@@ -154,7 +152,7 @@ def plane_facing(
                     if not abs(off) < gate:
                         continue
                 n += 1
-                for d in range(3):  # about the point itself: nothing is lost far from the origin
+                for d in range(3):  # relative to the point, for precision far from the origin
                     first[d] += places[j, d] - places[i, d]
                     for e in range(3):
                         second[d, e] += (places[j, d] - places[i, d]) * (
@@ -182,20 +180,12 @@ def plane_facing(
                     at[i, d] = places[i, d] - off * axis[d]
 
 
-# Which points are near which, and which of them touch.
-#
-#     places (N, 3), heights (N)  --linked-->  Links
-#
-# One kind of nearness for all: closer than 1 in place, and closer than 1 in a height besides.
-# Whoever asks divides by the reach. Points are visited cell by cell of a grid, each with all that
-# the cells around it hold.
-
 _REACH = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Neighbours of N points: those of i are `indices[offsets[i] : offsets[i + 1]]`, i left out.
+    """Neighbours of N points: those of i are `indices[offsets[i] : offsets[i + 1]]`, without i.
 
     Parameters
     ----------
@@ -206,27 +196,27 @@ class Links:
     offsets: Ints64
     indices: Ints32
 
-    def among(self, keep: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Links:
-        """Those of `linked` (M,) between the points kept (N,), which are numbered anew."""
+    def select(self, keep: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Links:
+        """Return the links of the mask `linked` (M,) between the points `keep` (N,), renumbered."""
         number = np.cumsum(keep) - 1
-        of = np.repeat(keep, np.diff(self.offsets))
-        held = linked & of & keep[self.indices]
-        sums = np.concatenate([[0], np.cumsum(held)])
+        sources = np.repeat(keep, np.diff(self.offsets))
+        selected = linked & sources & keep[self.indices]
+        sums = np.concatenate([[0], np.cumsum(selected)])
         counts = np.diff(sums[self.offsets])[keep]
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        return Links(offsets, number[self.indices[held]].astype(np.int32))
+        return Links(offsets, number[self.indices[selected]].astype(np.int32))
 
     def touching(
         self, places: Floats, reach: float, at: Floats, normals: Floats, gaps: Floats
     ) -> NDArray[np.bool_]:
-        """Which links (M,) are short, and between surfaces that are not one behind the other.
+        """Return a mask (M,) of the links that are short and join one surface.
 
         Parameters
         ----------
-        places : (N, 3) as `linked` took them
-        reach : in their units
-        at, normals : (N, 3)
-        gaps : (N,) farther than this from the planes of both there is a gap, metres
+        places : (N, 3) arguments of `link_points`
+        reach : greatest length, in their units
+        at, normals : (N, 3) points and normals of the planes
+        gaps : (N,) least distance from both planes that makes a gap, metres
         """
         keep = np.empty(len(self.indices), np.bool_)
         _touch(places, reach * reach, at, normals, gaps, self.offsets, self.indices, keep)
@@ -235,7 +225,7 @@ class Links:
 
 @kernel
 def _grid(cells: Ints64, order: Ints64, secret: int, table: Ints64, starts: Ints64) -> int:
-    """Enter runs of points in one cell (cells sorted by `order`) into a hash table."""
+    """Enter the runs of points with one cell (cells sorted by `order`) into a hash table."""
     mask = len(table) - 1
     n = 0
     for i in range(len(order)):
@@ -243,7 +233,7 @@ def _grid(cells: Ints64, order: Ints64, secret: int, table: Ints64, starts: Ints
         if i > 0 and cells[order[i - 1]] == key:
             continue
         starts[n] = i
-        at = mixed(key, secret) & mask
+        at = hash_key(key, secret) & mask
         while table[at] >= 0:
             at = (at + 1) & mask
         table[at] = n
@@ -257,7 +247,7 @@ def _link(
     places: Floats, heights: Floats, cells: Ints64, order: Ints64, secret: int, table: Ints64,
     starts: Ints64, n_cells: int, counts: Ints64, begins: Ints64,
 ) -> Ints32:  # fmt: skip
-    """Neighbours of each point, all in one array: where they begin, and how many they are."""
+    """Return the neighbours of each point in one array, and write their starts and counts."""
     mask = len(table) - 1
     indices = np.empty(16 * len(order) + 16, np.int32)
     total = 0
@@ -270,7 +260,7 @@ def _link(
             for dy in range(-1, 2):
                 for dz in range(-1, 2):
                     wanted = key + (dx * span + dy) * span + dz
-                    at = mixed(wanted, secret) & mask
+                    at = hash_key(wanted, secret) & mask
                     while table[at] >= 0:
                         if cells[order[starts[table[at]]]] == wanted:
                             around[found] = table[at]
@@ -307,8 +297,8 @@ def _reorder(indices: Ints32, begins: Ints64, offsets: Ints64, out: Ints32) -> N
             out[offsets[i] + k] = indices[begins[i] + k]
 
 
-def linked(places: Floats, heights: Floats) -> Links:
-    """All pairs of points that are near each other.
+def link_points(places: Floats, heights: Floats) -> Links:
+    """Return all pairs of points closer than 1 in place and in height.
 
     Parameters
     ----------
@@ -324,10 +314,10 @@ def linked(places: Floats, heights: Floats) -> Links:
     n_cells = _grid(cells, order, secret, table, starts)
     counts, begins = np.zeros(n, np.int64), np.zeros(n, np.int64)
     offsets = np.zeros(n + 1, np.int64)
-    found = _link(places, heights, cells, order, secret, table, starts, n_cells, counts, begins)
+    unordered = _link(places, heights, cells, order, secret, table, starts, n_cells, counts, begins)
     np.cumsum(counts, out=offsets[1:])
     indices = np.empty(int(offsets[-1]), np.int32)
-    _reorder(found, begins, offsets, indices)
+    _reorder(unordered, begins, offsets, indices)
     return Links(offsets, indices)
 
 
@@ -336,7 +326,7 @@ def _touch(
     places: Floats, square: float, at: Floats, normals: Floats, gaps: Floats, offsets: Ints64,
     indices: Ints32, keep: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Whether two are close, and one of them lies on the plane of the other."""
+    """Write whether two points are close, and one of them lies on the plane of the other."""
     for i in range(len(at)):
         for k in range(offsets[i], offsets[i + 1]):
             j = indices[k]
@@ -354,27 +344,25 @@ def _touch(
             keep[k] = min(one, other) <= max(gaps[i], gaps[j])
 
 
-# Points to voxels.
-
-#: Side of a square that has the area of the neighbourhood's disc, in its radii.
+#: Side of the square with the area of the neighbourhood's disc, in radii.
 _SQUARE = math.sqrt(math.pi)
-#: Voxels this far apart touch, in sides: two means in cells side by side.
+#: Greatest distance of voxels that touch, in sides: means in adjacent cells.
 _TOUCHING = 2.0
-#: Surfaces this near are one, in sides of a voxel.
+#: Greatest distance of points on one surface, in sides of a voxel.
 _GAP = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Voxels(Surface):
-    """The surface of a cloud as V voxels, in an order that is none of the points'; camera None.
+    """The surface of a cloud as V voxels, independent of the order of its points; camera None.
 
     Parameters
     ----------
-    cloud : whose they are
+    cloud : the cloud
     axes : (3, 3) principal axes, rows
-    centre : (3,) metres: the viewpoint; or the centroid where there is none
-    sides : (V,) float32, of each voxel across, metres
-    links : of voxels that touch, with no gap between their surfaces
+    centre : (3,) metres: the viewpoint, or the centroid without one
+    sides : (V,) float32, widths of the voxels, metres
+    links : links of voxels that touch, with no gap between their surfaces
     """
 
     cloud: Cloud
@@ -385,12 +373,12 @@ class Voxels(Surface):
 
     @property
     def plain(self) -> Surface:
-        """Points and normals alone."""
+        """Return points and normals alone."""
         return Surface(self.points, self.normals, self.valid, self.areas, None)
 
 
 def voxels(cloud: Cloud, p: CloudParameters) -> Voxels:
-    """Voxels of a cloud, with the normals of the planes they lie on, towards the viewpoint.
+    """Return the voxels of a cloud, with normals of their planes towards the viewpoint.
 
     Parameters
     ----------
@@ -398,39 +386,41 @@ def voxels(cloud: Cloud, p: CloudParameters) -> Voxels:
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_points` points are within range, or voxels hold one.
+    UselessFrame : fewer than `minimum_points` points are within range, or fewer voxels hold one
     """
-    points = within_range(cloud, p)
-    if cloud.has_viewpoint:
-        return _seen(cloud, points, p)
-    return _fused(cloud, points, p)
+    points = select_in_range(cloud, p)
+    build = _angular_voxels if cloud.has_viewpoint else _metric_voxels
+    return build(cloud, points, p)
 
 
-def _seen(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels:
+def _angular_voxels(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels:
     axes, centre = principal_axes(points), np.zeros(3)
     unit = max(p.minimum_range, 1e-9)
-    means, side = thinned(points, axes, centre, True, unit, p)
-    _check(len(means), cloud, p)
+    means, side = average_cells(points, axes, centre, True, unit, p)
+    _check_count(len(means), cloud, p)
     q, u = means[:, 0] / unit, np.ascontiguousarray(means[:, 1:])
     length = np.sqrt((u * u).sum(axis=1))
     rays = u / length[:, None]
     log_range = -np.log(q)
     reach = (2 * p.radius_px + 1) / _SQUARE * side
     places = rays / reach
-    near = linked(places, log_range / p.range_gate)
+    near = link_points(places, log_range / p.range_gate)
     gates = np.array([p.range_gate, p.noise_gate, p.plane_gate])
     limits = np.array([p.minimum_samples, p.minimum_spread * side**4])
     planes = np.zeros((len(q), 3))
-    plane_seen(q, u, near.offsets, near.indices, gates, limits, planes)
+    fit_inverse_planes(q, u, near.offsets, near.indices, gates, limits, planes)
     inverse = (planes * rays).sum(axis=1)
     norm = np.sqrt((planes * planes).sum(axis=1))
     within = (inverse * p.maximum_range * 2 > 1) & (inverse * p.minimum_range < 2)
     keep = (norm > 0) & within & (inverse >= p.minimum_cosine * norm)
     inverse, norm = np.where(keep, inverse, 1.0), np.where(keep, norm, 1.0)
     cosines = inverse / norm
-    solid = side * side * _share(rays @ axes.T)
+    # solid angle of a cell of the cube, from the tangents of its direction
+    a = np.sort(np.abs(rays @ axes.T), axis=1)
+    tangents = (a[:, :2] / a[:, 2:]) ** 2
+    solid = side * side * ((1 + tangents).prod(axis=1) / (1 + tangents.sum(axis=1)) ** 1.5)
     gaps = np.maximum(p.noise_gate / inverse + p.plane_gate, side * _GAP) / inverse
-    return _made(
+    return _build(
         cloud, axes, centre, keep, near, places, _TOUCHING * side / reach,
         at=rays / inverse[:, None],
         normals=-planes / norm[:, None],
@@ -440,30 +430,23 @@ def _seen(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels:
     )  # fmt: skip
 
 
-def _share(rays: Floats) -> Floats:
-    """Solid angle of a cell of the cube, as a share of the square of its angle."""
-    a = np.sort(np.abs(rays), axis=1)
-    tangents = (a[:, :2] / a[:, 2:]) ** 2
-    shares: Floats = (1 + tangents).prod(axis=1) / (1 + tangents.sum(axis=1)) ** 1.5
-    return shares
-
-
-def _fused(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels:
+def _metric_voxels(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels:
     centre = centroid(points)
     axes = principal_axes((points - centre).astype(np.float32))
     unit = max(float(np.abs(points - centre).max()), 1e-9)
-    means, side = thinned(points, axes, centre, False, unit, p)
-    _check(len(means), cloud, p)
+    means, side = average_cells(points, axes, centre, False, unit, p)
+    _check_count(len(means), cloud, p)
     at = means[:, 1:] * unit
     reach = (2 * p.radius_px + 1) / _SQUARE * side
     places = at / reach
-    near = linked(places, np.zeros(len(places)))
+    near = link_points(places, np.zeros(len(places)))
     limits = np.array([p.minimum_samples, p.minimum_spread * side**4])
     normals, feet = np.zeros_like(at), at.copy()
-    plane_facing(at, near.offsets, near.indices, side, limits, normals, feet)
+    fit_planes(at, near.offsets, near.indices, side, limits, normals, feet)
     keep = (normals != 0).any(axis=1)
-    crossed = np.where(keep, np.abs(normals @ axes.T).sum(axis=1), 1.0)  # cells, by a plane
-    return _made(
+    # number of cells that a plane crosses, per square of their side
+    crossed = np.where(keep, np.abs(normals @ axes.T).sum(axis=1), 1.0)
+    return _build(
         cloud, axes, centre, keep, near, places, _TOUCHING * side / reach,
         at=feet + centre,
         normals=normals,
@@ -473,7 +456,7 @@ def _fused(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels:
     )  # fmt: skip
 
 
-def _check(n: int, cloud: Cloud, p: CloudParameters) -> None:
+def _check_count(n: int, cloud: Cloud, p: CloudParameters) -> None:
     if n < p.minimum_points:
         name = f"{cloud.name}: " if cloud.name else ""
         raise UselessFrame(
@@ -482,7 +465,7 @@ def _check(n: int, cloud: Cloud, p: CloudParameters) -> None:
         )
 
 
-def _made(
+def _build(
     cloud: Cloud, axes: Floats, centre: Floats, keep: NDArray[np.bool_], near: Links,
     places: Floats, reach: float, *, at: Floats, normals: Floats, areas: Floats, sides: Floats,
     gaps: Floats,
@@ -497,5 +480,5 @@ def _made(
         axes=axes,
         centre=centre,
         sides=sides[keep].astype(np.float32),
-        links=near.among(keep, near.touching(places, reach, at, normals, gaps)),
+        links=near.select(keep, near.touching(places, reach, at, normals, gaps)),
     )

@@ -31,7 +31,7 @@ from sceneprint.geometry.registration.overlap import (
     PlaneView,
     explained,
 )
-from sceneprint.geometry.rigid import NO_UPS, Ups, are_level, are_near, distinct
+from sceneprint.geometry.rigid import NO_UPS, Ups, are_level, are_near, select_distinct
 from sceneprint.types import Floats, Patches
 
 Status = Literal["accepted", "ambiguous", "rejected"]
@@ -402,7 +402,7 @@ def best_alternative(
     hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
     proposed = far_from(T, proposed, p)
     order = -np.arange(len(proposed), dtype=float)
-    chosen = distinct(proposed, order, p.rival_m, p.rival_rad, p.n_proposed)
+    chosen = select_distinct(proposed, order, p.rival_m, p.rival_rad, p.n_proposed)
     hopeful = np.concatenate([hopeful, proposed[chosen]])
     rivals = np.concatenate([voted, refined_all(query.surface, match.surface, hopeful, p.then)])
     rivals = far_from(T, rivals, p)

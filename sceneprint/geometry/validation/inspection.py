@@ -24,7 +24,7 @@ from sceneprint.geometry.registration.overlap import (
     tolerances,
     weigh_overlap,
 )
-from sceneprint.geometry.rigid import inverse, moved
+from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Surface
 
 #: What becomes of a point: nothing to compare it with, or beside the surface; on it; before it.
@@ -170,7 +170,7 @@ def _coincident(
     """Patches that are each other's nearest with a like normal, by distance."""
     if not len(query) or not len(match):
         return np.zeros((0, 2), np.int32), np.zeros(0)
-    apart = np.linalg.norm(moved(T, query.means)[:, None] - match.means, axis=2)
+    apart = np.linalg.norm(transform_points(T, query.means)[:, None] - match.means, axis=2)
     cosines = (query.normals @ T[:3, :3].T) @ match.normals.T
     apart = np.where(cosines > p.inlier_cosine, apart, np.inf)
     there, back = apart.argmin(axis=1), apart.argmin(axis=0)
@@ -221,7 +221,9 @@ def overlay(
     """
     T = T_target_source
     ours, theirs = sampled(source, 1), sampled(target, 1)
-    points = np.concatenate([moved(T, ours[:, :3].astype(float)), theirs[:, :3].astype(float)])
+    points = np.concatenate(
+        [transform_points(T, ours[:, :3].astype(float)), theirs[:, :3].astype(float)]
+    )
     turned = ours[:, 3:].astype(float) @ T[:3, :3].T
     normals = np.concatenate([turned, theirs[:, 3:].astype(float)])
     if colour == "normal":

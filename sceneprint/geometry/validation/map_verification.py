@@ -31,7 +31,7 @@ from sceneprint.geometry.registration.overlap import (
     plane_view,
     tolerances,
 )
-from sceneprint.geometry.rigid import are_near, average_poses, distinct, inverse
+from sceneprint.geometry.rigid import are_near, average_poses, inverse, select_distinct
 from sceneprint.geometry.validation.validation import refined_at
 from sceneprint.types import Floats, Geometry, Intrinsics
 
@@ -371,7 +371,7 @@ def compare_poses(
     p, overlap_p : see there
     """
     first = -np.arange(len(poses), dtype=float)
-    chosen = distinct(poses, first, p.same_m, p.same_rad, p.n_poses)
+    chosen = select_distinct(poses, first, p.same_m, p.same_rad, p.n_poses)
     among = views.candidates if len(views.candidates) else None
     scored = [score_pose(frames, poses[i], views, p, overlap_p, among) for i in chosen]
     places = _hopeful(best_of_places(scored, p), p)[: p.n_places]
@@ -439,4 +439,4 @@ def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
 def different_views(viewpoints: Floats, p: MapParameters) -> list[int]:
     """Return the indices of the first of some views (n, 4, 4) from each viewpoint."""
     order = -np.arange(len(viewpoints), dtype=float)
-    return distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))
+    return select_distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))

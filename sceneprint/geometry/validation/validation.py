@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sceneprint.geometry.kernel import both
+from sceneprint.geometry.kernel import run_both
 from sceneprint.geometry.registration.alignment import (
     Alignment,
     AlignmentParameters,
@@ -55,10 +55,10 @@ from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.rigid import (
     NO_UPS,
     Ups,
-    difference,
     inverse,
     inverses,
     nearest_rotation,
+    pose_difference,
     rotation_angle,
     tilt_of,
 )
@@ -261,7 +261,7 @@ def validate(
         aligned = align_scans(a, b, rng, *numbers, other_axes=other_axes)
         there, back = aligned or (None, None)
     else:
-        there, back = both(
+        there, back = run_both(
             lambda: align(a, b, np.random.default_rng((seed, 0)), *numbers),
             lambda: align(b, a, np.random.default_rng((seed, 1)), *numbers),
         )
@@ -307,7 +307,7 @@ def validate_guided(
     if min(len(query.patches), len(match.patches)) < p.minimum_patches:
         return None
     a, b = _samples(query, match, ups, p)
-    there, back = both(
+    there, back = run_both(
         lambda: align_guided(a, b, T_match_query, p.alignment),
         lambda: align_guided(b, a, inverse(T_match_query), p.alignment),
     )
@@ -316,7 +316,7 @@ def validate_guided(
     validation = _decided(a, b, there, back, seed, p, "full")
     if validation.status != "accepted" or validation.T_match_query is None:
         return None
-    metres, radians = difference(validation.T_match_query, T_match_query)
+    metres, radians = pose_difference(validation.T_match_query, T_match_query)
     if metres > p.guided_m or radians > p.guided_rad:
         return None
     reason = "surfaces agree where other matches place the query"
