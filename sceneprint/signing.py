@@ -30,9 +30,9 @@ from sceneprint.geometry.signature.pair_features import (
     project,
 )
 from sceneprint.geometry.signature.segmentation import (
+    extract_patches,
     hierarchy,
     patch_weights,
-    patches_of,
     segment,
     supervoxels,
 )
@@ -173,8 +173,8 @@ def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
     """
     if isinstance(seen, Voxels):
         spacing, most = p.cloud.validation_seed_px, p.cloud.maximum_validation_patches
-        return patches_of(seen, supervoxels(seen, spacing, most, p.validation_segmentation))
-    return patches_of(seen, segment(seen, p.validation_segmentation))
+        return extract_patches(seen, supervoxels(seen, spacing, most, p.validation_segmentation))
+    return extract_patches(seen, segment(seen, p.validation_segmentation))
 
 
 def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:

@@ -12,7 +12,7 @@ from sceneprint.errors import ModelMismatch, UselessFrame
 from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.retrieval.ranking import diversify as select
-from sceneprint.geometry.signature.segmentation import patches_of, segment
+from sceneprint.geometry.signature.segmentation import extract_patches, segment
 from sceneprint.geometry.validation.validation import PairValidation, expected_error, preferred
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import (
@@ -177,7 +177,7 @@ def test_prepare_is_sign_and_geometry_of_one_look(
     assert geometry.model_id == made.model_id == model.id
     # the patches are of their own segmentation, the descriptors of its surroundings
     p = model.parameters
-    patches = patches_of(seen, segment(seen, p.validation_segmentation))
+    patches = extract_patches(seen, segment(seen, p.validation_segmentation))
     np.testing.assert_array_equal(geometry.patches.means, patches.means)
     expected = compress(patch_descriptors(patches, p.surroundings), model.compression)
     np.testing.assert_array_equal(geometry.descriptors, expected)

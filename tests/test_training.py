@@ -17,7 +17,7 @@ from sceneprint.geometry.signature.pair_features import TableLayout
 from sceneprint.geometry.signature.segmentation import (
     HierarchyParameters,
     SegmentationParameters,
-    patches_of,
+    extract_patches,
     segment,
 )
 from sceneprint.models import Model, ModelParameters
@@ -88,7 +88,7 @@ def test_descriptors_are_learnt_from_the_rooms(
     # of rooms it never saw the axes keep most of what differs, and random ones would not
     seen = [see(frame, model.parameters) for frame in unseen[:4]]
     p = model.parameters
-    patches = [patches_of(one, segment(one, p.validation_segmentation)) for one in seen]
+    patches = [extract_patches(one, segment(one, p.validation_segmentation)) for one in seen]
     rows = np.concatenate([patch_descriptors(one, p.surroundings) for one in patches])
     left = rows - rows.mean(axis=0)
     assert ((left @ axes.T) ** 2).sum() / (left**2).sum() > 0.5  # measured: 0.62

@@ -185,8 +185,8 @@ def test_signatures_are_those_of_code_for_this_processor(installed: Path, tmp_pa
 def test_another_processor_gets_code_of_its_own(installed: Path, tmp_path: Path) -> None:
     program = (
         "import sys; from sceneprint.geometry.session_join import *; import sceneprint;"
-        "from sceneprint.geometry.signature.pair_features import compiled_at;"
-        "print(compiled_at()[1])"
+        "from sceneprint.geometry.signature.pair_features import machine_code_folder;"
+        "print(machine_code_folder()[1])"
     )
     assert run(program, installed, tmp_path) == "True"
     assert run(program, installed, tmp_path, NUMBA_CPU_NAME="generic") == "False"

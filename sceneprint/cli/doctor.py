@@ -314,9 +314,9 @@ def _sqlite_version() -> Check:
 
 
 def _kernels() -> Check:
-    from sceneprint.geometry.signature.pair_features import compiled_at
+    from sceneprint.geometry.signature.pair_features import machine_code_folder
 
-    folder, compiled = compiled_at()
+    folder, compiled = machine_code_folder()
     if compiled:
         return Check("ok", "kernels", f"compiled, in {folder}")
     if folder and _may_write(Path(folder)):

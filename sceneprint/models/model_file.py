@@ -29,7 +29,7 @@ from sceneprint.geometry.signature.pair_features import (
     WIDTH,
     PairTable,
     Projection,
-    part,
+    compute_bins,
 )
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.models.model import (
@@ -458,7 +458,7 @@ def _build(model: Model, progress: Progress | None) -> Floats32:
     packed = np.empty((n, WIDTH), np.float32)
     for first in range(0, n, CHUNK):
         last = min(first + CHUNK, n)
-        done = part(first, last, p.table, p.properties, model.projection, model.mixture)
+        done = compute_bins(first, last, p.table, p.properties, model.projection, model.mixture)
         packed[first:last] = done.packed
         if progress is not None:
             progress(last, n)

@@ -135,7 +135,9 @@ def test_a_machine_where_nothing_was_used_yet(
     monkeypatch.delenv("SCENEPRINT_URL")
     monkeypatch.setattr(doctor, "DEFAULT_URL", "http://127.0.0.1:1")
     monkeypatch.setenv("SCENEPRINT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(pair_features, "compiled_at", lambda: (str(tmp_path / "numba"), False))
+    monkeypatch.setattr(
+        pair_features, "machine_code_folder", lambda: (str(tmp_path / "numba"), False)
+    )
     done = sceneprint("doctor", "--data", tmp_path / "new" / "data")
     found = verdicts(done.stdout)
     for made_later in ("kernels", "table depth", "table paper", "service"):

@@ -15,14 +15,14 @@ from sceneprint.geometry.signature import fisher_vector as module
 from sceneprint.geometry.signature.fisher_vector import (
     LevelStatistics,
     fisher_vector,
-    normalised,
+    normalise,
     quantise,
     signature,
     statistics_of_counts,
     statistics_of_features,
 )
 from sceneprint.geometry.signature.mixture import Mixture, posteriors
-from sceneprint.geometry.signature.pair_features import LEADING, PairCounts, PairTable, pack
+from sceneprint.geometry.signature.pair_features import LEADING, PairCounts, PairTable, pack_table
 from sceneprint.types import Floats, Floats32, Ints32
 
 
@@ -92,9 +92,9 @@ def test_order_and_repetition_do_not_matter() -> None:
 def test_normalised_by_hand() -> None:
     # roots 2, -3, 0, 6: of length 7
     np.testing.assert_allclose(
-        normalised(np.array([4.0, -9.0, 0.0, 36.0])), [2 / 7, -3 / 7, 0, 6 / 7], rtol=1e-12
+        normalise(np.array([4.0, -9.0, 0.0, 36.0])), [2 / 7, -3 / 7, 0, 6 / 7], rtol=1e-12
     )
-    assert normalised(np.zeros(5)).tolist() == [0.0] * 5
+    assert normalise(np.zeros(5)).tolist() == [0.0] * 5
 
 
 FLOATS = hnp.arrays(
@@ -107,7 +107,7 @@ FLOATS = hnp.arrays(
 @settings(max_examples=50)
 @given(FLOATS)
 def test_normalised_has_unit_norm_and_the_same_signs(phi: Floats) -> None:
-    result = normalised(phi)
+    result = normalise(phi)
     assert np.linalg.norm(result) == pytest.approx(1.0 if phi.any() else 0.0, abs=1e-12)
     np.testing.assert_array_equal(np.sign(result), np.sign(phi))
     np.testing.assert_allclose(result**2 * np.abs(phi).sum(), np.abs(phi), rtol=1e-9)
@@ -126,7 +126,7 @@ def table_of(features: Floats, mixture: Mixture) -> PairTable:
     shares[:, : order.shape[1]] = np.take_along_axis(pi, order, axis=1)
     components = np.zeros((len(features), LEADING), np.int16)
     components[:, : order.shape[1]] = order
-    return pack(features.astype(np.float32), shares, components)
+    return pack_table(features.astype(np.float32), shares, components)
 
 
 def counted(counts: Ints32) -> PairCounts:
@@ -155,7 +155,7 @@ def test_statistics_of_counts_equal_those_of_the_pairs() -> None:
 
 
 def test_statistics_of_counts_by_hand() -> None:
-    table = pack(
+    table = pack_table(
         np.full((3, 12), 2.0, np.float32),
         np.array([[0.75, 0.25, 5e-3] + [0] * 5, [1, 0, 0.5] + [0] * 5, [1] + [0] * 7], np.float32),
         np.array([[1, 0, 2] + [0] * 5, [0, 1] + [0] * 6, [1] * 8], np.int16),
@@ -190,7 +190,7 @@ def test_sums_over_the_table_are_the_same_to_the_bit(filled: int) -> None:
     rng, n = np.random.default_rng(filled), 5
     shares = rng.uniform(0.01, 1, (400, LEADING)).astype(np.float32)
     shares[np.arange(LEADING) > rng.integers(0, LEADING, 400)[:, None]] = 0  # one at least
-    table = pack(
+    table = pack_table(
         rng.normal(size=(400, 12)).astype(np.float32),
         shares,
         rng.integers(0, n, (400, LEADING)).astype(np.int16),

@@ -220,7 +220,7 @@ def test_patches_passed_over_are_those_too_far(
 def test_most_patches_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 400 along a line, 100 centres, and five rounds: without a compiler, to be counted."""
     compared = []
-    nearer = module._nearer.function
+    nearer = module._move_nearer.function
 
     def counted(*arguments: Any) -> None:
         compared.append(arguments[6] - arguments[5])
@@ -228,7 +228,7 @@ def test_most_patches_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for name in ("_k_means", "_seed", "_reassign", "_boxes", "_least_distances", "_largest_of"):
         monkeypatch.setattr(module, name, getattr(module, name).function)
-    monkeypatch.setattr(module, "_nearer", counted)
+    monkeypatch.setattr(module, "_move_nearer", counted)
     line = np.zeros((6, 400))
     line[0], line[5] = np.arange(400.0), 1.0
     labels = module._k_means(line, np.ones(400), 100, 1.0, 3.0, 4)

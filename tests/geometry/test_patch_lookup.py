@@ -7,7 +7,11 @@ from types import ModuleType
 import numpy as np
 
 from sceneprint.geometry.registration.overlap import sampled
-from sceneprint.geometry.signature.segmentation import SegmentationParameters, patches_of, segment
+from sceneprint.geometry.signature.segmentation import (
+    SegmentationParameters,
+    extract_patches,
+    segment,
+)
 from sceneprint.geometry.validation.inspection import patches_at
 from sceneprint.types import Floats, Patches
 
@@ -38,7 +42,7 @@ def test_it_is_the_nearest_that_fits() -> None:
 def test_it_is_nearly_the_segmentation(scenes: ModuleType) -> None:
     seen, _ = scenes.corner()
     labels = segment(seen, SegmentationParameters())
-    found = patches_at(sampled(seen, 1), patches_of(seen, labels))
+    found = patches_at(sampled(seen, 1), extract_patches(seen, labels))
     truth = labels[seen.valid]
     told = truth >= 0
     assert told.any()

@@ -11,7 +11,7 @@ from sceneprint.geometry.signature import segmentation as module
 from sceneprint.geometry.signature.segmentation import (
     SegmentationParameters,
     compact_labels,
-    patches_of,
+    extract_patches,
     segment,
 )
 from sceneprint.types import Floats32, Ints32, Surface
@@ -40,7 +40,7 @@ def test_no_patch_mixes_two_planes(scenes: ModuleType) -> None:
     seen, plane_of = scenes.corner()
     assert [int((plane_of == k).sum()) > 300 for k in range(3)] == [True] * 3
     labels = segment(seen, parameters())
-    patches = patches_of(seen, labels)
+    patches = extract_patches(seen, labels)
     at = labels >= 0
     off = scenes.degrees_between(seen.normals[at].astype(float), patches.normals[labels[at]])
     assert off.max() < 0.1  # the planes are at right angles
@@ -84,7 +84,7 @@ def test_labels_have_no_gaps_and_follow_the_image(scenes: ModuleType) -> None:
 def test_number_and_extent_of_patches(scenes: ModuleType, n_patches: int) -> None:
     seen = wall(scenes)
     labels = segment(seen, parameters(n_patches))
-    patches = patches_of(seen, labels)
+    patches = extract_patches(seen, labels)
     assert len(patches) == pytest.approx(n_patches, rel=0.1)
     spacing = np.sqrt(80 * 60 / n_patches) * 2.0 / 73.0  # metres, at 2 m
     reach = np.linalg.norm(seen.points - patches.means[labels], axis=2)
@@ -96,7 +96,7 @@ def test_number_and_extent_of_patches(scenes: ModuleType, n_patches: int) -> Non
 def test_patches_are_compact_on_slanted_walls(scenes: ModuleType) -> None:
     seen, _ = scenes.corner()
     labels = segment(seen, parameters())
-    patches = patches_of(seen, labels)
+    patches = extract_patches(seen, labels)
     at = labels >= 0
     spacing = np.sqrt(80 * 60 / 120) / 73.0 * patches.means[labels[at], 2]
     reach = np.linalg.norm(seen.points[at] - patches.means[labels[at]], axis=1)
@@ -128,7 +128,7 @@ def test_patches_of_equals_the_loop(scenes: ModuleType) -> None:
     seen, _ = scenes.corner()
     labels = rng.integers(-1, 7, seen.valid.shape).astype(np.int32)
     labels[~seen.valid] = -1
-    patches = patches_of(seen, labels)
+    patches = extract_patches(seen, labels)
     assert len(patches) == 7
     for k in range(7):
         mean, normal, area, size = np.zeros(3), np.zeros(3), 0.0, 0
@@ -153,7 +153,7 @@ def test_areas_weigh(scenes: ModuleType) -> None:
         np.array([[1, 3]], np.float32),
         scenes.CAMERA,
     )
-    patches = patches_of(seen, np.zeros((1, 2), np.int32))
+    patches = extract_patches(seen, np.zeros((1, 2), np.int32))
     np.testing.assert_allclose(patches.means, [[3, 0, 1]])
     np.testing.assert_allclose(patches.normals, [[-3 / 10**0.5, 0, -1 / 10**0.5]], rtol=1e-6)
     assert (patches.areas.tolist(), patches.sizes.tolist()) == ([4.0], [2])
@@ -164,7 +164,7 @@ def test_nothing_seen_gives_no_patch(scenes: ModuleType) -> None:
     seen.valid[:] = False
     labels = segment(seen, parameters())
     assert (labels == -1).all()
-    assert len(patches_of(seen, labels)) == 0
+    assert len(extract_patches(seen, labels)) == 0
 
 
 def naive_assignment(

@@ -11,7 +11,7 @@ import pytest
 
 from sceneprint.geometry.signature.segmentation import (
     SegmentationParameters,
-    patches_of,
+    extract_patches,
     supervoxels,
 )
 from sceneprint.geometry.surface.cloud import CloudParameters
@@ -64,7 +64,7 @@ def test_patches_hang_together_and_respect_edges(
     labels = supervoxels(seen, 5.0, 1000, S)
     assert (labels >= 0).mean() > 0.97
     assert set(parts(seen, labels)) == {1}
-    patches = patches_of(seen, labels)
+    patches = extract_patches(seen, labels)
     assert len(patches) > 100
     assert np.median(patches.coherences) > 0.9999
     assert np.mean(np.abs(patches.normals).max(axis=1) > 0.99) > 0.8
@@ -100,7 +100,7 @@ def test_patches_turn_with_the_cloud(cloud_scenes: ModuleType) -> None:
     made = []
     for one in (cloud, cloud_scenes.turned(cloud, R)):
         seen = voxels(one, P)
-        made.append(patches_of(seen, supervoxels(seen, 5.0, 1000, S)))
+        made.append(extract_patches(seen, supervoxels(seen, 5.0, 1000, S)))
     plain, turned = made
     assert len(turned) == pytest.approx(len(plain), rel=0.05)
     there = plain.means @ R.T

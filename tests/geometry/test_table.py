@@ -13,15 +13,15 @@ from scipy.spatial.transform import Rotation
 from sceneprint.geometry.signature.mixture import Mixture, posteriors
 from sceneprint.geometry.signature.pair_features import (
     LEADING,
-    LEAST,
+    LEAST_POSTERIOR,
     Projection,
     PropertyParameters,
     TableLayout,
     bin_centres,
+    compute_bins,
     count_pairs,
     invariants,
     neighbour_pairs,
-    part,
     project,
     properties,
 )
@@ -183,16 +183,18 @@ def model(rng: np.random.Generator, g: int) -> tuple[Projection, Mixture]:
 def test_leading_posteriors() -> None:
     projection, mixture = model(np.random.default_rng(1), 20)
     first, last = 400_000, 400_600
-    table = part(first, last, LAYOUT, P, projection, mixture)
+    table = compute_bins(first, last, LAYOUT, P, projection, mixture)
     features = project(properties(bin_centres(LAYOUT, first, last, P), P), projection)
     np.testing.assert_allclose(table.features, features, rtol=1e-6, atol=1e-6)
     exact = posteriors(features, mixture)
     order = np.argsort(-exact, axis=1)[:, :LEADING]
     leading = np.take_along_axis(exact, order, axis=1)
     expected = leading / leading.sum(axis=1, keepdims=True)
-    expected = np.where(expected < LEAST, 0.0, expected)
+    expected = np.where(expected < LEAST_POSTERIOR, 0.0, expected)
     expected /= expected.sum(axis=1, keepdims=True)
-    clear = (np.abs(leading / leading.sum(axis=1, keepdims=True) - LEAST) > 1e-5).all(axis=1)
+    clear = (np.abs(leading / leading.sum(axis=1, keepdims=True) - LEAST_POSTERIOR) > 1e-5).all(
+        axis=1
+    )
     assert clear.mean() > 0.9
     np.testing.assert_allclose(table.posteriors[clear], expected[clear], rtol=0, atol=1e-4)
     # float32 may exchange two that are equal; the values at the named components must agree
@@ -207,10 +209,10 @@ def test_leading_posteriors() -> None:
 
 def test_fewer_components_than_are_kept() -> None:
     projection, mixture = model(np.random.default_rng(2), 3)
-    table = part(0, 100, SMALL, P, projection, mixture)
+    table = compute_bins(0, 100, SMALL, P, projection, mixture)
     exact = posteriors(project(properties(bin_centres(SMALL, 0, 100, P), P), projection), mixture)
     for shares, components, expected in zip(table.posteriors, table.components, exact, strict=True):
         assert sorted(components[:3].tolist()) == [0, 1, 2]
-        kept = np.where(expected < LEAST, 0.0, expected)[components[:3]]
+        kept = np.where(expected < LEAST_POSTERIOR, 0.0, expected)[components[:3]]
         np.testing.assert_allclose(shares[:3], kept / kept.sum(), atol=1e-4)
         assert not shares[3:].any()

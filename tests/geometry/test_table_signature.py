@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.signature.fisher_vector import (
     fisher_vector,
-    normalised,
+    normalise,
     statistics_of_counts,
     statistics_of_features,
 )
@@ -23,11 +23,11 @@ from sceneprint.geometry.signature.pair_features import (
     Projection,
     PropertyParameters,
     TableLayout,
+    compute_bins,
     count_pairs,
     fit_projection,
     neighbour_pairs,
     pair_properties,
-    part,
     project,
 )
 from sceneprint.types import Floats, Patches
@@ -51,13 +51,13 @@ class Signatures:
     def exact(self, patches: Patches) -> Floats:
         f = project(pair_properties(patches, neighbour_pairs(patches, P), P), self.projection)
         s = statistics_of_features(f, np.ones(len(f)), self.mixture)
-        return normalised(fisher_vector(s, self.mixture))
+        return normalise(fisher_vector(s, self.mixture))
 
     def looked_up(self, patches: Patches) -> Floats:
         weights = np.ones(len(patches))
         counts = count_pairs(patches.means, patches.normals, weights, LAYOUT, P)
         s = statistics_of_counts(counts, self.table, len(self.mixture))
-        return normalised(fisher_vector(s, self.mixture))
+        return normalise(fisher_vector(s, self.mixture))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,9 @@ def signatures(scenes: ModuleType) -> Signatures:
     f = np.concatenate([pair_properties(x, neighbour_pairs(x, P), P)[::4] for x in others])
     projection = fit_projection(f, "pca")
     *_, mixture = fit_mixture(project(f, projection), MIXTURE, seed=0)
-    return Signatures(projection, mixture, part(0, LAYOUT.n_bins, LAYOUT, P, projection, mixture))
+    return Signatures(
+        projection, mixture, compute_bins(0, LAYOUT.n_bins, LAYOUT, P, projection, mixture)
+    )
 
 
 def test_table_distances_follow_exact_ones(rooms: list[Patches], signatures: Signatures) -> None:

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sceneprint.geometry.signature.segmentation import WeightParameters, patch_weights, patches_of
+from sceneprint.geometry.signature.segmentation import (
+    WeightParameters,
+    extract_patches,
+    patch_weights,
+)
 from sceneprint.types import Intrinsics, Patches, Surface
 
 ONES = np.ones((2, 3))
@@ -35,5 +39,5 @@ def test_coherence_is_the_length_of_the_mean_normal() -> None:
         areas=np.array([[1, 1, 3, 1]], np.float32),
         camera=Intrinsics(4, 1, 1.0, 1.0, 0.0, 0.0),
     )
-    found = patches_of(surface, np.array([[0, 0, 1, 1]], np.int32))
+    found = extract_patches(surface, np.array([[0, 0, 1, 1]], np.int32))
     np.testing.assert_allclose(found.coherences, [1.0, np.hypot(3, 1) / 4], rtol=1e-6)

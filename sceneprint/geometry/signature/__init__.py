@@ -1,1 +1,1 @@
-"""Surfaces to patches, pairs of patches and signatures."""
+"""Convert surfaces to patches, pairs of patches and signatures."""

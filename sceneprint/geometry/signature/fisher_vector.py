@@ -1,15 +1,15 @@
-"""Sec. III-B, "Encoding feature space statistics": features to psi, and psi as stored.
+"""Encode statistics of features as a Fisher vector and a stored signature (Sec. III-B).
 
-PairCounts, PairTable   --statistics_of_counts-->   Statistics
-features (M, 12)        --statistics_of_features--> Statistics   (exact, the oracle)
-Statistics  --fisher_vector-->  phi (25 G)
-H of them   --signature-->      psi (25 G H)   --quantise-->  uint8
-psi (n, D)  --fit_whitening-->  Whitening          psi  --whiten-->  (d,) uint8
+    PairCounts, PairTable   --statistics_of_counts-->   LevelStatistics
+    features (M, 12)        --statistics_of_features--> LevelStatistics   (exact, the oracle)
+    LevelStatistics  --fisher_vector-->  phi (25 G)
+    H of them   --signature-->      psi (25 G H)   --quantise-->  uint8
+    psi (n, D)  --fit_whitening-->  Whitening      psi  --whiten-->  (d,) uint8
 
-The stored signature is psi centred, turned to its widest axes, whitened, and cut to a few bytes. A
-Fisher vector has few strong axes, which all rooms share, and many weak ones, which tell rooms
-apart. Dividing each axis by its standard deviation lets the weak ones count. docs/model.md has
-the measurements that chose the numbers, and docs/paper.md says where this departs from the paper.
+The stored signature is psi centred, projected on its widest axes, whitened and quantised. A Fisher
+vector has few strong axes, which all rooms share, and many weak ones, which distinguish rooms;
+whitening lets the weak ones count. docs/model.md has the measurements, docs/paper.md the
+differences from the paper.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from sceneprint.geometry.signature.pair_features import (
 )
 from sceneprint.types import Bytes, Floats, Floats32
 
-#: Added to a quantised component: 0 is stored in the middle of the byte.
+#: Offset of a quantised component: 0 is stored in the middle of the byte.
 ZERO = 128
 
 
 @dataclass(frozen=True, eq=False)
 class LevelStatistics:
-    """Sums over all pairs of one level, from which Eq. (2) follows.
+    """Sums over all pairs of one level for Eq. (2).
 
     Parameters
     ----------
     zeroth : (G,) sum of weight times posterior
-    first, second : (G, 12) the same, times feature and times squared feature
+    first, second : (G, 12) sums of weight times posterior times feature, and squared feature
     n_pairs : number of ordered pairs
-    total : sum of their weights; the number itself where all weigh 1
+    total : sum of their weights; `n_pairs` if all weigh 1
     """
 
     zeroth: Floats
@@ -55,8 +55,7 @@ class LevelStatistics:
     total: float
 
 
-#: Rows of the table between one that is asked for and that which is read: the memory's answer
-#: takes as long as a few rows take to be added.
+#: Rows by which the prefetch of the table runs ahead, to hide the latency of the memory.
 _AHEAD = 16
 
 
@@ -64,12 +63,10 @@ _AHEAD = 16
 def _accumulate(
     counts: Floats32, table: Floats32, components: NDArray[np.int16], sums: Floats
 ) -> None:
-    """sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line.
+    """Add up sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line.
 
-    table, components: the packed table, and the same memory as int16.
-
-    A quarter of the bins hold pairs, and their rows lie all over the table, which no cache holds:
-    so the bins are listed, and each row is asked for while those before it are added.
+    table, components: the packed table, and the same memory as int16. A quarter of the bins hold
+    pairs, and their rows are scattered over a table larger than any cache, so they are prefetched.
     """
     used, n = np.empty(len(counts), np.int32), 0
     for b in range(len(counts)):
@@ -96,13 +93,7 @@ def _accumulate(
 def statistics_of_counts(
     counts: PairCounts, table: PairTable, n_components: int
 ) -> LevelStatistics:
-    """Statistics of pairs counted in the 4-D table.
-
-    Parameters
-    ----------
-    counts : of one level
-    n_components : G
-    """
+    """Return the statistics of one level's pairs, counted in the 4-D table; `n_components` is G."""
     d, sums = FEATURE_DIMENSION, np.zeros((n_components, 32))
     _accumulate(counts.weights, table.packed, table.packed.view(np.int16), sums)
     return LevelStatistics(
@@ -111,12 +102,12 @@ def statistics_of_counts(
 
 
 def statistics_of_features(features: Floats, weights: Floats, mixture: Mixture) -> LevelStatistics:
-    """Statistics of pairs one by one, with all posteriors: the oracle of the table.
+    """Return the statistics of single pairs with all posteriors: the oracle of the table.
 
     Parameters
     ----------
     features : (M, 12)
-    weights : (M,) of the pairs
+    weights : (M,) weights of the pairs
     mixture : G components
     """
     zeroth, first, second = moments(features, mixture, weights)
@@ -124,11 +115,11 @@ def statistics_of_features(features: Floats, weights: Floats, mixture: Mixture) 
 
 
 def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
-    """The Fisher vector phi of one level: Eq. (2), Sec. III-B.
+    """Return the Fisher vector phi of one level: Eq. (2), Sec. III-B.
 
     Parameters
     ----------
-    s : of at least one pair
+    s : statistics of at least one pair
     mixture : G components
 
     Returns
@@ -137,9 +128,10 @@ def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
 
     Notes
     -----
-    Readings R2-R4, R9 (docs/paper.md): true posteriors; the weighted mean over all pairs;
-    d^2 / var - 1 in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed form of the
-    inverse Fisher information's factor.
+    Readings R2-R4, R9 (docs/paper.md): true posteriors; the weighted mean over all pairs; d^2 / var
+        - 1
+    in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed form of the inverse Fisher
+    information's factor.
     """
     p, nu, variance = mixture.weights, mixture.means, mixture.variances
     root = np.sqrt(p)[:, None]
@@ -152,82 +144,63 @@ def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
     return np.concatenate([m0, m1, m2], axis=1).ravel()
 
 
-def normalised(phi: Floats) -> Floats:
-    """Component-wise signed square root, then unit l2 norm (after Eq. 2).
+def normalise(phi: Floats) -> Floats:
+    """Return the signed square root of phi (n,), normalised to unit l2 norm (after Eq. 2).
 
-    Parameters
-    ----------
-    phi : (n,); zeros, of a level without pairs, stay zeros
+    Zeros, of a level without pairs, stay zeros.
     """
     rooted = np.sign(phi) * np.sqrt(np.abs(phi))
-    norm = float(np.sqrt(np.abs(phi).sum()))  # of the roots; BLAS would sum by threads
+    norm = float(np.sqrt(np.abs(phi).sum()))  # norm of the roots; BLAS sums depend on threads
     result: Floats = rooted / norm if norm > 0 else rooted
     return result
 
 
 def signature(levels: Sequence[Floats]) -> Floats:
-    """psi: the normalised Fisher vectors of all levels, finest first, end to end.
-
-    Parameters
-    ----------
-    levels : H Fisher vectors (25 G,)
-
-    Returns
-    -------
-    psi : (25 G H,)
-    """
-    return np.concatenate([normalised(phi) for phi in levels])
+    """Return psi (25 G H,): the normalised Fisher vectors (25 G,) of all levels, finest first."""
+    return np.concatenate([normalise(phi) for phi in levels])
 
 
 def quantise(psi: Floats, scale: float) -> Bytes:
-    """One byte a component: round(psi / scale) + 128, clipped.
+    """Return one byte per component of psi (n,): round(psi / scale) + 128, clipped.
 
-    L1 distances of quantised signatures times `scale` are those of the signatures, up to
-    rounding: one scale serves all frames of a model.
-
-    Parameters
-    ----------
-    psi : (n,)
-    scale : the model's step
+    L1 distances of quantised signatures times `scale`, the model's step, are those of the
+    signatures up to rounding.
     """
     result: Bytes = np.clip(np.rint(psi / scale) + ZERO, 0, 255).astype(np.uint8)
     return result
 
 
-# The stored signature: psi whitened, and cut to a few bytes.
-
 Ints8 = NDArray[np.int8]
 Ints16 = NDArray[np.int16]
 Ints32 = NDArray[np.int32]
 
-#: Units of a component of psi, which lies in [-1, 1]. By Cauchy and Schwarz the product with a
-#: row of the basis fits in 32 bits for up to 16 levels of 25,000 components.
+#: Units of a component of psi, which lies in [-1, 1]. By Cauchy-Schwarz the product with a row of
+#: the basis fits in 32 bits for up to 16 levels of 25,000 components.
 UNITS = 1 << 14
-#: Units of a stored component of root mean square size; 127, five times as many, few reach.
+#: Units of a stored component of root mean square size; few components reach the limit of 127.
 GAIN = 26.0
 
 
 @dataclass(frozen=True)
 class WhiteningParameters:
-    """The numbers of the stored signature."""
+    """Parameters of the stored signature."""
 
     dimension: int = 448  #: d, bytes of a stored signature
-    exponent: float = 1.0  #: of the standard deviation that an axis is divided by; 0: not at all
+    exponent: float = 1.0  #: exponent of the standard deviation that divides an axis
 
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """An affine map from psi to the stored signature, learnt once for a model.
+    """An affine map from psi to the stored signature, learnt once per model.
 
-    Basis and psi are integers, so that their products are exact and a signature does not depend
-    on the order in which a processor sums.
+    Basis and psi are integers, so their products are exact and independent of the order of sums.
 
     Parameters
     ----------
-    levels : (h,) of the hierarchy whose Fisher vectors psi consists of, rising, 0 the finest
+    levels : (h,) ascending indices of the levels in psi, 0 is the finest
     basis : (d, D) int8, axes of psi, the widest first
-    scales : (d,) float64, of each axis: one unit of the product, whitened
-    offsets : (d,) float64, of each axis: the product of the mean psi
+    scales : (d,) float64, one unit of each axis's product, whitened
+    offsets : (d,) float64, each axis's product with the mean psi
     unrelated_distance : d0, the median squared distance of signatures of unrelated frames
     """
 
@@ -239,29 +212,24 @@ class Whitening:
 
     @property
     def dimension(self) -> int:
-        """d, bytes of a stored signature."""
+        """Return d, the bytes of a stored signature."""
         return len(self.basis)
 
     @property
     def gain(self) -> float:
-        """Units of a component of a unit vector."""
+        """Return the units of a component of a unit vector."""
         return GAIN * math.sqrt(self.dimension)
 
 
 def psi_units(psi: Floats) -> Ints16:
-    """psi in whole units.
-
-    Parameters
-    ----------
-    psi : (..., D), components in [-1, 1]
-    """
+    """Return psi (..., D), components in [-1, 1], in integer units."""
     units: Ints16 = np.rint(np.asarray(psi) * UNITS).astype(np.int16)
     return units
 
 
 @kernel
 def _products(basis: Ints8, psi: Ints16, result: Ints32) -> None:
-    """result (d,) = basis (d, D) @ psi (D,), exact in 32 bits."""
+    """Write basis (d, D) @ psi (D,) to `result` (d,), exact in 32 bits."""
     for i in range(len(basis)):
         total = np.int32(0)
         for j in range(len(psi)):
@@ -270,11 +238,11 @@ def _products(basis: Ints8, psi: Ints16, result: Ints32) -> None:
 
 
 def whiten(psi: Floats, whitening: Whitening) -> Bytes:
-    """The stored signature of a frame.
+    """Return the stored signature of a frame.
 
     Parameters
     ----------
-    psi : (D,) of the levels of the whitening
+    psi : (D,) Fisher vectors of the levels of the whitening
 
     Returns
     -------
@@ -282,51 +250,51 @@ def whiten(psi: Floats, whitening: Whitening) -> Bytes:
 
     Raises
     ------
-    ValueError : psi of another length.
+    ValueError : psi has another length
     """
     if psi.shape != whitening.basis.shape[1:]:
-        raise ValueError(f"psi {psi.shape}, where the basis is {whitening.basis.shape}")
+        raise ValueError(f"psi {psi.shape} does not fit the basis {whitening.basis.shape}")
     products = np.empty(whitening.dimension, np.int32)
     _products(whitening.basis, psi_units(psi), products)
     z = whitening.scales * (products - whitening.offsets)
     length = float(np.sqrt((z * z).sum()))
-    unit = z / length if length > 0 else z  # psi is the mean: every direction is as good
+    unit = z / length if length > 0 else z  # psi equals the mean
     stored: Bytes = (np.clip(np.rint(whitening.gain * unit), -127, 127) + ZERO).astype(np.uint8)
     return stored
 
 
 def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) -> Whitening:
-    """Principal axes of psi and their spread, by the products of the frames among each other.
+    """Fit principal axes of psi and their spread from the Gram matrix of the frames.
 
-    There are fewer frames than components, so the small matrix of the frames has all the axes.
+    There are fewer frames than components, so the Gram matrix is the smaller one.
 
     Parameters
     ----------
     psi : (n, D) units of training frames; see `psi_units`
-    levels : that psi consists of
+    levels : levels in psi
 
     Returns
     -------
-    whitening : whose unrelated distance is 1, until it is measured
+    whitening : its unrelated distance is 1, until it is measured
 
     Raises
     ------
-    ValueError : fewer frames than axes, or frames that span fewer.
+    ValueError : the frames are fewer than the axes, or span fewer dimensions
     """
     n, d = len(psi), p.dimension
     if not 1 <= d < n:
-        raise ValueError(f"{d} axes of {n} frames")
+        raise ValueError(f"{n} frames cannot determine {d} axes")
     mean = psi.mean(axis=0, dtype=np.float64)
     centred = psi - mean
     variances, vectors = np.linalg.eigh(centred @ centred.T / n)  # rising
     variances, vectors = variances[::-1][:d], vectors.T[::-1][:d]
     if variances[-1] <= 1e-9 * variances[0]:
-        raise ValueError(f"{n} frames that span fewer than {d} axes")
+        raise ValueError(f"{n} frames span fewer than {d} axes")
     axes = (vectors @ centred) / np.sqrt(n * variances)[:, None]
-    signs = np.sign(axes[np.arange(d), np.abs(axes).argmax(axis=1)])  # a fixed choice
+    signs = np.sign(axes[np.arange(d), np.abs(axes).argmax(axis=1)])  # eigenvectors have none
     axes *= signs[:, None]
     units = np.abs(axes).max(axis=1) / 127
     basis: Ints8 = np.rint(axes / units[:, None]).astype(np.int8)
-    # LAPACK differs between machines in the last bits of a double, which single precision drops
+    # single precision drops the last bits, in which LAPACK differs between processors
     scales = (units * variances ** (-p.exponent / 2)).astype(np.float32).astype(np.float64)
     return Whitening(levels, basis, scales, basis @ mean, 1.0)

@@ -1,7 +1,4 @@
-"""Sec. III-B, the generative model: a Gaussian mixture with diagonal covariances.
-
-features (M, 12)  --posteriors-->  pi (M, G)
-"""
+"""Fit and evaluate a Gaussian mixture with diagonal covariances (Sec. III-B, generative model)."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from sceneprint.types import Floats
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Theta = {p_g, nu_g, Lambda_g}.
+    """The mixture Theta = {p_g, nu_g, Lambda_g}.
 
     Parameters
     ----------
@@ -35,27 +32,19 @@ class Mixture:
 
 @dataclass(frozen=True)
 class MixtureParameters:
-    """The numbers of the fit."""
+    """Parameters of the fit."""
 
     n_components: int = 1250  #: G
-    iterations: int = 8  #: of expectation maximisation
-    variance_floor: float = 0.02  #: added to every variance; the features' own are 1
-    prior_variance: float = 0.02  #: towards which components with few samples are drawn
-    prior_count: float = 5.0  #: as strongly as so many samples would
-    minimum_weight: float = 1e-6  #: below which no p_g falls
+    iterations: int = 8  #: iterations of expectation maximisation
+    variance_floor: float = 0.02  #: added to every variance; features have variance 1
+    prior_variance: float = 0.02  #: prior of the variances of components
+    prior_count: float = 5.0  #: weight of the prior, in samples
+    minimum_weight: float = 1e-6  #: least p_g
 
 
 def log_densities(features: Floats, mixture: Mixture) -> Floats:
-    """log p_g + log N(f; nu_g, Lambda_g), the joint log density of feature and component.
-
-    Parameters
-    ----------
-    features : (M, 12)
-    mixture : G components
-
-    Returns
-    -------
-    (M, G) float64
+    """Return the joint log density of features (M, 12) and components, (M, G) float64:
+    log p_g + log N(f; nu_g, Lambda_g).
     """
     precision = 1.0 / mixture.variances
     constant = np.log(mixture.weights) - 0.5 * (
@@ -67,12 +56,7 @@ def log_densities(features: Floats, mixture: Mixture) -> Floats:
 
 
 def posteriors(features: Floats, mixture: Mixture) -> Floats:
-    """pi_ij,g of Sec. III-B: the share of each component in each feature.
-
-    Parameters
-    ----------
-    features : (M, 12)
-    mixture : G components
+    """Return pi_ij,g of Sec. III-B, the share of each component in each feature (M, 12).
 
     Returns
     -------
@@ -92,22 +76,22 @@ def posteriors(features: Floats, mixture: Mixture) -> Floats:
 def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[Mixture]:
     """Learn a mixture by expectation maximisation from a K-Means++ start (Sec. III-F).
 
-    Yields the start and the mixture after every iteration, so that the caller can show
-    progress; the last one is the result.
+    Yields the start and the mixture after every iteration, to show progress; the last is the
+    result.
 
     Parameters
     ----------
     features : (M, 12)
-    seed : of the K-Means++ start
+    seed : seed of the K-Means++ start
 
     Raises
     ------
-    TrainingError : fewer than ten features for each component.
+    TrainingError : there are fewer than ten features per component
     """
     if len(features) < 10 * p.n_components:
         raise TrainingError(
             f"{len(features)} training pairs are too few for {p.n_components} components. "
-            "Train on more frames, or choose a smaller preset."
+            "Train on more frames, or select a smaller preset."
         )
     mixture = _k_means_start(features, p, seed)
     yield mixture
@@ -117,15 +101,9 @@ def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[M
 
 
 def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture:
-    """One iteration of expectation maximisation.
+    """Return the mixture after one iteration of expectation maximisation.
 
-    Features are taken in blocks, so that memory is bounded by a block times G; posteriors
-    of all features at once would be gigabytes.
-
-    Parameters
-    ----------
-    features : (M, 12)
-    mixture : G components
+    Features (M, 12) are processed in blocks, since posteriors of all would take gigabytes.
     """
     zeroth, first, second = moments(features, mixture)
     count = np.maximum(zeroth, 1e-9)[:, None]
@@ -137,18 +115,13 @@ def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture
 def moments(
     features: Floats, mixture: Mixture, weights: Floats | None = None, block: int = 4096
 ) -> tuple[Floats, Floats, Floats]:
-    """Weighted sums over features of pi, pi f and pi f^2, block by block.
+    """Return the weighted sums over features of pi (G,), pi f (G, 12) and pi f^2 (G, 12).
 
     Parameters
     ----------
     features : (M, 12)
-    mixture : G components
-    weights : (M,), or None where all are 1
-    block : features at a time
-
-    Returns
-    -------
-    zeroth (G,), first (G, 12), second (G, 12)
+    weights : (M,), or None if all are 1
+    block : number of features per block
     """
     g, dimension = mixture.means.shape
     zeroth, first, second = np.zeros(g), np.zeros((g, dimension)), np.zeros((g, dimension))
@@ -181,8 +154,8 @@ def _k_means_start(features: Floats, p: MixtureParameters, seed: int) -> Mixture
 def _with_priors(
     count: Floats, means: Floats, variances: Floats, n: int, p: MixtureParameters
 ) -> Mixture:
-    drawn = (count[:, None] * variances + p.prior_count * p.prior_variance) / (
+    regular = (count[:, None] * variances + p.prior_count * p.prior_variance) / (
         count[:, None] + p.prior_count
     )
     weights = np.maximum(count / n, p.minimum_weight)
-    return Mixture(weights / weights.sum(), means, drawn)
+    return Mixture(weights / weights.sum(), means, regular)

@@ -1,16 +1,17 @@
-"""Sec. III-A, "Geometric property set extraction": patch pairs to 13-D properties, by a table.
+"""Compute the 13-D properties of patch pairs, and count pairs in a table (Sec. III-A).
 
     Patches (P), pairs (M, 2)  --invariants-->  (M, 4)  --properties-->  f' (M, 13)
-    layout  --bin_centres-->  invariants (B, 4)
-    layout  --bin_edges-->    edges, in coordinates that are cheap to compute
+    f' (M, 13)  --project-->  f (M, 12)
+    layout, projection, mixture  --compute_bins-->  PairTable (B bins)
+    Patches (P)  --count_pairs-->  PairCounts (B bins)
 
-Symbols follow the paper: mu is the reference patch, alpha its neighbour, r the vector from
-mu to alpha, <u, v, w> the Gram-Schmidt basis of (r, n_mu) with w = u x v.
+Symbols follow the paper: mu is the reference patch, alpha its neighbour, r the vector from mu to
+alpha, <u, v, w> the Gram-Schmidt basis of (r, n_mu) with w = u x v.
 
-A pair of oriented points has four degrees of freedom under rigid motion: the length of r,
-the angles of both normals to it, and the dihedral angle between the normals about it. All
-thirteen properties are functions of these four, so pairs are counted in the bins of a grid over
-them, and a table holds what the mixture makes of each bin.
+A pair of oriented points has four degrees of freedom under rigid motion: the length of r, the
+angles of both normals to it, and the dihedral angle between the normals about it. All thirteen
+properties are functions of these. So pairs are counted in the bins of a grid over the four, and a
+table holds projection and posteriors once per bin.
 """
 
 from __future__ import annotations
@@ -34,19 +35,15 @@ PROPERTY_DIMENSION = 13  #: length of f', Eq. (1)
 
 @dataclass(frozen=True)
 class PropertyParameters:
-    """The numbers of Eq. (1)."""
+    """Parameters of Eq. (1)."""
 
-    radius: float = 3.0  #: reach of a patch's neighbourhood, metres
+    radius: float = 3.0  #: radius of a patch's neighbourhood, metres
     angular_tolerance: float = math.radians(10.0)  #: e_theta of the robust sign, rad
     colinearity: float = 0.9995  #: |n_mu . u| beyond which (r, n_mu) span no basis
 
 
 def neighbour_pairs(patches: Patches, p: PropertyParameters) -> NDArray[np.int64]:
-    """All ordered pairs of patches that lie within reach and span a basis: N_mu of Sec. III-A.
-
-    Parameters
-    ----------
-    patches : P of them
+    """Return all ordered pairs of patches within reach that span a basis: N_mu of Sec. III-A.
 
     Returns
     -------
@@ -60,7 +57,7 @@ def neighbour_pairs(patches: Patches, p: PropertyParameters) -> NDArray[np.int64
 
 
 def invariants(patches: Patches, pairs: NDArray[np.int64]) -> Floats:
-    """The four numbers of each ordered pair that no rigid motion changes.
+    """Return the four rigid invariants of each ordered pair.
 
     Parameters
     ----------
@@ -69,8 +66,8 @@ def invariants(patches: Patches, pairs: NDArray[np.int64]) -> Floats:
 
     Returns
     -------
-    (M, 4) : ||r|| in metres; the angles of n_mu and of n_alpha to u in [0, pi]; the dihedral
-        angle from n_mu to n_alpha about u in [-pi, pi]; rad
+    (M, 4) : ||r|| in metres; the angles of n_mu and of n_alpha to u in [0, pi]; the dihedral angle
+        from n_mu to n_alpha about u in [-pi, pi]; rad
     """
     mu, alpha = pairs.T
     r = patches.means[alpha] - patches.means[mu]
@@ -81,28 +78,28 @@ def invariants(patches: Patches, pairs: NDArray[np.int64]) -> Floats:
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     w = np.cross(u, v)
     a_v, a_w = _dot(n_alpha, v), _dot(n_alpha, w)
-    # arctan2 keeps full precision where arccos of a cosine near 1 has lost half the digits
+    # arctan2 keeps full precision near 0, where arccos loses half the digits
     theta_mu = np.arctan2(_dot(n_mu, v), _dot(n_mu, u))
     theta_alpha = np.arctan2(np.hypot(a_v, a_w), _dot(n_alpha, u))
     return np.column_stack([d, theta_mu, theta_alpha, np.arctan2(a_w, a_v)])
 
 
 def properties(invariant: Floats, p: PropertyParameters) -> Floats:
-    """The 13-D vector f' of relative properties: Eq. (1), Sec. III-A.
+    """Return the 13-D vectors f' of relative properties: Eq. (1), Sec. III-A.
 
     Parameters
     ----------
-    invariant : (M, 4) as `invariants` returns them
+    invariant : (M, 4) result of `invariants`
 
     Returns
     -------
-    f : (M, 13) in the order of Eq. (1): 0-2 angles in rad, [0, pi]; 4-6 cosines; 3 and
-        7-12 metres
+    f : (M, 13) in the order of Eq. (1): 0-2 angles in rad, [0, pi]; 4-6 cosines; 3 and 7-12 metres
 
     Notes
     -----
-    Reading R1 (docs/paper.md): the printed interval of sgn_e is empty; the sign is taken
-    as 0 within e_theta of perpendicular, |cos| <= sin(e_theta).
+    Reading R1 (docs/paper.md): the printed interval of sgn_e is empty; the sign is 0 within e_theta
+        of
+    perpendicular, |cos| <= sin(e_theta).
     """
     d, theta_mu, theta_alpha, phi = invariant.T
     m_u, m_v = np.cos(theta_mu), np.sin(theta_mu)  # n_mu = m_u u + m_v v
@@ -125,17 +122,7 @@ def properties(invariant: Floats, p: PropertyParameters) -> Floats:
 
 
 def pair_properties(patches: Patches, pairs: NDArray[np.int64], p: PropertyParameters) -> Floats:
-    """Properties of ordered patch pairs: Eq. (1) applied to pairs as they stand.
-
-    Parameters
-    ----------
-    patches : P of them
-    pairs : (M, 2) as `neighbour_pairs` returns them
-
-    Returns
-    -------
-    f : (M, 13)
-    """
+    """Return the properties (M, 13) of ordered patch pairs (M, 2): Eq. (1)."""
     return properties(invariants(patches, pairs), p)
 
 
@@ -143,10 +130,6 @@ def _dot(a: Floats, b: Floats) -> Floats:
     product: Floats = np.einsum("md,md->m", a, b)
     return product
 
-
-# Sec. III-A, "Feature space projection": 13-D properties to 12-D features.
-#
-# f' (M, 13)  --project-->  f (M, 12)
 
 FEATURE_DIMENSION = 12  #: d_F, length of f
 
@@ -166,17 +149,11 @@ class Projection:
 
 
 def project(properties: Floats, projection: Projection) -> Floats:
-    """Features of the learnt subspace.
+    """Return the features of properties (M, 13) in the learnt subspace (Sec. III-A).
 
-    Parameters
-    ----------
-    properties : (M, 13)
-
-    Returns
-    -------
-    features : (M, 12), of unit variance and uncorrelated over the training pairs
+    Features (M, 12) have unit variance and are uncorrelated over the training pairs.
     """
-    # not `@`: BLAS sums in an order that depends on its threads, and tables are compared by byte
+    # einsum, because the order of BLAS's sums depends on its threads, and tables must be equal
     features: Floats = np.einsum("md,fd->mf", properties - projection.mean, projection.matrix)
     return features
 
@@ -189,22 +166,21 @@ def fit_projection(
     Parameters
     ----------
     properties : (M, 13)
-    method : "pca" whitens the standardised properties; "ica" goes on to make the
-        components independent (FastICA, log cosh)
-    seed : of FastICA's starting matrix
+    method : "pca" whitens the standardised properties; "ica" also makes the components independent
+        (FastICA, log cosh)
+    seed : seed of FastICA's starting matrix
 
     Returns
     -------
-    projection : rows are signed so that their largest weight is positive, since neither
-        method fixes signs
+    projection : each row's largest weight is positive, since neither method fixes signs
 
     Raises
     ------
-    TrainingError : a property does not vary, or FastICA does not converge.
+    TrainingError : a property does not vary, or FastICA does not converge
 
     Notes
     -----
-    Reading R7 (docs/paper.md): the paper says nonlinear ICA and cites EFICA, a linear one.
+    Reading R7 (docs/paper.md): the paper specifies nonlinear ICA, but cites the linear EFICA.
     """
     mean, scale = properties.mean(axis=0), properties.std(axis=0)
     if len(properties) <= PROPERTY_DIMENSION or not (scale > 1e-9).all():
@@ -220,8 +196,8 @@ def fit_projection(
         pca.fit(standardised)
         if pca.explained_variance_[-1] < 1e-9:
             raise TrainingError(
-                "The properties of the training pairs depend on each other, so that twelve "
-                "directions cannot be told apart. Train on more frames of furnished rooms."
+                "The properties of the training pairs span fewer than twelve dimensions, so no "
+                "subspace can be learnt. Train on more frames of furnished rooms."
             )
         components = pca.components_ / np.sqrt(pca.explained_variance_)[:, None]
     else:
@@ -246,37 +222,29 @@ def fit_projection(
     )
 
 
-# The grid over the four invariants of a pair, and the table over its bins.
-
-
 @dataclass(frozen=True)
 class TableLayout:
     """The grid over the four invariants of a pair.
 
-    Angular bins are centred on right angles (and the dihedral ones on 0 and 180 degrees):
-    buildings are full of these, and they must not fall on the edge between two bins. With 27
-    of them the tolerance of 10 degrees in Eq. (1) is an edge, so that no bin straddles the jump
-    of the robust sign; a third of the bins then serve as well as a finer grid without that.
+    Angular bins are centred on right angles (dihedral ones also on 0 and 180 degrees), because
+    these are frequent in buildings and must not fall on an edge. With 27 bins the tolerance of 10
+    degrees in Eq. (1) is an edge, so no bin straddles the jump of the robust sign: a finer grid
+    would need three times as many bins.
     """
 
     distance_bins: int = 20
-    angle_bins: int = 27  #: of each normal's angle to r; odd, so that one is centred on 90
+    angle_bins: int = 27  #: bins of each normal's angle to r; odd, so one is centred on 90 degrees
     dihedral_bins: int = 20  #: a multiple of 4, offset by half a bin
     distance_exponent: float = 1.3  #: distance edges are radius * (i / bins)^exponent
 
     @property
     def n_bins(self) -> int:
-        """B, the number of bins."""
+        """Return B, the number of bins."""
         return self.distance_bins * self.angle_bins**2 * self.dihedral_bins
 
 
 def bin_centres(layout: TableLayout, first: int, last: int, p: PropertyParameters) -> Floats:
-    """The four invariants at the centres of bins `first` to `last` - 1.
-
-    Returns
-    -------
-    (last - first, 4) : as `pair_features.invariants`: metres, rad
-    """
+    """Return the invariants at the centres of bins `first` to `last` - 1, as `invariants` does."""
     shape = (layout.distance_bins, layout.angle_bins, layout.angle_bins, layout.dihedral_bins)
     i, j, k, m = np.unravel_index(np.arange(first, last), shape)
     d = p.radius * ((i + 0.5) / layout.distance_bins) ** layout.distance_exponent
@@ -286,66 +254,59 @@ def bin_centres(layout: TableLayout, first: int, last: int, p: PropertyParameter
 
 
 def _diamond(x: Floats, y: Floats) -> Floats:
-    """Monotone stand-in for the angle atan2(y, x), in [0, 4): a division, no arctangent."""
+    """Return the diamond angle in [0, 4): monotone in atan2(y, x), but cheaper."""
     t = y / (np.abs(x) + np.abs(y))
     diamond: Floats = np.where(x < 0, 2.0 - t, np.where(y < 0, 4.0 + t, t))
     return diamond
 
 
 def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats, Floats]:
-    """Upper edges of the bins, in the coordinates in which `count_pairs` looks them up.
+    """Return the upper edges of the bins, in the coordinates of `count_pairs`.
 
     Returns
     -------
     distance : (distance_bins,) metres
     angle : (angle_bins,) minus the cosine of the angle, rising from -1; the last is infinite
-    dihedral : (dihedral_bins + 1,) diamond angle in [0, 4]; the last bin is the first's half
+    dihedral : (dihedral_bins + 1,) diamond angle in [0, 4]; the last bin is half of the first
     """
     distance = p.radius * (np.arange(1, layout.distance_bins + 1) / layout.distance_bins) ** (
         layout.distance_exponent
     )
     angle = -np.cos(np.pi * np.arange(1, layout.angle_bins + 1) / layout.angle_bins)
-    angle[-1] = np.inf  # a cosine may exceed 1 by a rounding
+    angle[-1] = np.inf  # a rounded cosine may exceed 1
     phi = 2 * np.pi * (np.arange(layout.dihedral_bins) + 0.5) / layout.dihedral_bins
     dihedral = np.append(_diamond(np.cos(phi), np.sin(phi)), 4.0)
     return distance, angle, dihedral
 
 
-def hints(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
-    """Where to begin the search for a bin: for each of `n` equal cells, its first bin.
+def search_starts(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
+    """Return the first bin of each of `n` equal cells, where the search for a bin starts.
 
     Parameters
     ----------
     edges : upper edges of the bins
-    origin, extent : of the coordinate
-    n : cells; each must be narrower than any bin
+    origin, extent : range of the coordinate
+    n : number of cells; each must be narrower than any bin
 
     Raises
     ------
-    ValueError : a bin is narrower than a cell.
+    ValueError : a bin is narrower than a cell
     """
     if n * np.diff(edges, prepend=origin).min() <= extent:
-        raise ValueError("bins are finer than the look-up allows: use fewer")
+        raise ValueError("bins are narrower than the cells of the search: use fewer bins")
     starts = origin + extent * np.arange(n) / n
     return np.minimum(np.searchsorted(edges, starts, side="right"), len(edges) - 1).astype(np.int32)
 
 
-# The 4-D pair table: what a pair of patches contributes to Eq. (2), looked up.
-#
-# Model  --part-->  PairTable (B bins: feature, leading posteriors)
-#
-# A pair has only the four invariants of `pair_features.py`. Projection and posteriors are
-# evaluated once for each bin of a grid over these four, instead of once for each pair.
-
-LEADING = 8  #: posteriors kept per bin
-LEAST = 1e-3  #: and of these, those that are no smaller; what is kept sums to 1
-#: Floats of one bin: feature, posteriors, and the components as pairs of int16.
+LEADING = 8  #: number of posteriors per bin, normalised to sum 1
+LEAST_POSTERIOR = 1e-3  #: smaller posteriors are 0
+#: Floats of a bin: feature, posteriors, and the components as pairs of int16.
 WIDTH = FEATURE_DIMENSION + LEADING + LEADING // 2
 
 
 @dataclass(frozen=True, eq=False)
 class PairTable:
-    """What every bin contributes, 96 bytes in one place each: two cache lines a look-up.
+    """The contribution of a pair to Eq. (2) by bin, 96 bytes each: two cache lines per look-up.
 
     Parameters
     ----------
@@ -356,28 +317,24 @@ class PairTable:
 
     @property
     def features(self) -> Floats32:
-        """(B, 12) float32, f of the bin's centre."""
+        """Return the features f of the bins' centres, (B, 12) float32."""
         return self.packed[:, :FEATURE_DIMENSION]
 
     @property
     def posteriors(self) -> Floats32:
-        """(B, 8) float32, falling, of sum 1; 0 from the first below 1e-3 on."""
+        """Return the leading posteriors, (B, 8) float32, falling, of sum 1, or 0."""
         return self.packed[:, FEATURE_DIMENSION : FEATURE_DIMENSION + LEADING]
 
     @property
     def components(self) -> NDArray[np.int16]:
-        """(B, 8) int16, the mixture components whose posteriors these are."""
+        """Return the mixture components of the posteriors, (B, 8) int16."""
         return self.packed.view(np.int16)[:, 2 * (FEATURE_DIMENSION + LEADING) :]
 
 
-def pack(features: Floats32, posteriors: Floats32, components: NDArray[np.int16]) -> PairTable:
-    """A table from its three parts.
-
-    Parameters
-    ----------
-    features : (B, 12)
-    posteriors, components : (B, 8)
-    """
+def pack_table(
+    features: Floats32, posteriors: Floats32, components: NDArray[np.int16]
+) -> PairTable:
+    """Pack features (B, 12), posteriors (B, 8) and components (B, 8) to a table."""
     packed = np.empty((len(features), WIDTH), np.float32)
     table = PairTable(packed)
     table.features[:], table.posteriors[:], table.components[:] = features, posteriors, components
@@ -385,11 +342,11 @@ def pack(features: Floats32, posteriors: Floats32, components: NDArray[np.int16]
 
 
 @kernel
-def _leading(
+def _select_leading(
     features: Floats32, constants: Floats32, means: Floats32, precisions: Floats32,
     components: NDArray[np.int16], posteriors: Floats32,
 ) -> None:  # fmt: skip
-    """Keep the largest posteriors of each feature. means, precisions: (12, G)."""
+    """Write the largest posteriors of each feature. means, precisions: (12, G)."""
     n, dimension = features.shape
     n_components, n_leading = len(constants), components.shape[1]
     logits = np.empty(n_components, np.float32)
@@ -419,59 +376,50 @@ def _leading(
         kept = np.float32(0.0)
         for k in range(found):
             posteriors[i, k] /= total
-            if posteriors[i, k] < np.float32(LEAST):
+            if posteriors[i, k] < np.float32(LEAST_POSTERIOR):
                 posteriors[i, k] = np.float32(0.0)
             kept += posteriors[i, k]
         for k in range(found):
             posteriors[i, k] /= kept
 
 
-def part(
+def compute_bins(
     first: int, last: int,
     layout: TableLayout, p: PropertyParameters, projection: Projection, mixture: Mixture,
 ) -> PairTable:  # fmt: skip
-    """Bins `first` to `last` - 1 of the table.
-
-    Parameters
-    ----------
-    first, last : bins
-    """
+    """Return bins `first` to `last` - 1 of the table."""
     invariant = bin_centres(layout, first, last, p)
     features = project(properties(invariant, p), projection).astype(np.float32)
     constants = np.log(mixture.weights) - 0.5 * np.log(mixture.variances).sum(axis=1)
     components = np.zeros((last - first, LEADING), np.int16)
     posteriors = np.zeros((last - first, LEADING), np.float32)
-    _leading(
+    _select_leading(
         features, constants.astype(np.float32),
         np.ascontiguousarray(mixture.means.T, np.float32),
         np.ascontiguousarray(1.0 / mixture.variances.T, np.float32),
         components, posteriors,
     )  # fmt: skip
-    return pack(features, posteriors, components)
+    return pack_table(features, posteriors, components)
 
 
-# All ordered pairs of patches, counted by their four invariants.
-#
-# Patches (P)  --count_pairs-->  PairCounts (B bins)
-#
-# All pairs are used: a sample of them would make the signature of one frame differ from itself
-# (docs/paper.md, R11). The inner loops run over all later patches, which lets the compiler work on
-# several at a time.
+# The kernels count all ordered pairs, because signatures of samples would differ (docs/paper.md,
+# R11). Their inner loops run over all later patches, so the compiler can vectorize them.
 
 
 @disjoint_kernel
 def _invariants(
     points: Floats, normals: Floats, i: int, d: Floats, i_u: Floats, j_u: Floats, turn: Floats
 ) -> None:
-    """Of patch i and each later one, with u from i to j: their distance, n_i . u, n_j . u, and the
-    diamond angle, as `_diamond`, of the dihedral angle about u from n_i to n_j.
+    """Write the distance of patch i to each later one, n_i . u and n_j . u, and the dihedral angle.
+
+    u points from i to j; the angle about u from n_i to n_j is a diamond angle, as in `_diamond`.
     """
     x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
     ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
     for j in range(i + 1, len(d)):
         rx, ry, rz = x[j] - ix, y[j] - iy, z[j] - iz
         length = np.sqrt(rx * rx + ry * ry + rz * rz)
-        inverse = 1.0 / (length + 1e-300)  # pairs in one place are left out by their distance
+        inverse = 1.0 / (length + 1e-300)  # pairs at distance 0 are excluded later
         along_i = (rx * ax + ry * ay + rz * az) * inverse
         along_j = (rx * nx[j] + ry * ny[j] + rz * nz[j]) * inverse
         cx, cy, cz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
@@ -485,7 +433,7 @@ def _invariants(
 
 @disjoint_kernel
 def _bin(value: float, edges: Floats, hints: Ints32, origin: float, per_unit: float) -> int:
-    """Index of the first edge above a value. Cells of hints are narrower than bins."""
+    """Return the index of the first edge above a value. Cells of `hints` are narrower than bins."""
     cell = min(max((value - origin) * per_unit, 0.0), len(hints) - 1.0)
     b = hints[np.uint64(np.int32(cell))]
     found: int = b + 1 if value >= edges[np.uint64(b)] else b
@@ -498,7 +446,7 @@ def _pair_bins(
     distance: Floats, angle: Floats, dihedral: Floats, of_distance: Ints32, of_angle: Ints32,
     of_dihedral: Ints32, n_angles: int, n_dihedrals: int, there: Ints32, back: Ints32,
 ) -> None:  # fmt: skip
-    """Bins of the pairs (i, j) and (j, i); -1 of a pair that is none."""
+    """Write the bins of the pairs (i, j) and (j, i); -1 if a pair does not count."""
     per_metre, per_cosine = len(of_distance) / radius, len(of_angle) / 2.0
     per_turn = len(of_dihedral) / 4.0
     for j in range(i + 1, len(d)):
@@ -511,7 +459,7 @@ def _pair_bins(
         # (i, j): angles of n_i and n_j to u
         bin_ij = ((row * n_angles + mu) * n_angles + alpha) * n_dihedrals + last
         there[j] = np.int32(bin_ij if near & (abs(i_u[j]) <= colinearity) else -1)
-        # (j, i): u turns round, the normals change places
+        # (j, i): u is reversed, the normals are swapped
         mu, alpha = n_angles - 1 - alpha, n_angles - 1 - mu
         bin_ji = ((row * n_angles + mu) * n_angles + alpha) * n_dihedrals + last
         back[j] = np.int32(bin_ji if near & (abs(j_u[j]) <= colinearity) else -1)
@@ -521,7 +469,7 @@ def _pair_bins(
 def _add(
     there: Ints32, back: Ints32, i: int, weights: Floats32, counts: Floats32, total: float
 ) -> tuple[int, float]:
-    """Add the weights of pairs to their bins: number of pairs, and `total` with their weights."""
+    """Add the weights of pairs to their bins; return the pairs, and `total` plus their weights."""
     found, own = 0, weights[i]
     for j in range(i + 1, len(there)):
         weight = own * weights[j]
@@ -542,7 +490,7 @@ def _count(
     distance: Floats, angle: Floats, dihedral: Floats,
     hints: Ints32, n_angles: int, n_dihedrals: int, weights: Floats32, counts: Floats32,
 ) -> tuple[int, float]:  # fmt: skip
-    """Add the weight of both orders of every pair; returns number and weight of all."""
+    """Add the weights of both orders of every pair; return the number and weight of all."""
     n = points.shape[1]
     d, i_u, j_u, turn = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     there, back = np.empty(n, np.int32), np.empty(n, np.int32)
@@ -576,10 +524,14 @@ class PairCounts:
 
 @lru_cache(maxsize=8)
 def _look_up(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats, Floats, Ints32]:
-    """The edges of `bin_edges`, and the hints of all three (3, n); they are shared."""
+    """Return the edges of `bin_edges`, and their search starts (3, n), shared and read-only."""
     distance, angle, dihedral = bin_edges(layout, p)
     starts = np.stack(
-        [hints(distance, 0.0, p.radius), hints(angle, -1.0, 2.0), hints(dihedral, 0.0, 4.0)]
+        [
+            search_starts(distance, 0.0, p.radius),
+            search_starts(angle, -1.0, 2.0),
+            search_starts(dihedral, 0.0, 4.0),
+        ]
     )
     for shared in (distance, angle, dihedral, starts):
         shared.flags.writeable = False
@@ -594,7 +546,7 @@ def count_pairs(
     Parameters
     ----------
     means, normals : (P, 3) float64, metres and unit length
-    weights : (P,) of the patches
+    weights : (P,) weights of the patches
     """
     distance, angle, dihedral, starts = _look_up(layout, p)
     counts = np.zeros(layout.n_bins, np.float32)
@@ -606,6 +558,6 @@ def count_pairs(
     return PairCounts(counts, n_pairs, total)
 
 
-def compiled_at() -> tuple[str, bool]:
-    """Folder of this code's machine code, and whether it is there."""
+def machine_code_folder() -> tuple[str, bool]:
+    """Return the folder of the pair kernel's machine code, and whether it holds code."""
     return code_folder(_count)

@@ -1,15 +1,19 @@
-"""Sec. III-F, segmentation: a surface to smooth, compact patches that respect edges.
+"""Segment a surface into smooth, compact patches, and cluster patches to a hierarchy (Sec. III-F).
 
-    Surface (h, w)  --segment-->      labels (h, w)  --patches_of-->  Patches (P)
-    Voxels (V)      --supervoxels-->  labels (1, V)  --patches_of-->  Patches (P)
+    Surface (h, w)  --segment-->      labels (h, w)  --extract_patches-->  Patches (P)
+    Voxels (V)      --supervoxels-->  labels (1, V)  --extract_patches-->  Patches (P)
+    Surface, labels (h, w)  --hierarchy-->  Hierarchy (H levels)
+    Patches (P)  --patch_weights-->  (P,)
 
-SLIC over position and normal, started from a grid in the image. No pixel term: two pixels
-belong together when their points are near and their normals agree, so that patches end at
-creases and at depth edges alike.
+Images: SLIC over position and normal, started from a grid. It has no pixel term, so patches end at
+creases and depth edges alike.
 
-Clouds are segmented after VCCS (Papon 2013): seeds on a grid, grown from voxel to voxel that touch,
-by position and normal; so a patch ends at creases and never crosses a gap. The distance is that of
-k-means in position and normal too, and centres follow their patches.
+Clouds: VCCS (Papon 2013), seeds on a grid that grow over touching voxels by position and normal. A
+patch ends at creases and never crosses a gap. Unlike in VCCS, the distance is that of k-means, and
+centres follow their patches.
+
+Hierarchy: agglomerative K-Means over the finest patches in position and normal, weighted by area,
+seeded near-uniformly over the surface by farthest-point sampling.
 """
 
 from __future__ import annotations
@@ -29,20 +33,22 @@ from sceneprint.types import Floats, Floats32, Hierarchy, Intrinsics, Ints32, Pa
 
 @dataclass(frozen=True)
 class SegmentationParameters:
-    """The numbers of the finest segmentation."""
+    """Parameters of the finest segmentation."""
 
-    n_patches: int = 1000  #: grid seeds of a full image
+    n_patches: int = 1000  #: number of grid seeds of a full image
     iterations: int = 5  #: rounds of assignment and update
-    normal_weight: float = 6.0  #: of 1 - cos(normals), beside squared seed spacings
+    normal_weight: float = 6.0  #: weight of 1 - cos(normals), relative to squared seed spacings
     minimum_size: float = 0.15  #: patches below this share of a grid cell are dropped
     minimum_pixels: int = 4  #: and those below so many pixels
 
 
 @kernel
-def _spread(
+def _spread_centres(
     centres: Floats32, row: int, shift: int, cells: Ints32, columns: int, out: Floats32
 ) -> None:
-    """The centre in a row of cells, `shift` beside that of each pixel: (7, w); dead where none."""
+    """Write the centre `shift` cells beside each pixel, in a row of cells, to (7, w), or a dead
+    one.
+    """
     for x in range(len(cells)):
         column = cells[x] + shift
         if row < 0 or row * columns >= len(centres) or column < 0 or column >= columns:
@@ -53,14 +59,13 @@ def _spread(
 
 
 @disjoint_kernel
-def _join(
+def _assign_row(
     pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, k: np.int32,
     cells: Ints32, labels: Ints32, nearest: Floats32,
 ) -> None:  # fmt: skip
-    """Give pixels of a row, of (6, h, w), to the centre beside each, of (7, w), where it is nearer
-    than their own; none is to a dead one.
+    """Assign pixels of a row, of (6, h, w), to the centre beside each, of (7, w), if it is nearer.
 
-    k : of the centre beside a pixel of the first cell
+    Dead centres get no pixels. k: centre beside a pixel of the first cell.
     """
     px, py, pz = pixels[0, y], pixels[1, y], pixels[2, y]
     nx, ny, nz = pixels[3, y], pixels[4, y], pixels[5, y]
@@ -84,11 +89,10 @@ def _assign(
     pixels: Floats32, valid: NDArray[np.bool_], centres: Floats32, spacing: float,
     normal_weight: np.float32, columns: int, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Give every pixel, of (6, h, w), the nearest of the centres seeded in the nine cells around
-    it.
+    """Assign every pixel, of (6, h, w), to the nearest centre of the nine cells around it.
 
-    Rows of pixels are compared with one centre each at a time, so that the compiler works on
-    eight pixels at once. Centres are spread over the pixels once for each row of cells.
+    A row of pixels is compared with one centre each at a time, which vectorizes. Centres are spread
+    over the pixels once per row of cells.
     """
     height, width = valid.shape
     rows = len(centres) // columns
@@ -103,7 +107,7 @@ def _assign(
             cell = min(int(y / spacing), rows - 1)
             for row in range(spread + 1, cell + 2):
                 for n in range(3):
-                    _spread(centres, row, n - 1, cells, columns, around[row % 3, n])
+                    _spread_centres(centres, row, n - 1, cells, columns, around[row % 3, n])
             spread = cell + 1
         nearest[:] = np.inf
         own = labels[y]
@@ -112,7 +116,7 @@ def _assign(
         for n in range(9):
             row, shift = cell + n // 3 - 1, n % 3
             k = np.int32(row * columns + shift - 1)
-            _join(pixels, y, around[row % 3, shift], normal_weight, k, cells, own, nearest)
+            _assign_row(pixels, y, around[row % 3, shift], normal_weight, k, cells, own, nearest)
         for x in range(width):
             own[x] = own[x] if valid[y, x] else -1
 
@@ -121,7 +125,7 @@ def _assign(
 def _sums(
     points: Floats32, normals: Floats32, weights: Floats32, labels: Ints32, n: int
 ) -> NDArray[np.float64]:
-    """Per label: weight, weighted point (3), weighted normal (3), pixels."""
+    """Return sums per label: weight, weighted point (3), weighted normal (3), pixels."""
     height, width = labels.shape
     sums = np.zeros((n, 8))
     for y in range(height):
@@ -140,7 +144,7 @@ def _sums(
 
 @kernel
 def _centres(sums: Floats, spacing: float, focal_length: float, centres: Floats32) -> None:
-    """Mean point and normal of labels, (n, 7), and (1 / metric seed spacing)^2, 0 where dead."""
+    """Write mean point and normal of labels, (n, 7), and (1 / metric seed spacing)^2, 0 if dead."""
     for k in range(len(sums)):
         alive = sums[k, 0] > 0
         weight = sums[k, 0] if alive else 1.0
@@ -157,7 +161,7 @@ def _centres(sums: Floats, spacing: float, focal_length: float, centres: Floats3
 
 @lru_cache(maxsize=8)
 def _seed_grid(height: int, width: int, n_patches: int) -> tuple[Ints32, float, int]:
-    """Cell of each pixel (h, w), their spacing in pixels, and cells in a row."""
+    """Return each pixel's cell (h, w), the spacing in pixels, and the number of cells in a row."""
     spacing = max(math.sqrt(height * width / n_patches), 1.0)
     rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
     y, x = np.mgrid[:height, :width]
@@ -171,9 +175,8 @@ def _seed_grid(height: int, width: int, n_patches: int) -> tuple[Ints32, float, 
 def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     """Assign every valid pixel to a patch.
 
-    Patches below either limit of the parameters are dropped (their pixels get -1):
-    their normals would be noise, and in an image of a thousand patches they hold under
-    one per cent of the surface.
+    Patches below either limit of the parameters are dropped: their normals would be noise, and in
+    an image of a thousand patches they cover less than one per cent of the surface.
 
     Parameters
     ----------
@@ -204,20 +207,14 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
 
 
 def compact_labels(labels: Ints32, keep: NDArray[np.bool_]) -> Ints32:
-    """Renumber labels without gaps, those not kept becoming -1.
-
-    Parameters
-    ----------
-    labels : (h, w) int32, -1 for none
-    keep : (n,) bool
-    """
+    """Renumber labels (h, w) without gaps; labels that the mask `keep` (n,) drops become -1."""
     renumbered = np.where(keep, np.cumsum(keep) - 1, -1).astype(np.int32)
     result: Ints32 = np.where(labels >= 0, renumbered[labels], -1).astype(np.int32)
     return result
 
 
-def patches_of(surface: Surface, labels: Ints32) -> Patches:
-    """Means, normals and areas of labelled pixels, each pixel weighing its surface area.
+def extract_patches(surface: Surface, labels: Ints32) -> Patches:
+    """Return means, normals and areas of labelled pixels, weighted by their surface areas.
 
     Parameters
     ----------
@@ -226,7 +223,7 @@ def patches_of(surface: Surface, labels: Ints32) -> Patches:
 
     Returns
     -------
-    patches : P of them, in the order of the labels
+    patches : P patches in the order of the labels
     """
     n = int(labels.max(initial=-1)) + 1
     sums = _sums(surface.points, surface.normals, surface.areas, labels, n)
@@ -242,34 +239,26 @@ def patches_of(surface: Surface, labels: Ints32) -> Patches:
     )
 
 
-# Sec. III-F, hierarchy: the finest patches to H levels, each fewer by a constant factor.
-#
-#     Surface, labels (h, w)  --hierarchy-->  Hierarchy (H levels)
-#
-# Agglomerative K-Means over the finest patches in position and normal, weighted by area,
-# seeded near-uniformly over the surface by farthest-point sampling.
-
-
 @dataclass(frozen=True)
 class HierarchyParameters:
-    """The numbers of the hierarchy."""
+    """Parameters of the hierarchy."""
 
     n_levels: int = 4  #: H
-    factor: float = 2.0**0.5  #: each level has fewer patches by this factor
-    iterations: int = 4  #: of K-Means
-    normal_weight: float = 3.0  #: of 1 - cos(normals), beside squared patch diameters
+    factor: float = 2.0**0.5  #: ratio of the numbers of patches of successive levels
+    iterations: int = 4  #: iterations of K-Means
+    normal_weight: float = 3.0  #: weight of 1 - cos(normals), relative to squared patch diameters
 
 
-#: Patches, neighbours in their order, that are compared with a centre or passed over together.
+#: Number of consecutive patches that are compared with a centre, or skipped, together.
 _BLOCK = 8
 
 
 @disjoint_kernel
-def _nearer(
+def _move_nearer(
     patches: Floats, centre: Floats, scale: float, weight: float, c: int, first: int, last: int,
     nearest: Floats, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Move to cluster `c` those of some patches that are nearer to its centre than to their own."""
+    """Move patches to cluster `c` if they are nearer to its centre than to their own."""
     x, y, z, nx, ny, nz = (
         patches[0], patches[1], patches[2], patches[3], patches[4], patches[5]
     )  # fmt: skip
@@ -283,7 +272,7 @@ def _nearer(
 
 @kernel
 def _boxes(patches: Floats, boxes: Floats) -> float:
-    """Corners (6, n) of the boxes about blocks of patches, and the longest of all normals."""
+    """Write the corners (6, n) of the boxes of blocks of patches; return the longest normal."""
     longest = 0.0
     boxes[:3], boxes[3:] = np.inf, -np.inf
     for k in range(patches.shape[1]):
@@ -300,7 +289,7 @@ def _boxes(patches: Floats, boxes: Floats) -> float:
 def _least_distances(
     boxes: Floats, centre: Floats, scale: float, weight: float, longest: float, least: Floats
 ) -> None:
-    """What no distance of a block's patches from a centre falls below, roundings included."""
+    """Write lower bounds of the distances of blocks of patches from a centre, rounding included."""
     cosine = longest * np.sqrt(centre[3] ** 2 + centre[4] ** 2 + centre[5] ** 2)
     of_normals = weight * (1.0 - cosine) - 1e-9 * abs(weight) * (1.0 + cosine)
     shrunk = scale * (1.0 - 1e-9)
@@ -312,7 +301,7 @@ def _least_distances(
 
 
 @kernel
-def _largest_of(values: Floats, first: int, last: int) -> float:
+def _maximum(values: Floats, first: int, last: int) -> float:
     largest: float = values[first]
     for k in range(first + 1, last):
         largest = max(largest, values[k])
@@ -324,7 +313,7 @@ def _seed(
     patches: Floats, areas: Floats, boxes: Floats, longest: float, scale: float, weight: float,
     centres: Floats, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Farthest-point sampling: the largest patch, then always the one that is worst served."""
+    """Select centres by farthest-point sampling, starting with the largest patch."""
     n, n_blocks = len(labels), boxes.shape[1]
     nearest, farthest = np.full(n, np.inf), np.full(n_blocks, np.inf)
     least = np.empty(n_blocks)
@@ -335,9 +324,9 @@ def _seed(
         for b in range(n_blocks):
             if least[b] < farthest[b]:
                 first, last = b * _BLOCK, min((b + 1) * _BLOCK, n)
-                _nearer(patches, centres[c], scale, weight, c, first, last, nearest, labels)
-                farthest[b] = _largest_of(nearest, first, last)
-        worst = int(np.argmax(farthest))  # the first of equals, in the order of the patches
+                _move_nearer(patches, centres[c], scale, weight, c, first, last, nearest, labels)
+                farthest[b] = _maximum(nearest, first, last)
+        worst = int(np.argmax(farthest))  # the first of equals
         chosen, last = worst * _BLOCK, min((worst + 1) * _BLOCK, n)
         while chosen < last - 1 and nearest[chosen] != farthest[worst]:
             chosen += 1
@@ -348,35 +337,36 @@ def _reassign(
     patches: Floats, boxes: Floats, longest: float, scale: float, weight: float, centres: Floats,
     labels: Ints32,
 ) -> None:  # fmt: skip
-    """Give every patch the nearest centre, the first of equals.
+    """Assign every patch to the nearest centre, the first of equals.
 
-    Its present centre is no farther than it is, so blocks of patches are compared only with
-    centres that may be as near as that to one of them.
+    The distance to the present centre is an upper bound, so a block of patches is compared only
+    with centres whose lower bound does not exceed it.
     """
     n, n_blocks = len(labels), boxes.shape[1]
     nearest, farthest, least = np.empty(n), np.empty(n_blocks), np.empty(n_blocks)
     for k in range(n):
         nearest[k] = np.inf
-        _nearer(patches, centres[labels[k]], scale, weight, labels[k], k, k + 1, nearest, labels)
+        _move_nearer(
+            patches, centres[labels[k]], scale, weight, labels[k], k, k + 1, nearest, labels
+        )
     for b in range(n_blocks):
-        farthest[b] = _largest_of(nearest, b * _BLOCK, min((b + 1) * _BLOCK, n))
+        farthest[b] = _maximum(nearest, b * _BLOCK, min((b + 1) * _BLOCK, n))
     nearest[:] = np.inf
     for c in range(len(centres)):
         _least_distances(boxes, centres[c], scale, weight, longest, least)
         for b in range(n_blocks):
             if least[b] <= farthest[b]:
                 first, last = b * _BLOCK, min((b + 1) * _BLOCK, n)
-                _nearer(patches, centres[c], scale, weight, c, first, last, nearest, labels)
+                _move_nearer(patches, centres[c], scale, weight, c, first, last, nearest, labels)
 
 
 @kernel
 def _k_means(
     patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
 ) -> Ints32:
-    """Labels of (6, P) positions and normals; clusters that end empty are numbered still.
+    """Return the labels of (6, P) positions and normals; empty clusters keep their numbers.
 
-    Neighbours are compared with a centre together, or not at all where their box is too far: of
-    the distances, a twentieth is left to be computed.
+    Bounds of blocks of neighbours leave a twentieth of the distances to compute.
     """
     n = patches.shape[1]
     centres, labels = np.empty((n_clusters, 6)), np.zeros(n, np.int32)
@@ -400,18 +390,18 @@ def _k_means(
     return labels
 
 
-def _coarser(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints32:
-    """Index of each patch's parent among at most `n_clusters`, numbered without gaps."""
+def _cluster(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints32:
+    """Return each patch's parent among at most `n_clusters`, numbered without gaps."""
     scale = n_clusters / float(patches.areas.sum())
-    joined = np.ascontiguousarray(np.concatenate([patches.means, patches.normals], axis=1).T)
-    labels = _k_means(joined, patches.areas, n_clusters, scale, p.normal_weight, p.iterations)
+    columns = np.ascontiguousarray(np.concatenate([patches.means, patches.normals], axis=1).T)
+    labels = _k_means(columns, patches.areas, n_clusters, scale, p.normal_weight, p.iterations)
     _, parents = np.unique(labels, return_inverse=True)
     numbered: Ints32 = parents.astype(np.int32)
     return numbered
 
 
 def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hierarchy:
-    """The levels {X_h}: every level is clustered from the finest patches.
+    """Return the levels {X_h}, each clustered from the finest patches.
 
     Parameters
     ----------
@@ -420,60 +410,44 @@ def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hiera
 
     Returns
     -------
-    hierarchy : `n_levels` levels, finest first; each holds 1 / factor of the patches of the
-        one before it, and never fewer than one
+    hierarchy : `n_levels` levels, finest first; each has 1 / factor of the patches of the level
+        before, at least one
     """
-    levels, labels = [patches_of(surface, finest)], [finest]
+    levels, labels = [extract_patches(surface, finest)], [finest]
     for h in range(1, p.n_levels):
         n_clusters = max(round(len(levels[0]) / p.factor**h), 1)
-        parents = _coarser(levels[0], n_clusters, p)
+        parents = _cluster(levels[0], n_clusters, p)
         coarse = np.where(finest >= 0, parents[finest], -1).astype(np.int32)
-        levels.append(patches_of(surface, coarse))
+        levels.append(extract_patches(surface, coarse))
         labels.append(coarse)
     return Hierarchy(tuple(levels), tuple(labels))
 
 
-# How much a patch has to say: size and flatness to a weight, and of two patches to a pair's.
-#
-#     Patches (P)  --patch_weights-->  (P,)
-#
-# The paper counts every pair once. Then where the segmentation happens to cut decides how much
-# a surface counts, and a chair's leg, whose one patch bends round it, counts like a square of
-# floor. Weighting by size makes the statistics depend on the surface rather than on its cuts;
-# weighting by coherence keeps normals that are means of unlike normals from being believed.
-
-
 @dataclass(frozen=True)
 class WeightParameters:
-    """The numbers of the weights; both 0 give the paper's equal pairs."""
+    """Parameters of patch weights; both 0 give the paper's equal pairs.
 
-    size_exponent: float = 0.5  #: of the share of the image that a patch covers
-    coherence_exponent: float = 20.0  #: of the length of the mean of its pixels' normals
+    The paper counts every pair once, so the weight of a surface depends on its segmentation, and a
+    patch bent round a chair's leg counts like a square of floor. Weighting by size makes the
+    statistics depend on the surface; weighting by coherence discounts means of unlike normals.
+    """
+
+    size_exponent: float = 0.5  #: exponent of the share of the image that a patch covers
+    coherence_exponent: float = 20.0  #: exponent of the length of its mean normal
 
 
 def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
-    """Weight of each patch; a pair weighs the product of its two.
-
-    Parameters
-    ----------
-    patches : P of them
-
-    Returns
-    -------
-    weights : (P,) positive, of mean 1
-    """
+    """Return the weights of patches, (P,) positive, of mean 1; pairs weigh their product."""
     weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
     result: Floats = weights / weights.mean()
     return result
 
 
-# Segmentation of clouds.
-
-#: Depth of a seed's cell, in its width: surfaces seen at a slant are one cell still.
+#: Ratio of depth to width of a seed's cell, so that slanted surfaces stay in one cell.
 _DEPTH = 4.0
-#: Least size of a patch, as a share of its seed's cell: seeds set wider end with no patch.
+#: Least size of a patch, as a share of its seed's cell: ends the search for a spacing.
 _LEAST = 1e-3
-#: Rounds of growth before centres move: a patch may grow by so many voxels.
+#: Rounds of growth, by a voxel each, between updates of the centres.
 _GROWTH = 2
 
 
@@ -481,7 +455,7 @@ _GROWTH = 2
 def _seed_cells(
     points: Floats32, axes: Floats, centre: Floats, unit: float, spacing: float, cells: Ints64
 ) -> None:
-    """Cell of each point: about a viewpoint of directions and range in `unit`; 0 for none."""
+    """Write the cell of each point: by direction and range in `unit`, or by position if 0."""
     for i in range(len(points)):
         px, py, pz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = axes[0, 0] * px + axes[0, 1] * py + axes[0, 2] * pz
@@ -496,11 +470,11 @@ def _seed_cells(
 
 
 @kernel
-def _centre_of(
+def _voxel_centres(
     points: Floats32, normals: Floats32, sides: Floats32, labels: Ints32, spacing: float,
     sums: Floats,
 ) -> None:  # fmt: skip
-    """Per label: mean point (3), unit mean normal (3), 1 / spacing^2 in metres; 0 where dead.
+    """Write per label: mean point (3), unit mean normal (3), 1 / spacing^2 in metres; 0 if dead.
 
     spacing: in sides of a voxel.
     """
@@ -530,7 +504,7 @@ def _grow(
     points: Floats32, normals: Floats32, offsets: Ints64, indices: Ints32, centres: Floats,
     normal_weight: float, labels: Ints32, out: Ints32,
 ) -> None:  # fmt: skip
-    """Give every voxel the nearest centre among its own and those of the voxels it touches."""
+    """Assign every voxel to the nearest centre among its own and those of the voxels it touches."""
     for i in range(len(labels)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -581,9 +555,9 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
     Parameters
     ----------
     seen : V voxels
-    spacing : of the seeds, in sides of a voxel
-    most : patches; seeds are set wider until there are no more
-    p : its iterations, weight of normals and limits of size
+    spacing : distance of the seeds, in sides of a voxel
+    most : maximum number of patches; more of them widen the spacing
+    p : parameters of iterations, weight of normals and limits of size
 
     Returns
     -------
@@ -596,14 +570,14 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
         seeds = _seeds(seen, spacing)
         n = int(np.count_nonzero(np.bincount(seeds) >= least))
         if n <= most:
-            labels, n = _grown(seen, seeds, spacing, least, p)
+            labels, n = _grow_patches(seen, seeds, spacing, least, p)
             if n <= most:
                 return labels[None]
-        spacing *= 1.03 * (n / most) ** 0.85  # patches on surfaces at a slant are long
+        spacing *= 1.03 * (n / most) ** 0.85  # above a square root: patches at a slant are long
 
 
 def _seeds(seen: Voxels, spacing: float) -> Ints32:
-    """The seed that each voxel begins with (V,): that of its cell in a grid."""
+    """Return the seed of each voxel (V,): the index of its cell in a grid."""
     side, unit = float(np.median(seen.sides)), 0.0
     if seen.cloud.has_viewpoint:
         at = seen.points[0] - seen.centre
@@ -615,15 +589,15 @@ def _seeds(seen: Voxels, spacing: float) -> Ints32:
     return first.astype(np.int32)
 
 
-def _grown(
+def _grow_patches(
     seen: Voxels, labels: Ints32, spacing: float, least: float, p: SegmentationParameters
 ) -> tuple[Ints32, int]:
-    """Labels (V,) of the patches grown from seeds so far apart, and how many there are."""
+    """Return the labels (V,) of the patches grown from seeds so far apart, and their number."""
     points, normals, links = seen.points[0], seen.normals[0], seen.links
     centres = np.zeros((int(labels.max(initial=-1)) + 1, 8))
     grown = labels.copy()
     for _ in range(p.iterations):
-        _centre_of(points, normals, seen.sides, labels, spacing, centres)
+        _voxel_centres(points, normals, seen.sides, labels, spacing, centres)
         for _ in range(_GROWTH):
             _grow(
                 points, normals, links.offsets, links.indices, centres, p.normal_weight,
