@@ -15,7 +15,7 @@ import numpy as np
 from sceneprint.errors import ModelMismatch
 from sceneprint.geometry.kernel import run_both
 from sceneprint.geometry.registration.alignment import are_scans
-from sceneprint.geometry.registration.overlap import thinned
+from sceneprint.geometry.registration.overlap import thin_points
 from sceneprint.geometry.registration.patch_descriptors import compress, patch_descriptors
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.retrieval.ranking import (
@@ -129,7 +129,7 @@ def _scan(cloud: Cloud, p: CloudParameters) -> Surface:
     points = spread_points(cloud, shown, p)
     # far surface is seen thinly, so that cubes are far narrower than if points lay evenly
     even = math.sqrt(float(points.areas.sum(dtype=float)) / SPREAD_POINTS)
-    return replace(shown, spread=thinned(points, SPREAD_POINTS, even / 12))
+    return replace(shown, spread=thin_points(points, SPREAD_POINTS, even / 12))
 
 
 def distance(a: Signature, b: Signature) -> int:

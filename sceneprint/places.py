@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sceneprint.geometry.registration.icp import error_of, transported
+from sceneprint.geometry.registration.icp import pose_error, transform_covariance
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.confidence import ConfidenceModel, PlaceEvidence
@@ -102,7 +102,7 @@ class PosePrior:
 
     def expects(self, T: Floats) -> bool:
         """Return whether a pose T_parent_query (4, 4) lies where it has 99.9 % of its mass."""
-        off = error_of(self.T, T)
+        off = pose_error(self.T, T)
         return float(off @ np.linalg.solve(self.covariance, off)) <= _CHI_SQUARE_6
 
 
@@ -295,7 +295,7 @@ def _votes(
                 continue
             covariance = v.covariance
             if covariance is not None:
-                covariance = transported(covariance, viewpoint[:3, :3], np.zeros(3))
+                covariance = transform_covariance(covariance, viewpoint[:3, :3], np.zeros(3))
             weight = 1.0 if v.strength == "strong" else p.weak
             T = viewpoint @ v.T_match_query @ inverse(frame.T)
             votes.append(_Vote(match, T, covariance, viewpoint, weight))

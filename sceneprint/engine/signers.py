@@ -11,7 +11,7 @@ import numpy as np
 
 from sceneprint.errors import Busy, FrameError
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.retrieval.ranking import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
 from sceneprint.geometry.validation.validation import ValidationParameters
@@ -129,7 +129,7 @@ def warm_signing(signer: Signer) -> bytes:
 
 def warm_validation(geometry: Geometry, p: ValidationParameters) -> bool:
     """Validate a corner against itself, and draw it; returns whether it was accepted."""
-    drawn = sampled(geometry.surface, 1)  # as a page asks for them
+    drawn = sample_points(geometry.surface, 1)  # as a page asks for them
     patches_at(drawn, geometry.patches)
     residuals(drawn, geometry.surface, np.eye(4), p.agreement)
     return validate(geometry, geometry, p=p).status == "accepted"

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableGeometry
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
-from sceneprint.geometry.registration.overlap import thinned
+from sceneprint.geometry.registration.overlap import thin_points
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, directions
 from sceneprint.types import (
     Bytes,
@@ -307,7 +307,7 @@ def write_geometry(geometry: Geometry) -> bytes:
     schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
     model, sizes = bytes.fromhex(geometry.model_id), (len(patches), geometry.descriptors.shape[1])
     if camera is None:
-        packed, corner, step = pack_points(thinned(geometry.surface, MAXIMUM_POINTS))
+        packed, corner, step = pack_points(thin_points(geometry.surface, MAXIMUM_POINTS))
         head = _CLOUD.pack(len(packed), 1, *sizes, _POINTS, 0, *corner, step, model)
         body = packed.astype("<u2").tobytes()
     else:

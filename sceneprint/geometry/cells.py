@@ -29,7 +29,7 @@ from sceneprint.geometry.registration.overlap import (
     VIOLATES,
     OverlapParameters,
     look_up,
-    looked_up,
+    overlap_target,
     tolerances,
 )
 from sceneprint.geometry.rigid import inverse
@@ -305,7 +305,7 @@ def frame_verdicts(
     rotation = np.eye(4)
     rotation[:3, :3] = T_parent_sensor[:3, :3]
     either_side = tolerances(replace(p, normal_cosine=-2.0))
-    verdicts[near] = look_up(source, looked_up(surface, p), inverse(rotation), either_side)
+    verdicts[near] = look_up(source, overlap_target(surface, p), inverse(rotation), either_side)
     return verdicts
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
-    explained,
+    plane_agreement,
     plane_view,
     plane_weights,
 )
@@ -174,7 +174,7 @@ def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too
     shifts = np.tile(np.eye(4), (6, 1, 1))
     shifts[:, :3, 3] = 0.3 * np.concatenate([np.eye(3), -np.eye(3)])
     voted = shifts @ T
-    seen = explained(*views, voted, overlap_p)
+    seen = plane_agreement(*views, voted, overlap_p)
     assert (seen.violations > P.refuted).any()
     none = np.empty((0, 4, 4))
     told = [

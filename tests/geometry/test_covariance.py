@@ -14,17 +14,17 @@ from scipy.stats import chi2
 from sceneprint.geometry.registration.icp import (
     FINE,
     CovarianceParameters,
-    Free,
-    Refined,
+    FreeDirection,
+    Refinement,
     adjoint,
-    error_of,
     free_directions,
     pair_covariance,
     place_covariance,
+    pose_error,
     refine,
-    transported,
+    transform_covariance,
 )
-from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of, validate
@@ -74,7 +74,7 @@ def votes_of(seed: int, index: int, model: Model) -> list[Vote]:
             v = validate(seen[i], seen[j])
             if v.T_match_query is None or v.covariance is None:
                 continue
-            error = error_of(v.T_match_query, inverse(poses[j]) @ poses[i])
+            error = pose_error(v.T_match_query, inverse(poses[j]) @ poses[i])
             found.append(Vote((index, i), error, v.covariance, poses[i], poses[j], v.T_match_query))
     return found
 
@@ -97,10 +97,10 @@ def places(votes: list[Vote]) -> list[float]:
     found = []
     for several in by_query.values():
         poses = np.array([one.T_world_match @ one.T_match_query for one in several])
-        own = [transported(one.covariance, one.T_world_match[:3, :3], np.zeros(3))
+        own = [transform_covariance(one.covariance, one.T_world_match[:3, :3], np.zeros(3))
                for one in several]  # fmt: skip
         average = average_poses(poses)
-        error = error_of(average.T, several[0].T_world_query)
+        error = pose_error(average.T, several[0].T_world_query)
         if average.support > 1 and near(error):
             found.append(square(error, place_covariance(average, poses, np.array(own))))
     return found
@@ -132,7 +132,9 @@ def test_an_error_is_what_was_put_there() -> None:
     T = posed(rng)
     for size in (0.0, 1e-12, 1e-6, 1e-2, 1.0):
         error = size * rng.normal(size=6)
-        np.testing.assert_allclose(error_of(T, with_error(T, error)), error, rtol=1e-6, atol=1e-15)
+        np.testing.assert_allclose(
+            pose_error(T, with_error(T, error)), error, rtol=1e-6, atol=1e-15
+        )
 
 
 def test_transport_against_monte_carlo() -> None:
@@ -141,14 +143,14 @@ def test_transport_against_monte_carlo() -> None:
     S = some_covariance(rng, 2e-3)
     errors = rng.multivariate_normal(np.zeros(6), S, 8_000)
     cases = (
-        (lambda A: before @ A, transported(S, before[:3, :3], np.zeros(3))),
-        (lambda A: A @ after, transported(S, np.eye(3), T[:3, :3] @ after[:3, 3])),
-        (inverse, transported(S, T[:3, :3].T, inverse(T)[:3, 3])),
+        (lambda A: before @ A, transform_covariance(S, before[:3, :3], np.zeros(3))),
+        (lambda A: A @ after, transform_covariance(S, np.eye(3), T[:3, :3] @ after[:3, 3])),
+        (inverse, transform_covariance(S, T[:3, :3].T, inverse(T)[:3, 3])),
     )
     some = [with_error(T, one) for one in errors]
     for told, expected in cases:
         there = told(T)
-        found = np.cov(np.array([error_of(there, told(one)) for one in some]).T)
+        found = np.cov(np.array([pose_error(there, told(one)) for one in some]).T)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         np.testing.assert_allclose(found / scale, expected / scale, atol=0.06)
 
@@ -171,7 +173,7 @@ def left_twist(T: Floats, true: Floats) -> Floats:
 def test_a_pairs_covariance_from_the_definition(lost: int | None) -> None:
     rng = np.random.default_rng(4)
     T, p = posed(rng), CovarianceParameters()
-    refined = [Refined(T, some_covariance(rng) + np.eye(6), 500, s) for s in (3e-5, 1e-5)]
+    refined = [Refinement(T, some_covariance(rng) + np.eye(6), 500, s) for s in (3e-5, 1e-5)]
     information, noise = np.zeros((6, 6)), []
     step = 1e-6
     for i, (one, told) in enumerate(zip(refined, (lambda A: A, np.linalg.inv), strict=True)):
@@ -203,7 +205,7 @@ def test_no_refinement_no_covariance() -> None:
 
 def of_itself(surface: Surface) -> tuple[Floats, Floats]:
     """Covariance of a surface laid on itself, and points all over it."""
-    points = sampled(surface, FINE.stride)
+    points = sample_points(surface, FINE.stride)
     one = refine(points, surface, np.eye(4), FINE)
     S = pair_covariance(one, one, np.eye(4))
     assert S is not None
@@ -221,7 +223,7 @@ def planes(
     return surface
 
 
-def displaced(free: Free, points: Floats) -> Floats:
+def displaced(free: FreeDirection, points: Floats) -> Floats:
     """How far the error moves each point along its normal, per unit of it."""
     moved = free.translation + np.cross(free.rotation, points[:, :3])
     result: Floats = np.abs((moved * points[:, 3:]).sum(axis=1))

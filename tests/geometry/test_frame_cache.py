@@ -12,9 +12,9 @@ from sceneprint.geometry.kernel import cached_per_frame
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,
-    looked_up,
+    overlap_target,
     plane_view,
-    sampled,
+    sample_points,
 )
 from sceneprint.geometry.validation.acceptance import AmbiguityParameters, symmetries
 from sceneprint.pipeline import open_signer, prepare
@@ -51,8 +51,8 @@ def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames: tuple[DepthFram
     """No result may hold the frame that it is kept with."""
     geometry = prepare(room_frames[0], open_signer("depth"))[1]
     made = (
-        sampled(geometry.surface, 5),
-        looked_up(geometry.surface, OverlapParameters()).points,
+        sample_points(geometry.surface, 5),
+        overlap_target(geometry.surface, OverlapParameters()).points,
         plane_view(geometry, PlaneParameters()).weights,
         symmetries(geometry.patches, AmbiguityParameters()),
     )
@@ -60,8 +60,8 @@ def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames: tuple[DepthFram
     for one, other in zip(
         made,
         (
-            sampled(again.surface, 5),
-            looked_up(again.surface, OverlapParameters()).points,
+            sample_points(again.surface, 5),
+            overlap_target(again.surface, OverlapParameters()).points,
             plane_view(again, PlaneParameters()).weights,
             symmetries(again.patches, AmbiguityParameters()),
         ),

@@ -11,7 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint import types
 from sceneprint.geometry.registration import overlap as module
-from sceneprint.geometry.registration.overlap import OverlapParameters, overlap_counts, sampled
+from sceneprint.geometry.registration.overlap import (
+    OverlapParameters,
+    overlap_counts,
+    sample_points,
+)
 from sceneprint.geometry.surface import camera
 from sceneprint.types import Floats, Floats32, Surface
 
@@ -61,7 +65,7 @@ def test_equals_the_oracle(scenes: ModuleType) -> None:
     corner, _ = scenes.corner()
     corner.points[10:20, 30:50] = corner.normals[10:20, 30:50] = 0.0
     corner.valid[10:20, 30:50] = False
-    source = sampled(corner, 3)
+    source = sample_points(corner, 3)
     inliers, violations = 0, 0
     for k in range(40):
         T = np.eye(4)
@@ -77,14 +81,14 @@ def test_equals_the_oracle(scenes: ModuleType) -> None:
 
 def test_a_surface_agrees_with_itself(scenes: ModuleType) -> None:
     corner, _ = scenes.corner()
-    found = overlap_counts(sampled(corner, 2), corner, np.eye(4), P)
+    found = overlap_counts(sample_points(corner, 2), corner, np.eye(4), P)
     assert (found.inliers, found.violations) == (found.points, 0) == (1200, 0)
 
 
 def test_moving_into_and_out_of_the_room(scenes: ModuleType) -> None:
     # 30 cm into the walls nothing is violated; as far off them nearly all of it
     corner, _ = scenes.corner()
-    source = sampled(corner, 2)
+    source = sample_points(corner, 2)
     shift = np.eye(4)
     shift[2, 3] = 0.3
     behind = overlap_counts(source, corner, shift, P)
@@ -99,7 +103,7 @@ def test_moving_into_and_out_of_the_room(scenes: ModuleType) -> None:
 @pytest.mark.parametrize("stride", [1, 2, 3, 5, 60, 200])
 def test_sampling_takes_the_middle_of_each_cell(scenes: ModuleType, stride: int) -> None:
     corner, _ = scenes.corner()
-    rows = sampled(corner, stride)
+    rows = sample_points(corner, stride)
     assert rows.flags["C_CONTIGUOUS"]
     wanted = corner.points[stride // 2 :: stride, stride // 2 :: stride].reshape(-1, 3)
     np.testing.assert_array_equal(rows[:, :3], wanted)
@@ -110,7 +114,7 @@ def test_nothing_to_compare(scenes: ModuleType) -> None:
     corner, _ = scenes.corner()
     none = overlap_counts(np.empty((0, 6), np.float32), corner, np.eye(4), P)
     assert (none.points, none.inliers, none.violations) == (0, 0, 0)
-    source = sampled(corner, 5)
+    source = sample_points(corner, 5)
     corner.points[:] = 0.0
     unseen = overlap_counts(source, corner, np.eye(4), P)
     assert (unseen.points, unseen.inliers, unseen.violations) == (192, 0, 0)

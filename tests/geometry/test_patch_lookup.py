@@ -6,7 +6,7 @@ from types import ModuleType
 
 import numpy as np
 
-from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.signature.segmentation import (
     SegmentationParameters,
     extract_patches,
@@ -42,7 +42,7 @@ def test_it_is_the_nearest_that_fits() -> None:
 def test_it_is_nearly_the_segmentation(scenes: ModuleType) -> None:
     seen, _ = scenes.corner()
     labels = segment(seen, SegmentationParameters())
-    found = patches_at(sampled(seen, 1), extract_patches(seen, labels))
+    found = patches_at(sample_points(seen, 1), extract_patches(seen, labels))
     truth = labels[seen.valid]
     told = truth >= 0
     assert told.any()

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
-    _lifts,
+    _height_offsets,
+    dominant_up,
+    draw_plan,
     other_plans,
     plan_hypotheses,
-    plan_of,
-    up_of,
 )
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import inverse, pose_difference, select_distinct, transform_points
@@ -85,34 +85,34 @@ def nearest(found: Floats, true: Floats) -> tuple[float, float, int]:
 def test_up_is_what_floors_face_and_walls_stand_across(pitch: float, roll: float) -> None:
     T = pose(5, 4, 1, 30, pitch, roll)
     surface = seen_from(T)
-    up = up_of(surface.normals[0].astype(float), np.array([0.0, 0, 1]), P.tilt)
+    up = dominant_up(surface.normals[0].astype(float), np.array([0.0, 0, 1]), P.tilt)
     assert up @ T[2, :3] == pytest.approx(1.0, abs=1e-6)  # the third row: world z in the sensor
 
 
 def test_without_a_normal_near_the_axis_up_is_the_axis() -> None:
     walls = np.tile([1.0, 0.0, 0.0], (50, 1))
-    assert up_of(walls, np.array([0.0, 0, 1]), math.radians(50)).tolist() == [0, 0, 1]
+    assert dominant_up(walls, np.array([0.0, 0, 1]), math.radians(50)).tolist() == [0, 0, 1]
 
 
 def test_a_known_up_is_taken_as_it_is() -> None:
     T = pose(5, 4, 1, 30, 20, 0)
     up = np.array([0.0, 0.6, 0.8])
-    plan = plan_of(seen_from(T), P, up=up)
+    plan = draw_plan(seen_from(T), P, up=up)
     np.testing.assert_allclose(plan.R[2], up)
     np.testing.assert_allclose(plan.R @ plan.R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(plan.R) == pytest.approx(1.0)
 
 
 def test_heights_lay_floor_on_floor() -> None:
-    low, high = (plan_of(seen_from(pose(5, 4, z, 0)), P) for z in (1.0, 2.5))
-    assert _lifts(high, low, P)[0] == pytest.approx(1.5)
-    assert _lifts(low, high, P)[0] == pytest.approx(-1.5)
+    low, high = (draw_plan(seen_from(pose(5, 4, z, 0)), P) for z in (1.0, 2.5))
+    assert _height_offsets(high, low, P)[0] == pytest.approx(1.5)
+    assert _height_offsets(low, high, P)[0] == pytest.approx(-1.5)
 
 
 @pytest.mark.parametrize("yaw", [3, 90, 178])
 def test_the_true_transform_is_proposed(yaw: float) -> None:
     source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
-    a, b = plan_of(seen_from(source), P), plan_of(seen_from(target), P)
+    a, b = draw_plan(seen_from(source), P), draw_plan(seen_from(target), P)
     found = plan_hypotheses([(a, b)], P)
     metres, degrees, rank = nearest(found, inverse(target) @ source)
     # half a cell, half a yaw (2.5 degrees, on a lever of some metres), half a step of height
@@ -126,7 +126,7 @@ def test_a_scanner_on_its_side_is_found_by_the_other_axes() -> None:
     source, target = pose(4, 5, 1.2, 12, 0, 90), pose(10, 3, 2.0, 40)
     surfaces = seen_from(source), seen_from(target)
     true = inverse(target) @ source
-    upright = [(plan_of(surfaces[0], P), plan_of(surfaces[1], P))]
+    upright = [(draw_plan(surfaces[0], P), draw_plan(surfaces[1], P))]
     assert nearest(plan_hypotheses(upright, P), true)[1] > 30
     found = plan_hypotheses(other_plans(*surfaces, P), P)
     metres, degrees, _ = nearest(found, true)
@@ -138,7 +138,7 @@ def test_the_axis_of_a_range_image_is_its_pole() -> None:
     surface = seen_from(pose(4, 5, 1.2, 0, 0, 90))
     sphere = Sphere(60, 16, 0.1, -math.pi, 0.5, pole=1)
     on_its_side = replace(surface, camera=sphere)
-    up = plan_of(on_its_side, P).R[2]
+    up = draw_plan(on_its_side, P).R[2]
     np.testing.assert_allclose(up, [0, 1, 0], atol=1e-6)
 
 

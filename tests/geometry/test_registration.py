@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration import icp as module
 from sceneprint.geometry.registration.icp import COARSE, FINE, RefinementParameters, refine
-from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.rigid import pose_difference
 from sceneprint.models import Model
 from sceneprint.signing import see
@@ -77,7 +77,7 @@ def test_one_step_equals_the_oracle(scenes: ModuleType) -> None:
     rng = np.random.default_rng(0)
     corner, _ = scenes.corner()
     p = RefinementParameters(3, 1, 0.1, 0.1)
-    source = sampled(corner, p.stride)
+    source = sample_points(corner, p.stride)
     for _ in range(5):
         T = off(rng, 0.04, 1.5)
         information, step, points = step_oracle(source, corner, T, p)
@@ -94,7 +94,7 @@ def test_one_step_equals_the_oracle(scenes: ModuleType) -> None:
 def test_an_exact_corner_is_found_exactly(scenes: ModuleType) -> None:
     rng = np.random.default_rng(1)
     corner, _ = scenes.corner()
-    source = sampled(corner, 2)
+    source = sample_points(corner, 2)
     for _ in range(5):
         start = off(rng, 0.05, 3.0)
         before = start.copy()
@@ -110,7 +110,7 @@ def test_an_exact_corner_is_found_exactly(scenes: ModuleType) -> None:
 
 def test_a_room_is_found_to_a_millimetre(room_surface: Surface) -> None:
     rng = np.random.default_rng(2)
-    source = sampled(room_surface, FINE.stride)
+    source = sample_points(room_surface, FINE.stride)
     for _ in range(5):
         coarse = refine(source, room_surface, off(rng, 0.05, 3.0), COARSE)
         assert coarse is not None
@@ -124,7 +124,7 @@ def test_a_room_is_found_to_a_millimetre(room_surface: Surface) -> None:
 
 def test_information_is_symmetric_and_positive(room_surface: Surface, scenes: ModuleType) -> None:
     for surface in (room_surface, scenes.corner()[0]):
-        found = refine(sampled(surface, 2), surface, np.eye(4), FINE)
+        found = refine(sample_points(surface, 2), surface, np.eye(4), FINE)
         assert found is not None
         np.testing.assert_array_equal(found.information, found.information.T)
         values = np.linalg.eigvalsh(found.information)
@@ -137,7 +137,7 @@ def test_a_plane_leaves_three_directions_free(scenes: ModuleType) -> None:
     q = scenes.plane(scenes.CAMERA, towards, np.array([0.0, 0.0, 2.0]))
     wall = scenes.lifted(scenes.CAMERA, q, np.broadcast_to(towards, (60, 80, 3)))
     start = off(np.random.default_rng(3), 0.02, 1.0)
-    found = refine(sampled(wall, 2), wall, start, FINE)
+    found = refine(sample_points(wall, 2), wall, start, FINE)
     assert found is not None
     values = np.linalg.eigvalsh(found.information)
     assert np.abs(values[:3]).max() < 1e-9 * values[-1]
@@ -151,7 +151,7 @@ def test_a_plane_leaves_three_directions_free(scenes: ModuleType) -> None:
 
 def test_what_does_not_overlap_is_not_refined(scenes: ModuleType) -> None:
     corner, _ = scenes.corner()
-    source = sampled(corner, 2)
+    source = sample_points(corner, 2)
     far, behind = np.eye(4), np.diag([-1.0, 1, -1, 1])
     far[2, 3] = 5.0
     blank = replace(corner, points=np.zeros_like(corner.points))
@@ -173,7 +173,7 @@ def test_far_points_weigh_less(scenes: ModuleType) -> None:
     other = replace(walls, points=walls.points.copy())
     other.points[:, 40:, 2] += 0.04
     p = RefinementParameters(2, 1, 0.1, 0.1)
-    source = sampled(walls, 2)
+    source = sample_points(walls, 2)
     source[:, :2] = 0.0  # all on the optical axis: no turn, only a shift
     found = refine(source, other, np.eye(4), p)
     assert found is not None

@@ -12,8 +12,8 @@ import pytest
 from sceneprint.geometry.registration.alignment import AlignmentParameters
 from sceneprint.geometry.registration.sequence_alignment import (
     SequenceParameters,
-    _cyclic,
-    coarse,
+    _cyclic_cost,
+    coarse_patches,
     neighbour_sequences,
     sequence_correspondences,
 )
@@ -65,7 +65,7 @@ def alignment_cost(a: Floats, b: Floats, p: SequenceParameters) -> float:
     """Share of the cost of leaving all of one out and inserting all of the other: 0 alike."""
     m, n = len(a), len(b)
     costs, rows = np.empty((max(m, 1), max(n, 1))), np.empty((3, n + 1))
-    cost = _cyclic(
+    cost = _cyclic_cost(
         np.ascontiguousarray(a, float), m, np.ascontiguousarray(b, float), n,
         p.length_scale, p.angle_scale, p.gap_cost, p.swap_cost, 1.0, costs, rows,
     )  # fmt: skip
@@ -171,7 +171,7 @@ def test_rigid_motion_changes_nothing() -> None:
     patches = scattered(30, 80)
     for seed in range(3):
         other = carried(patches, motion(seed))
-        own, theirs = coarse(patches, P), coarse(other, P)
+        own, theirs = coarse_patches(patches, P), coarse_patches(other, P)
         np.testing.assert_allclose(
             transform_points(motion(seed), own.means), theirs.means, atol=1e-9
         )
@@ -197,12 +197,12 @@ def test_coarse_patches_by_hand() -> None:
     areas = np.array([3.0, 1.0, 1.0, 1.0, 0.5])
     some = patches_at(means, np.tile([0.0, 0.0, 1.0], (5, 1)), areas)
     # the largest, the farthest from it, the farthest from both
-    found = coarse(some, replace(P, n_coarse=3))
+    found = coarse_patches(some, replace(P, n_coarse=3))
     expected = np.array([[0.025, 0.0, 0.0], [0.0, 3.0, 0.0], [2.1, 0.0, 0.0]])
     np.testing.assert_allclose(found.means, expected, atol=1e-12)
     np.testing.assert_array_equal(found.areas, [4.0, 0.5, 2.0])
     np.testing.assert_array_equal(found.sizes, [100, 50, 100])
-    assert len(coarse(some, P)) == 5
+    assert len(coarse_patches(some, P)) == 5
 
 
 def test_known_correspondences_are_found() -> None:
@@ -236,7 +236,7 @@ def test_golden() -> None:
     # which are the nearest of all, without the bounds that spare most of the alignments
     of_source, of_target = (
         [one.symbols[i, : one.lengths[i]] for i in range(50)]
-        for one in (neighbour_sequences(a, coarse(a, p), p) for a in (source, target))
+        for one in (neighbour_sequences(a, coarse_patches(a, p), p) for a in (source, target))
     )
     for own in nearest:
         cost = [alignment_cost(of_source[own[0]], one, p) for one in of_target]

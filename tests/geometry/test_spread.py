@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.registration.overlap import one_of_each, sampled, thinned
-from sceneprint.geometry.registration.plan_search import PlanParameters, plan_of
+from sceneprint.geometry.registration.overlap import first_per_cube, sample_points, thin_points
+from sceneprint.geometry.registration.plan_search import PlanParameters, draw_plan
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
 from sceneprint.geometry.validation.validation import refined_at
@@ -104,17 +104,17 @@ def test_as_many_are_counted_as_of_a_depth_image(lidar: Model) -> None:
     surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
     assert surface.spread is not None
     n = surface.spread.points.shape[1]
-    assert len(sampled(surface, 5)) == pytest.approx(n / round(25 * n / 19_200), abs=1)
-    assert len(sampled(surface, 2)) == pytest.approx(n / 2, abs=1)
-    assert len(sampled(surface, 1)) == int(surface.valid.sum())
-    assert len(thinned(surface.spread, 100, 1.0).points[0]) <= 100
+    assert len(sample_points(surface, 5)) == pytest.approx(n / round(25 * n / 19_200), abs=1)
+    assert len(sample_points(surface, 2)) == pytest.approx(n / 2, abs=1)
+    assert len(sample_points(surface, 1)) == int(surface.valid.sum())
+    assert len(thin_points(surface.spread, 100, 1.0).points[0]) <= 100
 
 
 def test_plans_are_of_the_points(lidar: Model) -> None:
     surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
-    plan = plan_of(surface, PlanParameters(cell=0.5, voxel=0.4))
+    plan = draw_plan(surface, PlanParameters(cell=0.5, voxel=0.4))
     assert surface.spread is not None
-    alone = plan_of(surface.spread, PlanParameters(cell=0.5, voxel=0.4))
+    alone = draw_plan(surface.spread, PlanParameters(cell=0.5, voxel=0.4))
     np.testing.assert_array_equal(plan.points, alone.points)
 
 
@@ -145,6 +145,6 @@ def test_the_first_point_in_each_cube_is_kept(at: float) -> None:
     for cube in (0.25, 0.31, 40.0):
         cells = np.floor(points / np.float32(cube)).astype(np.int64)
         _, first = np.unique(cells, axis=0, return_index=True)
-        assert one_of_each(points, cube).tolist() == sorted(first.tolist())
-    assert one_of_each(points[:0], 1.0).tolist() == []
-    assert one_of_each(points, 40.0).dtype == np.int32
+        assert first_per_cube(points, cube).tolist() == sorted(first.tolist())
+    assert first_per_cube(points[:0], 1.0).tolist() == []
+    assert first_per_cube(points, 40.0).dtype == np.int32

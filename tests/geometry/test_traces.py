@@ -8,7 +8,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sceneprint.geometry.registration.overlap import OverlapParameters, overlap_counts, sampled
+from sceneprint.geometry.registration.overlap import (
+    OverlapParameters,
+    overlap_counts,
+    sample_points,
+)
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.inspection import (
     AGREES,
@@ -58,7 +62,7 @@ def framed(surface: Surface, of: Patches) -> Geometry:
 @pytest.mark.parametrize("T", [shifted(), shifted(0.04, 0.03), shifted(0.3, -0.3), shifted(z=9.0)])
 def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -> None:
     seen, _ = scenes.corner()
-    points = sampled(seen, P.stride)
+    points = sample_points(seen, P.stride)
     counts, verdicts = overlap_counts(points, seen, T, P), judged(points, seen, T, P)
     assert (verdicts == AGREES).sum() == counts.inliers
     assert (verdicts == VIOLATES).sum() == counts.violations
@@ -69,14 +73,14 @@ def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -
 
 def test_a_wall_before_a_wall(scenes: ModuleType) -> None:
     near, far = wall(scenes, 1.5), wall(scenes, 2.0)
-    assert set(judged(sampled(near, 3), far, shifted(), P).tolist()) == {VIOLATES}
-    assert set(judged(sampled(far, 3), near, shifted(), P).tolist()) == {NEITHER}
+    assert set(judged(sample_points(near, 3), far, shifted(), P).tolist()) == {VIOLATES}
+    assert set(judged(sample_points(far, 3), near, shifted(), P).tolist()) == {NEITHER}
 
 
 @pytest.mark.parametrize("tolerance", [0.05, 0.12])
 def test_residuals_by_hand(scenes: ModuleType, tolerance: float) -> None:
     seen, p = wall(scenes, 2.0), OverlapParameters(stride=3, surface_tolerance=tolerance)
-    points = sampled(seen, 3)
+    points = sample_points(seen, 3)
     ahead = int(np.hypot(points[:, 0], points[:, 1]).argmin())
     # half a step off a whole one, as a share of the tolerance, and where nothing agrees
     for share, step in ((0.0, 1), (0.5, 1), (1.5, 2), (49.5, 50), (-50.5, 51), (249.5, 250)):
@@ -88,7 +92,7 @@ def test_residuals_by_hand(scenes: ModuleType, tolerance: float) -> None:
 
 def test_residuals_agree_with_verdicts(scenes: ModuleType) -> None:
     seen, _ = scenes.corner()
-    points, T = sampled(seen, 2), shifted(0.04, 0.03)
+    points, T = sample_points(seen, 2), shifted(0.04, 0.03)
     told, verdicts = residuals(points, seen, T, P), judged(points, seen, T, P)
     assert ((told <= TOLERANCE) == (verdicts == AGREES)).all()
     assert ((told == VIOLATION) == (verdicts == VIOLATES)).all()

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from sceneprint import pipeline
 from sceneprint.errors import ModelMismatch
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.registration.alignment import Alignment, align, samples_of
-from sceneprint.geometry.registration.overlap import explained, overlap_counts, sampled
+from sceneprint.geometry.registration.alignment import Alignment, align, frame_samples
+from sceneprint.geometry.registration.overlap import overlap_counts, plane_agreement, sample_points
 from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.validation.validation import (
@@ -340,9 +340,11 @@ def test_what_is_told_is_counted_under_the_transform_told(
         v = sane(validate(query, match))
         if v.T_match_query is None:
             continue
-        a = overlap_counts(sampled(query.surface, 5), match.surface, v.T_match_query, p.agreement)
+        a = overlap_counts(
+            sample_points(query.surface, 5), match.surface, v.T_match_query, p.agreement
+        )
         back = inverse(v.T_match_query)
-        b = overlap_counts(sampled(match.surface, 5), query.surface, back, p.agreement)
+        b = overlap_counts(sample_points(match.surface, 5), query.surface, back, p.agreement)
         inliers, violations = a.inliers + b.inliers, a.violations + b.violations
         assert v.inliers == inliers
         assert v.overlap == inliers / (a.points + b.points)
@@ -356,7 +358,7 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]
     p, apart, met = ValidationParameters(), 0, 0
     couples = [(rooms[0][i][1], rooms[room][j][1]) for room in (0, 1) for i, j in ((0, 1), (3, 0))]
     for query, match in couples:
-        a, b = (samples_of(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
+        a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
         there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
         back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
         assert there is not None
@@ -371,7 +373,7 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]
             assert found.T_other is None
             continue
         apart += 1
-        seen = explained(a.planes, b.planes, told, p.agreement)
+        seen = plane_agreement(a.planes, b.planes, told, p.agreement)
         best = int(np.argmax(seen.share - seen.violations))
         np.testing.assert_array_equal(found.T_match_query, told[best])
         # the other one is not lost
@@ -396,7 +398,7 @@ def test_what_one_search_alone_finds_is_judged_by_the_evidence(
 ) -> None:
     p, accepted = ValidationParameters(), 0
     for query, match, T in pairs:
-        a, b = (samples_of(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
+        a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
         there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
         back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
         assert there is not None
@@ -433,7 +435,7 @@ def test_of_two_places_that_both_explain_the_frames_neither_is_believed(model: M
     for turn in (0.4, 0.4 + math.pi / 2):
         T = looking((2.2 * math.sin(turn), -2.2 * math.cos(turn), 1.3), (0.0, 0.0, 0.3))
         seen.append(geometry(model, take(scene, T, KINECT, rng)))
-    a, b = (samples_of(one, p.agreement.stride, p.rivals.planes) for one in seen)
+    a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in seen)
     v = validate(*seen)
     assert v.T_rival is not None
     there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)

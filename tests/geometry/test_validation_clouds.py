@@ -16,8 +16,8 @@ from sceneprint.geometry.registration.icp import FINE, refine
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     agreements,
-    looked_up,
-    sampled,
+    overlap_target,
+    sample_points,
 )
 from sceneprint.geometry.rigid import inverse, pose_difference, transform_points
 from sceneprint.geometry.validation.acceptance import (
@@ -224,12 +224,12 @@ def test_what_is_found_by_place_does_not_depend_on_a_secret(
 ) -> None:
     """Which points share a slot of the hash nobody can know: else a cloud could make it slow."""
     query, match = fused[0]
-    points, made = sampled(query.surface, 5), []
+    points, made = sample_points(query.surface, 5), []
     for secret in (0, 2**51 + 12345):
         monkeypatch.setattr("secrets.randbits", lambda _, secret=secret: secret)
         p = OverlapParameters()
         surface = replace(match.surface)  # what is known of the other was made with its secret
-        target = looked_up(surface, p)
+        target = overlap_target(surface, p)
         refined = refine(points, surface, np.eye(4), FINE)
         assert refined is not None
         inliers = agreements(points, surface, refined.T[None], p)[0, 0]

@@ -157,7 +157,7 @@ def check_targets(module: ModuleType) -> None:
     points = rng.uniform(-1, 1, (300, 3))
     normals = np.where(rng.random((300, 1)) < 0.5, [0, 0, 1.0], [0, 0.8, 0.6])
     whole = in_no_order(points, normals)
-    t = module.target_of(whole, 0.1, 0.4)
+    t = module.lookup_target(whole, 0.1, 0.4)
     # the first in each small cube, here of 8 cm, in the order given
     small = np.floor(whole.points[0] / 0.08)
     first = [i for i in range(300) if not (small[:i] == small[i]).all(axis=1).any()]
@@ -182,18 +182,18 @@ def check_targets(module: ModuleType) -> None:
     # of two as far off the first, whichever is walked to first
     for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
         pair = np.array([[0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0]])[order]
-        t = module.target_of(in_no_order(pair, np.tile([0, 0, 1.0], (3, 1))), 0.1, 0.4)
+        t = module.lookup_target(in_no_order(pair, np.tile([0, 0, 1.0], (3, 1))), 0.1, 0.4)
         found = module.nearest_alike(
             t.points, t.normals, t.camera, t.heads, t.chain, np.zeros(3), np.array([0, 0, 1.0]), 0.7
         )
         assert found == (0, 0.0625)
     # a pinhole's and a sphere's maps are looked up as they are
     for seen in (wall(2.0), ball(2.0)):
-        t = module.target_of(seen, 0.1, 0.4)
+        t = module.lookup_target(seen, 0.1, 0.4)
         assert t.points is seen.points
         assert len(t.heads) == len(t.chain) == 0
     # at most so many, spread over all that is shown
-    few = module.thinned(whole, 50)
+    few = module.thin_points(whole, 50)
     assert 25 < few.valid.sum() <= 50
     assert few.camera is None
     gap = np.linalg.norm(whole.points[0][:, None] - few.points[0], axis=2)
@@ -201,9 +201,9 @@ def check_targets(module: ModuleType) -> None:
     where = gap.argmin(axis=0)
     np.testing.assert_array_equal(whole.points[0, where], few.points[0])
     np.testing.assert_array_equal(whole.normals[0, where], few.normals[0])
-    same = module.thinned(whole, 300)
+    same = module.thin_points(whole, 300)
     np.testing.assert_array_equal(same.points, whole.points)
-    assert module.thinned(in_no_order(np.ones((9, 3)), np.ones((9, 3))), 4).points.shape == (
+    assert module.thin_points(in_no_order(np.ones((9, 3)), np.ones((9, 3))), 4).points.shape == (
         1,
         1,
         3,
@@ -278,14 +278,17 @@ def check_agreement_of_clouds(module: ModuleType) -> None:
     weights = np.array([0.5, 0.25, 4.0], np.float32)
     assert module.agreements(both, floor, np.eye(4)[None], p, weights).tolist() == [[0.75, 0.0]]
     # of a thousand points in one place one is kept
-    assert len(module.looked_up(in_no_order(np.zeros((1000, 3)), np.ones((1000, 3))), p).chain) == 1
+    assert (
+        len(module.overlap_target(in_no_order(np.zeros((1000, 3)), np.ones((1000, 3))), p).chain)
+        == 1
+    )
     # of points in no order as many are taken as of pixels: one of 25
-    assert len(module.sampled(floor, 5)) == 18
+    assert len(module.sample_points(floor, 5)) == 18
     # of a sphere of four times as many pixels as a depth image every tenth row and column
     large = Sphere(480, 160, 0.01, 0.0, 1.0)
-    assert module.sampled(ball(2.0, large), 5).shape == (48 * 16, 6)
-    assert module.sampled(whole, 5).shape == (7 * 3, 6)
-    assert len(module.sampled(ball(2.0, large), 1)) == 480 * 160
+    assert module.sample_points(ball(2.0, large), 5).shape == (48 * 16, 6)
+    assert module.sample_points(whole, 5).shape == (7 * 3, 6)
+    assert len(module.sample_points(ball(2.0, large), 1)) == 480 * 160
 
 
 def check_agreement(module: ModuleType) -> None:
@@ -382,12 +385,12 @@ def check_agreement(module: ModuleType) -> None:
 def check_sampling(module: ModuleType) -> None:
     seen = wall(np.arange(31 * 41).reshape(31, 41) + 1.0)
     seen.valid[7, 12] = False
-    rows = module.sampled(seen, 5)  # the middle of every full five
+    rows = module.sample_points(seen, 5)  # the middle of every full five
     assert (rows.shape, rows.dtype) == ((6 * 8 - 1, 6), np.float32)
     z = [y * 41 + x + 1 for y in range(2, 31, 5) for x in range(2, 41, 5) if (y, x) != (7, 12)]
     assert rows[:, 2].tolist() == z
     np.testing.assert_array_equal(rows[:, 3:], np.broadcast_to(TOWARDS, (47, 3)))
-    assert len(module.sampled(seen, 1)) == 31 * 41 - 1
+    assert len(module.sample_points(seen, 1)) == 31 * 41 - 1
 
 
 def check_registration(module: ModuleType) -> None:

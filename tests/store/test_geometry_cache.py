@@ -9,7 +9,7 @@ import pytest
 
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.pipeline import Signer, prepare
 from sceneprint.store import GeometryCache
 from sceneprint.store.blobs.folder import FolderBlobs
@@ -30,9 +30,9 @@ def test_what_is_read_again_is_the_same_object_with_what_was_worked_out_of_it(bl
     cache, digest = GeometryCache(blobs, 1 << 30), blobs.put(artifacts[0])
     first = cache.read(digest)
     assert write_geometry(first) == artifacts[0]
-    points = sampled(first.surface, 4)
+    points = sample_points(first.surface, 4)
     assert cache.read(digest) is first
-    assert sampled(cache.read(digest).surface, 4) is points
+    assert sample_points(cache.read(digest).surface, 4) is points
 
 
 def test_the_least_recently_used_goes_first_and_memory_stays_within_its_bound(blobs, artifacts):

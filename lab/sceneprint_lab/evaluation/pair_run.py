@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sceneprint.errors import DatasetError
 from sceneprint.fusion import open3d
 from sceneprint.geometry.registration.alignment import AlignmentParameters
-from sceneprint.geometry.registration.icp import refined_all
+from sceneprint.geometry.registration.icp import refine_all
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.signature.pair_features import PropertyParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
@@ -456,7 +456,7 @@ def refined_by_us(
     query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
 ) -> Floats | None:
     """Return our refinement of another's transform, with wide gates first as for our hypotheses."""
-    coarse = refined_all(query.surface, match.surface, T[None], p.coarse)
+    coarse = refine_all(query.surface, match.surface, T[None], p.coarse)
     return refined_at(query, match, coarse[0] if len(coarse) else T, p.fine)
 
 

@@ -31,7 +31,7 @@ from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, write_ply
 from sceneprint.geometry.registration.icp import PAIR_METHOD
-from sceneprint.geometry.registration.overlap import sampled
+from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.retrieval.ranking import pairwise_distances, similarity
 from sceneprint.geometry.rigid import NO_UPS, Ups, inverse, transform_points
 from sceneprint.geometry.validation.inspection import (
@@ -535,7 +535,7 @@ class PointClouds:
 
 def _some(geometry: Geometry, limit: int) -> tuple[Floats32, int]:
     """Points and normals (N, 6), at most so many, and of how many."""
-    every = sampled(geometry.surface, 1)
+    every = sample_points(geometry.surface, 1)
     return np.ascontiguousarray(every[thinned(len(every), limit)]), len(every)
 
 

@@ -19,7 +19,7 @@ from sceneprint.engine.search.retrieval import Deadline, Searched, SearchedMap
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
-from sceneprint.geometry.registration.icp import transported
+from sceneprint.geometry.registration.icp import transform_covariance
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
 from sceneprint.geometry.validation.map_verification import (
@@ -254,7 +254,7 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
         joined = find_joins(connection, row.number).get(name)
         if joined is not None:  # the map's poses are in its root
             name, T = joined.root, joined.T @ T
-            covariance = transported(covariance, joined.T[:3, :3], np.zeros(3))
+            covariance = transform_covariance(covariance, joined.T[:3, :3], np.zeros(3))
         if not has_parent_frame(connection, row.number, name):
             raise InvalidRequest(
                 f"No frame of map {row.name!r} has a pose in the parent frame {name!r} of the "

@@ -1,1 +1,1 @@
-"""Two frames to a transform: correspondences, hypotheses, refinement, overlap."""
+"""Register two frames: correspondences, hypotheses, refinement, overlap."""

@@ -1,25 +1,23 @@
-"""Sec. III-E, search: two frames to the transform that explains them best, and to others.
+"""Search for the transform that best explains two frames, and for alternatives (Sec. III-E).
 
     correspondences (M)  --consensus-->  transforms (S, 4, 4), best supported first
-    Geometry, Geometry  --align-->  Alignment               of one direction alone
-    Geometry, Geometry  --align_scans-->  two Alignments    of scans, from one search
+    Geometry, Geometry  --align-->  Alignment               one direction
+    Geometry, Geometry  --align_scans-->  two Alignments    scans, one search for both directions
     Geometry, Geometry, T  --align_guided-->  Alignment     without a search, from a known transform
 
-Two correspondences are compatible when a rigid motion could carry both: their patches lie as far
-apart, at the same heights over each other's planes, at the same angle, and turn the same way
-round. A seed correspondence and those compatible with it that are also compatible with each other
-(second-order compatibility: Chen et al., SC2-PCR, CVPR 2022) give one transform, refined over all
-correspondences that it explains.
+Two correspondences are compatible if a rigid motion could map both: their patches agree in
+distance, in heights over each other's planes, in the angle of their normals, and in handedness. A
+seed correspondence and the compatible ones that are also compatible with each other (second-order
+compatibility: Chen et al., SC2-PCR, CVPR 2022) give one transform, refined over all correspondences
+that it explains.
 
-The two directions of depth images are searched independently: that they meet is evidence, which
-one search for both would take away. Scans see so much more that one search is enough; there the
-directions are refined apart.
+The directions of depth images are searched independently: that they meet is evidence, which one
+search for both would destroy. Scans see so much more that one search suffices; their directions are
+refined separately.
 
-Gravity rules transforms out where both frames know which way is up. An IMU tells up in its sensor's
-coordinates to half a degree or so. A transform of two frames of one place must then lay the up of
-the one on that of the other: what tilts is not unlikely but impossible. That holds only as far as
-`up` is right, so the search is told of it with room to spare, and where nothing fits with it, the
-surfaces are asked once without it. Gravity is not the paper's.
+Gravity excludes transforms that tilt, if both frames know up (an IMU measures it to half a degree).
+`up` may be wrong, so the gates leave room, and if nothing fits, the search is repeated without it.
+Gravity is not in the paper.
 """
 
 from __future__ import annotations
@@ -35,20 +33,20 @@ from sceneprint.geometry.kernel import cached_per_frame, disjoint_kernel, kernel
 from sceneprint.geometry.registration.icp import (
     COARSE,
     FINE,
-    Refined,
+    Refinement,
     RefinementParameters,
     refine,
-    refined_all,
-    refined_with_index,
+    refine_all,
+    refine_with_index,
 )
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,
     PlaneView,
     agreements,
-    explained,
+    plane_agreement,
     plane_view,
-    sampled,
+    sample_points,
 )
 from sceneprint.geometry.registration.patch_descriptors import (
     MatchingParameters,
@@ -58,10 +56,10 @@ from sceneprint.geometry.registration.patch_descriptors import (
 from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
     ScanPlan,
+    dominant_up,
+    draw_plan,
     other_plans,
     plan_hypotheses,
-    plan_of,
-    up_of,
 )
 from sceneprint.geometry.registration.sequence_alignment import (
     Matching,
@@ -90,32 +88,30 @@ from sceneprint.types import (
     kind_of,
 )
 
-# Consensus of correspondences.
-
 
 @dataclass(frozen=True)
 class ConsensusParameters:
-    """The numbers of the compatibility graph and of the hypotheses drawn from it."""
+    """Parameters of the compatibility graph and of its hypotheses."""
 
-    distance_tolerance: float = 0.12  #: of lengths and heights, metres
-    angle_tolerance: float = 0.5  #: of the angle between two patches' normals, radians
+    distance_tolerance: float = 0.12  #: tolerance of lengths and heights, metres
+    angle_tolerance: float = 0.5  #: tolerance of the angle between two patches' normals, radians
     minimum_distance: float = 0.15  #: nearer pairs constrain no rotation, metres
-    n_seeds: int = 40  #: transforms that are tried
-    n_support: int = 16  #: correspondences that a seed's first transform is fitted to
-    normal_weight: float = 0.05  #: of agreeing normals beside agreeing positions, square metres
-    rounds: int = 3  #: of fitting again to what a transform explains
-    inlier_distance: float = 0.15  #: between patches under a transform, metres
-    inlier_cosine: float = 0.85  #: of the angle between their normals
+    n_seeds: int = 40  #: number of transforms that are tried
+    n_support: int = 16  #: number of correspondences of a seed's first fit
+    normal_weight: float = 0.05  #: weight of normals relative to positions, square metres
+    rounds: int = 3  #: number of refits to the explained correspondences
+    inlier_distance: float = 0.15  #: greatest distance of patches under a transform, metres
+    inlier_cosine: float = 0.85  #: least cosine between their normals
 
 
 @kernel
 def _alike_angles(a: float, b: float, most: float) -> bool:
-    """Whether two angles, given by their cosines, differ by no more than `most`."""
+    """Return whether two angles, as cosines, differ by at most `most`."""
     a, b = min(max(a, -1.0), 1.0), min(max(b, -1.0), 1.0)
     return not abs(np.arccos(a) - np.arccos(b)) > most
 
 
-#: What `_compare` says of two correspondences: the last, that their angles have yet to be compared.
+#: Results of `_compare` for two correspondences; the last requires a comparison of angles.
 _APART, _ALIKE, _UNDECIDED = 0, 1, 2
 
 
@@ -126,12 +122,12 @@ def _compare(
 ) -> None:  # fmt: skip
     """Compare correspondence i with each later one; all arrays (3, M), said (M,), cosines (2, M).
 
-    They are compatible where lengths, heights above each other's planes, angles between normals and
-    the signed triple product, which tells a scene from its mirror image, agree. Angles differ by
-    no less than their cosines do, and by most where one of them is 0: an arccosine is needed only
-    between these bounds.
+    They are compatible if lengths, heights above each other's planes, angles between normals and
+    the signed triple product, which excludes mirror images, agree. A difference of angles is at
+    least that of their cosines, and greatest if one of them is 0: only between these bounds an
+    arccosine is needed.
     """
-    later = i + 1  # indices from 0 on: what might be negative is not looked up in order
+    later = i + 1  # slices, because possibly negative indices prevent vectorization
     px, py, pz, nx, ny, nz = (
         p[0, later:], p[1, later:], p[2, later:], n[0, later:], n[1, later:], n[2, later:],
     )  # fmt: skip
@@ -177,7 +173,7 @@ def _graph(
     p: Floats, n: Floats, q: Floats, m: Floats,
     tolerance: float, angle: float, minimum: float, bits: NDArray[np.uint64],
 ) -> None:  # fmt: skip
-    """Bit j of row i: correspondences i and j are compatible. All arrays (3, M)."""
+    """Set bit j of row i if correspondences i and j are compatible. All arrays (3, M)."""
     count = p.shape[1]
     said, cosines = np.empty(count, np.uint8), np.empty((2, count))
     for i in range(count):
@@ -192,7 +188,7 @@ def _graph(
 
 @kernel
 def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
-    """common[i, j]: how many are compatible with both, where i and j are compatible; else 0."""
+    """Write the number of correspondences compatible with both i and j, 0 if these are not."""
     count, words = bits.shape
     m1, m2 = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
     m4, h = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
@@ -212,11 +208,11 @@ def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
 
 
 @disjoint_kernel
-def _shares(
+def _covariance_terms(
     p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
     a: Floats, b: Floats, shares: Floats,
 ) -> None:  # fmt: skip
-    """Shares (9, M) of correspondences in the covariance about middles a and b; q by rows."""
+    """Write the terms (9, M) of the covariance about the means a and b, by rows of q."""
     p0, p1, p2, n0, n1, n2 = p[0], p[1], p[2], n[0], n[1], n[2]
     a0, a1, a2 = a[0], a[1], a[2]
     for r in range(3):
@@ -231,7 +227,7 @@ def _shares(
 
 @disjoint_kernel
 def _moments(p: Floats, q: Floats, weights: Floats, shares: Floats) -> None:
-    """Weighted coordinates (6, M)."""
+    """Write weighted coordinates (6, M)."""
     for d in range(3):
         of_p, of_q, in_p, in_q = p[d], q[d], shares[d], shares[3 + d]
         for i in range(len(weights)):
@@ -244,11 +240,10 @@ def _fit(
     p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
     shares: Floats, T: Floats,
 ) -> bool:  # fmt: skip
-    """Weighted Kabsch over positions and normals, (3, M) each; False where fewer than three take
-    part. Weights of 0 or more.
+    """Fit T by weighted Kabsch to positions and normals, (3, M) each; False with fewer than three.
 
-    shares (9, M) is scratch space: products of several correspondences are taken at once, and
-    sums in their order.
+    shares (9, M) is scratch space: products of correspondences vectorize, and sums keep their
+    order.
     """
     total, used = 0.0, 0
     for i in range(len(weights)):
@@ -266,7 +261,7 @@ def _fit(
     a[0], a[1], a[2], b[0], b[1], b[2] = (
         a0 / total, a1 / total, a2 / total, b0 / total, b1 / total, b2 / total,
     )  # fmt: skip
-    _shares(p, n, q, m, weights, normal_weight, a, b, shares)
+    _covariance_terms(p, n, q, m, weights, normal_weight, a, b, shares)
     for r in range(3):
         s0, s1, s2 = shares[3 * r], shares[3 * r + 1], shares[3 * r + 2]
         h0, h1, h2 = 0.0, 0.0, 0.0
@@ -285,11 +280,11 @@ def _fit(
 
 
 @kernel
-def _explained(
+def _weigh_inliers(
     p: Floats, n: Floats, q: Floats, m: Floats, T: Floats,
     distance: float, cosine: float, weights: Floats,
 ) -> None:  # fmt: skip
-    """Weight (1 - d^2 / distance^2)^2 of each correspondence under T; all arrays (3, M)."""
+    """Write the weight (1 - d^2 / distance^2)^2 of each correspondence under T; arrays (3, M)."""
     px, py, pz, qx, qy, qz = p[0], p[1], p[2], q[0], q[1], q[2]
     ax, ay, az, bx, by, bz = n[0], n[1], n[2], m[0], m[1], m[2]
     xx, xy, xz, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
@@ -310,7 +305,7 @@ def _explained(
 
 @kernel
 def _largest(row: Ints32, order: Ints32) -> None:
-    """Indices of the largest of a row, largest first, of equals the earlier."""
+    """Write the indices of the largest of a row, largest first, of equals the earlier."""
     found = 0
     for j in range(len(row)):
         if found == len(order) and row[j] <= row[order[found - 1]]:
@@ -347,14 +342,14 @@ def _hypotheses(
         weights[seed] = max(row[order[0]], 1)
         for k in order:
             weights[k] = max(float(row[k]), weights[k])
-        for j in range(count):  # what this seed speaks for, others need not repeat
+        for j in range(count):  # avoid seeds that would repeat this hypothesis
             if row[j] > 0:
                 support[j] *= 1.0 - 0.5 * row[j] / row[order[0]]
         support[seed] = 0.0
         if not _fit(p, n, q, m, weights, normal_weight, shares, T[found]):
             continue
         for _ in range(rounds):
-            _explained(p, n, q, m, T[found], distance, cosine, weights)
+            _weigh_inliers(p, n, q, m, T[found], distance, cosine, weights)
             if not _fit(p, n, q, m, weights, normal_weight, shares, T[found]):
                 break
         found += 1
@@ -362,7 +357,7 @@ def _hypotheses(
 
 
 def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParameters) -> Floats:
-    """Transforms from source to target on which correspondences agree.
+    """Return transforms from source to target on which correspondences agree.
 
     Parameters
     ----------
@@ -371,7 +366,7 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
 
     Returns
     -------
-    (S, 4, 4) at most `n_seeds` transforms T_target_source; none where no three agree
+    (S, 4, 4) at most `n_seeds` transforms T_target_source; none if no three agree
     """
     if len(pairs) < 3:
         return np.empty((0, 4, 4))
@@ -391,36 +386,29 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
     return T[:found]
 
 
-# What `up` is worth.
-
-
 def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
-    """How far `up` lies from the direction near it that most of the frame's surface faces, radians.
+    """Return the angle of `up` (3,) to the nearest dominant direction of the frame's surface, rad.
 
-    Floors, tables and what stands on them tell up as well as an IMU does, where they are in view.
-    A floor that is not in view tells nothing, and a ramp the wrong thing: a hint, and no evidence.
-
-    Parameters
-    ----------
-    frame : of which `up` (3,) was told
+    Visible floors and tables show up as precisely as an IMU, but a ramp misleads and a floor may be
+    out of view: the angle is a hint, no evidence.
     """
     facing = frame.surface.normals[frame.surface.valid][:: p.floor_stride].astype(float)
     if not len(facing):
         return 0.0
-    cosine = float(np.clip(up_of(facing, up, p.floor_tilt) @ up, -1.0, 1.0))
+    cosine = float(np.clip(dominant_up(facing, up, p.floor_tilt) @ up, -1.0, 1.0))
     return math.acos(cosine)
 
 
 def contradiction(
     tilt: float, query: Geometry, match: Geometry, ups: Ups, p: GravityParameters
 ) -> str:
-    """What is said of surfaces that fit, but only tilted against `up`.
+    """Return the reason for refusing surfaces that fit only if tilted against `up`.
 
     Parameters
     ----------
-    tilt : of the transform, radians
+    tilt : tilt of the transform, radians
     query, match : the two frames
-    ups : of query and match, both known
+    ups : up vectors of query and match, both known
     """
     wrong = [
         name
@@ -435,29 +423,27 @@ def contradiction(
     )
 
 
-# The search.
-
-#: What proposed a transform: patches alike, plans laid on each other, or the map's poses.
+#: Source of a proposed transform: correspondences, plans, or the map's poses.
 Search = Literal["correspondences", "plans", "guided"]
 
 
 @dataclass(frozen=True)
 class AlignmentParameters:
-    """The numbers of the search for a transform."""
+    """Parameters of the search for a transform."""
 
     matching: MatchingParameters = field(default_factory=MatchingParameters)
     consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
-    n_refined: int = 16  #: hypotheses that are refined
-    score_stride: int = 2  #: of the points that hypotheses are scored on
-    n_fine: int = 6  #: of two scans, that are refined finely before the best is taken
-    fine_stride: int = 4  #: of the pixels for that
-    violation_weight: float = 3.0  #: of a violation beside an inlier, in the score of hypotheses
-    rank_violations: float = 1.0  #: of violations beside the share of planes, once refined
-    same_m: float = 0.1  #: hypotheses this near are one
-    same_rad: float = math.radians(6.0)
+    n_refined: int = 16  #: number of hypotheses that are refined
+    score_stride: int = 2  #: stride of the points that score hypotheses
+    n_fine: int = 6  #: number of scans' hypotheses that are refined finely before ranking
+    fine_stride: int = 4  #: stride of the pixels for that
+    violation_weight: float = 3.0  #: weight of a violation in the score of a hypothesis
+    rank_violations: float = 1.0  #: weight of violations in the rank of a refined hypothesis
+    same_m: float = 0.1  #: distance within which hypotheses are equal, metres
+    same_rad: float = math.radians(6.0)  #: and radians
     coarse: RefinementParameters = COARSE
     fine: RefinementParameters = FINE
-    lever: float = 1.0  #: in `stiffness` a radian counts as much as this many metres
+    lever: float = 1.0  #: metres that count as a radian in `stiffness`
     sequence: SequenceParameters = field(default_factory=SequenceParameters)
     plan: PlanParameters = field(default_factory=PlanParameters)
     gravity: GravityParameters = field(default_factory=GravityParameters)
@@ -465,12 +451,12 @@ class AlignmentParameters:
 
 @dataclass(frozen=True, eq=False)
 class FrameSamples:
-    """A frame as hypotheses are scored on it.
+    """A frame prepared for the scoring of hypotheses.
 
     Parameters
     ----------
-    points : (N, 6) float32 of its surface, of `sampled`
-    up : (3,) unit vector in the sensor's coordinates, where it is known
+    points : (N, 6) float32 result of `sample_points`
+    up : (3,) unit vector in the sensor's coordinates, or None
     """
 
     geometry: Geometry
@@ -479,42 +465,45 @@ class FrameSamples:
     up: Floats | None = None
 
     def plan(self, p: PlanParameters) -> ScanPlan:
-        """Of a scan."""
+        """Return the plan of a scan."""
         if self.up is not None:
-            return plan_of(self.geometry.surface, p, up=self.up)
+            return draw_plan(self.geometry.surface, p, up=self.up)
         return _upright_plan(self.geometry.surface, p)
 
 
 @cached_per_frame
 def _upright_plan(surface: Surface, p: PlanParameters) -> ScanPlan:
-    return plan_of(surface, p)
+    return draw_plan(surface, p)
 
 
-def samples_of(
+def frame_samples(
     geometry: Geometry, stride: int, p: PlaneParameters, up: Floats | None = None
 ) -> FrameSamples:
-    """A frame made ready for `align`; stride in pixels."""
-    return FrameSamples(geometry, sampled(geometry.surface, stride), plane_view(geometry, p), up)
+    """Return a frame prepared for `align`; stride in pixels."""
+    return FrameSamples(
+        geometry, sample_points(geometry.surface, stride), plane_view(geometry, p), up
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """One direction's outcome.
+    """The result of a search in one direction.
 
     Parameters
     ----------
     T : (4, 4) T_target_source
-    others : (n, 4, 4) the other hypotheses that were refined, best first
-    stiffness : least over largest eigenvalue of the information, 0 where a direction is free
-    refined : the last refinement, with its information; None where it was lost
-    search : what proposed the transform
-    proposed : (n, 4, 4) of scans, all hypotheses as they were proposed, best first
+    others : (n, 4, 4) the other refined hypotheses, best first
+    stiffness : ratio of the least to the largest eigenvalue of the information, 0 with a free
+        direction
+    refined : the last refinement, with its information; None if it failed
+    search : source of the transform
+    proposed : (n, 4, 4) for scans, all hypotheses before refinement, best first
     """
 
     T: Floats
     others: Floats
     stiffness: float
-    refined: Refined | None
+    refined: Refinement | None
     search: Search = "correspondences"
     proposed: Floats = field(default_factory=lambda: np.empty((0, 4, 4)))
 
@@ -527,33 +516,32 @@ def align(
     overlap_p: OverlapParameters,
     matching: Matching = "histograms",
 ) -> Alignment | None:
-    """The transform from source to target: Sec. III-E, in one direction.
+    """Search for the transform from source to target: Sec. III-E, in one direction.
 
-    Correspondences vote for some forty hypotheses; these are scored by how both frames' points fit
-    the other's surface, the best distinct ones refined and ranked by how many planes agree, and
-    the best refined to the end. Where up is known in both frames, what tilts is left out.
+    Correspondences propose some forty hypotheses. These are scored by the agreement of both frames'
+    points, the best distinct ones are refined and ranked by planes, and the best is refined finely.
 
     Parameters
     ----------
-    source, target : of two frames
-    rng : of the patches drawn
-    matching : what correspondences are found by
+    source, target : samples of two frames
+    rng : generator of the sampled patches
+    matching : method of matching
 
     Returns
     -------
-    alignment : or None where no three correspondences agree, or no hypothesis survives refinement
+    alignment : or None if no three correspondences agree, or all refinements fail
     """
     a, b = source.geometry, target.geometry
     ups = source.up, target.up
-    hypotheses = _voted(a, b, rng, p, matching, ups)
+    hypotheses = _vote(a, b, rng, p, matching, ups)
     scores = _scores(source, target, hypotheses, p, overlap_p)
     chosen = select_distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
-    refined = refined_all(a.surface, b.surface, hypotheses[chosen], p.coarse)
+    refined = refine_all(a.surface, b.surface, hypotheses[chosen], p.coarse)
     refined = refined[are_level(refined, ups, p.gravity.refined_tilt)]
     if not len(refined):
         return None
-    refined = refined[_ranked(source, target, refined, p, overlap_p)]
-    return _finished(source, target, refined[0], refined[1:], p, "correspondences")
+    refined = refined[_rank(source, target, refined, p, overlap_p)]
+    return _refine_finally(source, target, refined[0], refined[1:], p, "correspondences")
 
 
 def align_scans(
@@ -566,24 +554,24 @@ def align_scans(
     *,
     other_axes: bool = False,
 ) -> tuple[Alignment, Alignment] | None:
-    """The transforms from query to match and back, of two scans: one search, refined each way.
+    """Search for the transforms between two scans: one search, refined in each direction.
 
-    To the hypotheses of correspondences come those of the plans. The best few are refined finely
-    before the best of all is taken: plans are coarse, and coarsely refined hypotheses rank badly.
+    Plans add to the hypotheses of correspondences. The best few are refined finely before ranking:
+    plans are coarse, and coarsely refined hypotheses rank badly.
 
     Parameters
     ----------
-    query, match : of two scans
-    rng, p, overlap_p, matching : as of `align`
-    other_axes : whether the scanners may have stood otherwise than upright
+    query, match : samples of two scans
+    rng, p, overlap_p, matching : arguments of `align`
+    other_axes : whether the scanners may not have stood upright
 
     Returns
     -------
-    alignments : there and back, or None where no hypothesis survives refinement
+    alignments : there and back, or None if all refinements fail
     """
     a, b = query.geometry, match.geometry
     ups = query.up, match.up
-    voted = _voted(a, b, rng, p, matching, ups)
+    voted = _vote(a, b, rng, p, matching, ups)
     plans = [(query.plan(p.plan), match.plan(p.plan))]
     if other_axes:
         plans = other_plans(a.surface, b.surface, p.plan)
@@ -591,7 +579,7 @@ def align_scans(
     hypotheses = np.concatenate([voted, planned])
     scores = _scores(query, match, hypotheses, p, overlap_p)
     chosen = select_distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
-    transforms, index = refined_with_index(a.surface, b.surface, hypotheses[chosen], p.coarse)
+    transforms, index = refine_with_index(a.surface, b.surface, hypotheses[chosen], p.coarse)
     if not index:
         return None
     is_planned = np.array(chosen)[index] >= len(voted)
@@ -599,44 +587,43 @@ def align_scans(
     transforms, is_planned = transforms[level], is_planned[level]
     if not len(transforms):
         return None
-    order = _ranked(query, match, transforms, p, overlap_p)
+    order = _rank(query, match, transforms, p, overlap_p)
     transforms, is_planned = transforms[order], is_planned[order]
     onto, numbers = b.surface.fitted, replace(p.fine, stride=p.fine_stride)
-    fine, index = refined_with_index(a.surface, onto, transforms[: p.n_fine], numbers)
+    fine, index = refine_with_index(a.surface, onto, transforms[: p.n_fine], numbers)
     transforms[index] = fine
-    order = _ranked(query, match, transforms, p, overlap_p)
+    order = _rank(query, match, transforms, p, overlap_p)
     T, others = transforms[order[0]], transforms[order[1:]]
     search: Search = "plans" if is_planned[order[0]] else "correspondences"
-    there = _finished(query, match, T, others, p, search)
-    back = _finished(match, query, inverse(T), inverses(others), p, search)
+    there = _refine_finally(query, match, T, others, p, search)
+    back = _refine_finally(match, query, inverse(T), inverses(others), p, search)
     return replace(there, proposed=hypotheses[np.argsort(-scores, kind="stable")]), back
 
 
 def align_guided(
     source: FrameSamples, target: FrameSamples, T: Floats, p: AlignmentParameters
 ) -> Alignment | None:
-    """A transform that is known beforehand, (4, 4) T_target_source, refined in one direction.
-
-    Nothing is searched for. None where the surfaces do not hold it.
-    """
+    """Refine a known transform, (4, 4) T_target_source, in one direction; None if that fails."""
     surface, onto = source.geometry.surface, target.geometry.surface
-    coarse = refine(sampled(surface, p.coarse.stride), onto, T, p.coarse, kind_of(surface.camera))
+    coarse = refine(
+        sample_points(surface, p.coarse.stride), onto, T, p.coarse, kind_of(surface.camera)
+    )
     if coarse is None:
         return None
-    found = _finished(source, target, coarse.T, np.empty((0, 4, 4)), p, "guided")
-    return None if found.refined is None else found
+    result = _refine_finally(source, target, coarse.T, np.empty((0, 4, 4)), p, "guided")
+    return None if result.refined is None else result
 
 
 def are_scans(query: Geometry, match: Geometry) -> bool:
-    """Whether both frames are range images about a viewpoint."""
-    return all(isinstance(one.surface.camera, Sphere) for one in (query, match))
+    """Return whether both frames are range images about a viewpoint."""
+    return all(isinstance(frame.surface.camera, Sphere) for frame in (query, match))
 
 
-def _voted(
+def _vote(
     source: Geometry, target: Geometry, rng: np.random.Generator, p: AlignmentParameters,
     matching: Matching, ups: Ups,
 ) -> Floats:  # fmt: skip
-    """What correspondences vote for, less what tilts."""
+    """Return the hypotheses of correspondences, except those that tilt."""
     pairs = _pairs(source, target, rng, p, matching, ups)
     voted = consensus(source.patches, target.patches, pairs, p.consensus)
     return voted[are_level(voted, ups, p.gravity.proposed_tilt)]
@@ -658,14 +645,14 @@ def _pairs(
     return pairs[np.abs(gate.source[pairs[:, 0]] - gate.target[pairs[:, 1]]) <= gate.most]
 
 
-def _finished(
+def _refine_finally(
     source: FrameSamples, target: FrameSamples, T: Floats, others: Floats, p: AlignmentParameters,
     search: Search,
 ) -> Alignment:  # fmt: skip
-    """One transform refined to the end."""
+    """Refine a transform finely."""
     surface = source.geometry.surface
     onto = target.geometry.surface.fitted
-    fine = refine(sampled(surface, p.fine.stride), onto, T, p.fine, kind_of(surface.camera))
+    fine = refine(sample_points(surface, p.fine.stride), onto, T, p.fine, kind_of(surface.camera))
     if fine is None:
         return Alignment(T, others, 0.0, None, search)
     scale = np.array([p.lever] * 3 + [1.0] * 3)
@@ -678,22 +665,22 @@ def _scores(
     source: FrameSamples, target: FrameSamples, transforms: Floats, p: AlignmentParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Share of the inliers, less violations, of both frames' points."""
+    """Return the shares of inliers, less weighted violations, of both frames' points."""
     total = np.zeros(len(transforms))
-    for one, other, each in (
+    for frame, other, direction in (
         (source, target, transforms), (target, source, inverses(transforms)),
     ):  # fmt: skip
-        points = one.points[:: p.score_stride]
-        counts = agreements(points, other.geometry.surface, each, overlap_p)
+        points = frame.points[:: p.score_stride]
+        counts = agreements(points, other.geometry.surface, direction, overlap_p)
         total += (counts[:, 0] - p.violation_weight * counts[:, 1]) / max(len(points), 1)
     return total
 
 
-def _ranked(
+def _rank(
     source: FrameSamples, target: FrameSamples, transforms: Floats, p: AlignmentParameters,
     overlap_p: OverlapParameters,
 ) -> Ints32:  # fmt: skip
-    """Indices of refined transforms, best first."""
-    seen = explained(source.planes, target.planes, transforms, overlap_p)
+    """Return the indices of refined transforms, best first."""
+    seen = plane_agreement(source.planes, target.planes, transforms, overlap_p)
     scores = seen.share - p.rank_violations * seen.violations
     return np.argsort(-scores, kind="stable").astype(np.int32)

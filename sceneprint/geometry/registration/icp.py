@@ -1,22 +1,20 @@
-"""Sec. III-E, refinement: point-to-plane ICP, from a transform to the best one near it.
+"""Refine a transform by point-to-plane ICP, and estimate its covariance (Sec. III-E).
 
     points of the source, surface of the target, T  --refine-->  T, information
-    Refined there, Refined back, T  --pair_covariance-->  covariance (6, 6)
-    covariance  --free_directions-->  Free: along what the surfaces can slide
-    covariance, R, lever  --transported-->  covariance told in another frame
+    refinement there, refinement back, T  --pair_covariance-->  covariance (6, 6)
+    covariance  --free_directions-->  directions in which the surfaces can slide
+    covariance, R, lever  --transform_covariance-->  covariance in another frame
 
-Projective point-to-plane alignment: every point is compared with the plane that the target saw in
-its direction. Depth errors of structured-light sensors grow with z^2, so far points weigh less.
-Where the target has no viewpoint, a point is compared with the plane of the nearest one that faces
-the same way; all else is the same.
+Projective point-to-plane alignment compares a point with the plane that the target saw in its
+direction. Depth errors of structured-light sensors grow with z^2, so distant points weigh less. In
+a target without a viewpoint, a point is compared with the plane of the nearest point with a similar
+normal.
 
-The covariance is what the last refinement knows, scaled to the errors that are made. The error of
-T_parent_child is (x, y, z, rx, ry, rz): what must be added to its translation, metres along the
-parent's axes, and the rotation vector, radians about the parent's axes, that must be put before its
-rotation, T_true = [exp(r) R, t + x]. It is what ROS means in PoseWithCovariance. Errors are small:
-what is of second order in them is left out. The inverse of Gauss-Newton's information alone is no
-covariance: neighbouring pixels err together, so thousands of them say no more than a few. How many:
-docs/uncertainty.md.
+The error of T_parent_child is (x, y, z, rx, ry, rz), as in ROS's PoseWithCovariance: x is added to
+its translation, metres along the parent's axes, and the rotation vector r, radians about the
+parent's axes, is applied before its rotation, T_true = [exp(r) R, t + x], to first order. The
+inverse of Gauss-Newton's information alone is no covariance, because the errors of neighbouring
+pixels are correlated: docs/uncertainty.md measures their effective number.
 """
 
 from __future__ import annotations
@@ -27,7 +25,12 @@ from typing import Literal
 import numpy as np
 
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
-from sceneprint.geometry.registration.overlap import LookupTarget, nearest_alike, sampled, target_of
+from sceneprint.geometry.registration.overlap import (
+    LookupTarget,
+    lookup_target,
+    nearest_alike,
+    sample_points,
+)
 from sceneprint.geometry.rigid import PoseAverage, apply_rotation, rotation_angle, solve_positive
 from sceneprint.geometry.surface.camera import (
     BLOCK,
@@ -45,43 +48,43 @@ from sceneprint.types import PINHOLE, Floats, Floats32, Ints32, Surface, kind_of
 
 @dataclass(frozen=True)
 class RefinementParameters:
-    """The numbers of one refinement."""
+    """Parameters of a refinement."""
 
-    stride: int  #: of the source's pixels
-    iterations: int
-    first_gate: float  #: farther from the plane a point is forgotten, metres, at first
-    last_gate: float  #: and at last
-    normal_cosine: float = 0.7  #: of the angle between normals that may belong together
+    stride: int  #: stride of the source's pixels
+    iterations: int  #: number of Gauss-Newton steps
+    first_gate: float  #: greatest distance of a point from the plane in the first step, metres
+    last_gate: float  #: and in the last
+    normal_cosine: float = 0.7  #: least cosine between corresponding normals
     reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / this)^growth)
-    minimum_points: int = 20  #: fewer fix no transform
-    growth: int = 2  #: 2 as a depth sensor's noise, 1 or 0 as a scanner's
-    weight_depth: float = 1.0  #: where weights begin to fall as 1 / z^4, metres
-    nearest: float = 0.1  #: points this near the target's camera are not compared, metres
-    reach: float = 0.25  #: to a point of a target in no order, metres
-    thinning: int = 1  #: of the points, only every such one takes part at first
-    last_iterations: int = 2  #: in which all do
+    minimum_points: int = 20  #: least number of points
+    growth: int = 2  #: 2 for the noise of a depth sensor, 1 or 0 for a scanner's
+    weight_depth: float = 1.0  #: depth at which weights start to fall as 1 / z^4, metres
+    nearest: float = 0.1  #: least depth of a point in the target's camera, metres
+    reach: float = 0.25  #: greatest distance to a point of an unordered target, metres
+    thinning: int = 1  #: stride of the points in the first iterations
+    last_iterations: int = 2  #: number of iterations with all points
 
 
-#: To see whether it leads anywhere.
+#: For a quick check of a hypothesis.
 QUICK = RefinementParameters(10, 4, 0.25, 0.15)
 #: For hypotheses: few points, wide gates.
 COARSE = RefinementParameters(5, 8, 0.25, 0.08)
-#: For the best of them.
+#: For the best hypotheses.
 FINE = RefinementParameters(2, 8, 0.08, 0.03, thinning=4)
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
-    """What a refinement came to.
+class Refinement:
+    """The result of a refinement.
 
     Parameters
     ----------
     T : (4, 4) T_target_source
-    information : (6, 6) J^T W J per point used: turn (radians), then shift (metres), about the
+    information : (6, 6) J^T W J per point: rotation (radians), then translation (metres), about the
         target's origin
-    points : that took part in the last step
-    mean_square : weighted square of their residuals, per point used: the noise of this very pair,
-        in the weights of `information`
+    points : number of points in the last step
+    mean_square : mean weighted square of their residuals: the noise of this pair, in the weights of
+        `information`
     """
 
     T: Floats
@@ -95,7 +98,7 @@ def _add(
     A: Floats, g: Floats, row: Floats, x: float, y: float, z: float,
     mx: float, my: float, mz: float, residual: float, weight: float,
 ) -> None:  # fmt: skip
-    """One point's share of the normal equations: (x, y, z) moved, on a plane with that normal."""
+    """Add a moved point (x, y, z), on a plane with normal m, to the normal equations."""
     row[0], row[1], row[2] = y * mz - z * my, z * mx - x * mz, x * my - y * mx
     row[3], row[4], row[5] = mx, my, mz
     for a in range(6):
@@ -110,12 +113,13 @@ def _nearest_in_line(
     points: Floats32, width: int, column: Ints32, line: Ints32, beside: int,
     x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
 ) -> None:  # fmt: skip
-    """Of the three pixels in a line beside that of each point: the nearest one that shows
-    anything, if it is nearer than `nearest`; that squared, and its index in the flat map.
+    """Update the nearest pixel of each point with three pixels of the line `beside` its own.
+
+    nearest: squared distances. best: indices in the flat map.
     """
     for i in range(count):
         start, middle = (line[i] + beside) * width, column[i]
-        # the last column of a closed sphere has the first for its neighbour
+        # the last column of a closed sphere adjoins the first
         first = start + (middle - 1 if middle > 0 else width - 1)
         second = start + middle
         third = start + (middle + 1 if middle < width - 1 else 0)
@@ -132,13 +136,13 @@ def _nearest_in_line(
 
 
 @disjoint_kernel
-def _weighed(
+def _weigh_points(
     source: Floats32, start: int, places: Ints32, points: Floats32, normals: Floats32,
     x: Floats, y: Floats, z: Floats, depth: Floats, nearest: Floats, best: Ints32, T: Floats,
     gate: float, numbers: Floats, count: int, rows: Floats, weights: Floats,
 ) -> None:  # fmt: skip
-    """Rows of the Jacobian and residuals, (7, n), of points with their nearest pixels; weights,
-    negative where the two do not belong together.
+    """Write rows of the Jacobian and residuals, (7, n), of points with their nearest pixels, and
+    weights: negative if the two do not correspond.
     """
     least_cosine, reference, power = numbers[3], numbers[4], numbers[6]
     per_depth, kind = numbers[7], numbers[8]
@@ -175,8 +179,8 @@ def _weighed(
 
 
 @disjoint_kernel
-def _kept(weights: Floats, count: int, places: Ints32) -> int:
-    """Indices of the weights that are not negative; how many."""
+def _select_compatible(weights: Floats, count: int, places: Ints32) -> int:
+    """Write the indices of the weights that are not negative; return their number."""
     found = 0
     for i in range(count):
         places[found] = i
@@ -186,10 +190,10 @@ def _kept(weights: Floats, count: int, places: Ints32) -> int:
 
 @disjoint_kernel
 def _add_all(rows: Floats, weights: Floats, places: Ints32, count: int, sums: Floats) -> None:
-    """Shares of points in the normal equations, one after the other.
+    """Add points to the normal equations in their order.
 
-    sums (28,): the lower triangle of A row by row, then -g and the weighted squares. All stay in
-    registers, which numba does for nothing but single variables.
+    sums (28,): the lower triangle of A row by row, then -g and the weighted squares. Single
+    variables, because numba keeps only these in registers.
     """
     r0, r1, r2, r3, r4, r5, r6 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6]
     aa, ba, bb, ca, cb, cc = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
@@ -230,15 +234,14 @@ def _accumulate(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats, gate: float,
     numbers: Floats, room: Floats, indices: Ints32, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Normal equations of one Gauss-Newton step on the points of (6, N); returns how many took
-    part, and the sum of their weighted squares.
+    """Write the normal equations of a Gauss-Newton step on the points of (6, N); return the number
+    of points used, and the sum of their weighted squares.
 
-    Blocks of points go through one step after the other, so that the compiler works on several
-    at once; sums are added up in the order of the points.
+    Each step processes a block of points, which vectorizes; sums keep the order of the points.
     """
     height, width = points.shape[0], points.shape[1]
     shown, facing = points.reshape(-1), normals.reshape(-1)
-    # on a closed sphere the first column has a neighbour before it: the last
+    # the first column of a closed sphere adjoins the last
     edge = 0.0 if camera[0] == 1 and camera[6] > 0 else 1.0
     moved, seen, inside, rows = room[:3], room[3:6], room[6:10], room[10:17]
     nearest, weights, sums, used = room[17], room[18], np.zeros(28), 0
@@ -258,11 +261,11 @@ def _accumulate(
             _nearest_in_line(
                 shown, width, pixels[0], pixels[1], beside, x, y, z, count, nearest, best
             )
-        _weighed(
+        _weigh_points(
             source, start, places, shown, facing, x, y, z, inside[3], nearest, best, T, gate,
             numbers, count, rows, weights,
         )  # fmt: skip
-        count = _kept(weights, count, places)
+        count = _select_compatible(weights, count, places)
         _add_all(rows, weights, places, count, sums)
         used += count
     k = 0
@@ -280,7 +283,7 @@ def _accumulate_near(
     source: Floats32, step: int, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, gate: float, numbers: Floats, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """As `_accumulate`, on a target whose points are in no order."""
+    """Write the normal equations for a target with unordered points; see `_accumulate`."""
     least_cosine, kind, per_depth = numbers[3], numbers[8], numbers[7]
     row, at, facing = np.zeros(6), np.empty(3), np.empty(3)
     used, squares = 0, 0.0
@@ -315,7 +318,7 @@ def refine_in_place(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, information: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Gauss-Newton on T; the points that took part in the last step, 0 where it was lost, and
+    """Run Gauss-Newton on T; return the number of points in the last step, 0 if it failed, and
     their mean weighted square before it.
     """
     iterations, minimum = int(numbers[0]), int(numbers[5])
@@ -350,7 +353,7 @@ def refine_in_place(
         for a in range(6):
             for b in range(6):
                 information[a, b] = A[a, b] / used
-            # a little damping: a direction that no point holds does not move
+            # damping keeps T fixed in directions that no point constrains
             A[a, a] += 1e-6 * used
         if not solve_positive(A, g, step):
             return 0, 0.0
@@ -368,8 +371,8 @@ def refine_in_place(
     return used, squares / max(used, 1)
 
 
-def numbers_of(p: RefinementParameters, kind: int) -> Floats:
-    """The parameters as the kernel takes them, and the kind of the source's camera."""
+def kernel_numbers(p: RefinementParameters, kind: int) -> Floats:
+    """Return the parameters and the kind of the source's camera as an array for the kernels."""
     return np.array(
         [p.iterations, p.first_gate, p.last_gate, p.normal_cosine, p.reference_depth,
          p.minimum_points, p.growth, 1.0 / p.weight_depth, kind, p.thinning, p.last_iterations],
@@ -377,92 +380,97 @@ def numbers_of(p: RefinementParameters, kind: int) -> Floats:
     )  # fmt: skip
 
 
-def compared(surface: Surface, p: RefinementParameters) -> LookupTarget:
-    """A surface made ready for `refine_in_place`."""
-    return target_of(surface, p.nearest, p.reach)
+def icp_target(surface: Surface, p: RefinementParameters) -> LookupTarget:
+    """Return a surface prepared for `refine_in_place`."""
+    return lookup_target(surface, p.nearest, p.reach)
 
 
 def refine(
     source: Floats32, target: Surface, T_target_source: Floats, p: RefinementParameters,
     kind: int = PINHOLE,
-) -> Refined | None:  # fmt: skip
-    """Lay a source's points onto the target's surface, from a transform near by: Sec. III-E.
+) -> Refinement | None:  # fmt: skip
+    """Align a source's points to the target's surface, from a nearby transform: Sec. III-E.
 
     Parameters
     ----------
-    source : (N, 6) float32 points and normals, of `overlap.sampled` with the stride of `p`
-    target : (h, w) surface, or points in no order
-    T_target_source : (4, 4) where to start
-    kind : of the source's camera, `camera.kind_of`: by what its points weigh
+    source : (N, 6) float32 points and normals, of `overlap.sample_points` with the stride of `p`
+    target : (h, w) surface, or unordered points
+    T_target_source : (4, 4) initial transform
+    kind : kind of the source's camera (`camera.kind_of`), which determines the weights
 
     Returns
     -------
-    refined : or None where fewer than `minimum_points` stay within the gates, or they fix no step
+    refinement : or None if fewer than `minimum_points` stay within the gates, or a step is singular
     """
     T, information = np.array(T_target_source, float), np.zeros((6, 6))
-    t = compared(target, p)
+    t = icp_target(target, p)
     used, mean_square = refine_in_place(
-        source, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers_of(p, kind), information
+        source,
+        t.points,
+        t.normals,
+        t.camera,
+        t.heads,
+        t.chain,
+        T,
+        kernel_numbers(p, kind),
+        information,
     )
-    return Refined(T, information, used, mean_square) if used else None
+    return Refinement(T, information, used, mean_square) if used else None
 
 
-def refined_all(
+def refine_all(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> Floats:
-    """Each of the hypotheses (n, 4, 4) refined; those that lose the surface are left out."""
-    return refined_with_index(source, target, hypotheses, p)[0]
+    """Refine hypotheses (n, 4, 4), and omit those that fail."""
+    return refine_with_index(source, target, hypotheses, p)[0]
 
 
-def refined_with_index(
+def refine_with_index(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> tuple[Floats, list[int]]:
-    """`refined_all`, and of which of the hypotheses each is."""
-    points, t = sampled(source, p.stride), compared(target, p)
-    numbers, information = numbers_of(p, kind_of(source.camera)), np.zeros((6, 6))
-    kept, index = [], []
+    """Refine hypotheses as `refine_all`; return the indices of the successful ones too."""
+    points, t = sample_points(source, p.stride), icp_target(target, p)
+    numbers, information = kernel_numbers(p, kind_of(source.camera)), np.zeros((6, 6))
+    refined, index = [], []
     for k, hypothesis in enumerate(hypotheses):
         T = hypothesis.copy()
         used, _ = refine_in_place(
             points, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers, information
         )
         if used:
-            kept.append(T)
+            refined.append(T)
             index.append(k)
-    return np.array(kept).reshape(-1, 4, 4), index
+    return np.array(refined).reshape(-1, 4, 4), index
 
-
-# Covariance of a transform.
 
 Method = Literal["information-scaled", "votes-and-spread"]
-#: What made a pair's covariance, and what a place's.
+#: Methods of the covariances of a pair, and of an averaged pose.
 PAIR_METHOD: Method = "information-scaled"
 PLACE_METHOD: Method = "votes-and-spread"
 
-#: Of turn, then shift, as refinement orders them, to shift, then turn.
+#: Reorders rotation, translation (as in a refinement) to translation, rotation.
 _SHIFT_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 @dataclass(frozen=True)
 class CovarianceParameters:
-    """The numbers of covariances; how they were chosen: docs/uncertainty.md."""
+    """Parameters of covariances; docs/uncertainty.md describes how they were tuned."""
 
-    independent: float = 5.3  #: points per direction that err independently, however many there are
-    least_square: float = 1e-7  #: of the mean weighted square: no sensor is surer
-    most: float = 10.0  #: deviation of what nothing holds, metres and radians
-    lever: float = 1.0  #: a radian counts as much as this many metres
-    free: float = 30.0  #: times the least deviation, from which on a direction is free
+    independent: float = 5.3  #: effective number of independent points per direction
+    least_square: float = 1e-7  #: least mean weighted square: no sensor is more accurate
+    most: float = 10.0  #: deviation in unconstrained directions, metres and radians
+    lever: float = 1.0  #: metres that count as a radian
+    free: float = 30.0  #: least ratio of a free direction's deviation to the least deviation
 
 
 @dataclass(frozen=True, eq=False)
-class Free:
-    """A direction along which a transform is hardly held.
+class FreeDirection:
+    """A direction in which a transform is hardly constrained.
 
     Parameters
     ----------
-    translation, rotation : (3,) each, together of length 1: the error, metres and radians,
-        along this direction
-    deviation : standard deviation along it, metres where it shifts, radians where it turns
+    translation, rotation : (3,) each, together of unit length: the error, metres and radians
+    deviation : standard deviation in this direction, metres for translations, radians for rotations
     """
 
     translation: Floats
@@ -470,13 +478,13 @@ class Free:
     deviation: float
 
 
-def crossing(v: Floats) -> Floats:
-    """[v]x (3, 3): crossing(v) @ u = v x u."""
+def cross_matrix(v: Floats) -> Floats:
+    """Return [v]x (3, 3): cross_matrix(v) @ u = v x u."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def adjoint(R: Floats, lever: Floats) -> Floats:
-    """How an error (x, r) is told elsewhere: (6, 6).
+    """Return the matrix (6, 6) that transforms an error (x, r) to another frame.
 
     Parameters
     ----------
@@ -485,23 +493,18 @@ def adjoint(R: Floats, lever: Floats) -> Floats:
     """
     result = np.zeros((6, 6))
     result[:3, :3], result[3:, 3:] = R, R
-    result[:3, 3:] = -crossing(lever) @ R  # what turns moves all that is away from the origin
+    result[:3, 3:] = -cross_matrix(lever) @ R  # a rotation moves points away from the origin
     return result
 
 
-def transported(covariance: Floats, R: Floats, lever: Floats) -> Floats:
-    """A covariance told in other axes and of another point of the same body: A S A^T.
+def transform_covariance(covariance: Floats, R: Floats, lever: Floats) -> Floats:
+    """Return a covariance (6, 6) in other axes, and at another point of the same body: A S A^T.
 
-    Of T_a_b with rotation R and translation t, and transforms without error beside it:
+    For T_a_b with rotation R and translation t, and exact transforms beside it, use as (R, lever):
 
-    * T_c_a T_a_b: (R_c_a, 0)
-    * T_a_b T_b_d, as of a robot's base: (identity, R t_b_d)
-    * the inverse T_b_a: (R^T, -R^T t)
-
-    Parameters
-    ----------
-    covariance : (6, 6)
-    R, lever : see `adjoint`
+    * (R_c_a, 0) for T_c_a T_a_b
+    * (identity, R t_b_d) for T_a_b T_b_d, as of a robot's base
+    * (R^T, -R^T t) for the inverse T_b_a
     """
     A = adjoint(R, lever)
     moved: Floats = A @ covariance @ A.T
@@ -509,99 +512,98 @@ def transported(covariance: Floats, R: Floats, lever: Floats) -> Floats:
 
 
 def pair_covariance(
-    there: Refined | None, back: Refined | None, T: Floats, p: CovarianceParameters | None = None
+    there: Refinement | None,
+    back: Refinement | None,
+    T: Floats,
+    p: CovarianceParameters | None = None,
 ) -> Floats | None:
-    """Covariance of a transform that lies halfway between two refinements: Sec. III-E.
+    """Return the covariance of a transform halfway between two refinements: Sec. III-E.
 
     Parameters
     ----------
-    there, back : the last refinement of each direction, or None where it was lost
+    there, back : the last refinement of each direction, or None if it failed
     T : (4, 4) T_match_query
 
     Returns
     -------
-    (6, 6) of T, or None where both were lost
+    (6, 6) covariance of T, or None if both failed
     """
     p = p or CovarianceParameters()
     information, squares = [], []
-    if there is not None:  # its error is of the match's origin, which is not where the query is
-        informed = there.information[np.ix_(_SHIFT_FIRST, _SHIFT_FIRST)]
-        onward = adjoint(np.eye(3), -T[:3, 3])
-        information.append(onward.T @ informed @ onward)
-        squares.append(there.mean_square)
-    if back is not None:  # told in the query's axes; that it is the inverse's changes the sign
-        informed = back.information[np.ix_(_SHIFT_FIRST, _SHIFT_FIRST)]
-        onward = adjoint(T[:3, :3].T, np.zeros(3))
-        information.append(onward.T @ informed @ onward)
-        squares.append(back.mean_square)
+    # one is an error at the match's origin; the other is in the query's axes, of opposite sign
+    for refinement, R, lever in (
+        (there, np.eye(3), -T[:3, 3]), (back, T[:3, :3].T, np.zeros(3))
+    ):  # fmt: skip
+        if refinement is not None:
+            A = adjoint(R, lever)
+            ordered = refinement.information[np.ix_(_SHIFT_FIRST, _SHIFT_FIRST)]
+            information.append(A.T @ ordered @ A)
+            squares.append(refinement.mean_square)
     if not information:
         return None
     noise = max(float(np.mean(squares)), p.least_square) / p.independent
     scale = _scale(p)
-    held = np.mean(information, axis=0) * np.outer(1 / scale, 1 / scale) / noise
-    values, vectors = np.linalg.eigh((held + held.T) / 2)
+    precision = np.mean(information, axis=0) * np.outer(1 / scale, 1 / scale) / noise
+    values, vectors = np.linalg.eigh((precision + precision.T) / 2)
     variances = 1 / np.maximum(values, 1 / p.most**2)
     result: Floats = (vectors * variances) @ vectors.T * np.outer(1 / scale, 1 / scale)
     return (result + result.T) / 2
 
 
-def free_directions(covariance: Floats, p: CovarianceParameters | None = None) -> tuple[Free, ...]:
-    """Directions whose deviation is far above the least one, the freest first.
+def free_directions(
+    covariance: Floats, p: CovarianceParameters | None = None
+) -> tuple[FreeDirection, ...]:
+    """Return the directions whose deviation is far above the least, the freest first.
 
-    A lone plane has three: two shifts within it, and the turn about its normal; a corridor has
-    one, along it; a corner none.
-
-    Parameters
-    ----------
-    covariance : (6, 6)
-    p : see CovarianceParameters
+    A plane has three: two translations within it, and the rotation about its normal; a corridor has
+    one, along it; a corner has none.
     """
     p = p or CovarianceParameters()
     scale = _scale(p)
     values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
     deviations = np.sqrt(np.maximum(values, 0.0))
-    found = []
+    free = []
     for i in range(5, 0, -1):
         if deviations[i] > p.free * deviations[0]:
             towards = vectors[:, i] / scale
             length = float(np.linalg.norm(towards))
             towards = towards / length * np.sign(towards[np.abs(towards).argmax()])
-            found.append(Free(towards[:3], towards[3:], float(deviations[i]) * length))
-    return tuple(found)
+            free.append(FreeDirection(towards[:3], towards[3:], float(deviations[i]) * length))
+    return tuple(free)
 
 
 def place_covariance(average: PoseAverage, poses: Floats, covariances: Floats) -> Floats:
-    """Covariance of an averaged pose, from its votes' covariances and how far they lie apart.
+    """Return the covariance of an averaged pose, from its votes' covariances and their spread.
 
-    Two frames make each vote, and one of them, the query, is the same for all: half of the mean
-    of their covariances is kept whole, the other half divided by their number, as is what they
-    differ by, which holds the errors of the map's poses.
+    All votes share the query. So half of the mean covariance stays whole, and the other half is
+    divided by the number of votes, as is their spread, which contains the errors of the map's
+    poses.
 
     Parameters
     ----------
-    average : of `average_poses`
-    poses : (n, 4, 4) that were averaged
-    covariances : (n, 6, 6) of each
+    average : result of `average_poses`
+    poses : (n, 4, 4) poses that were averaged
+    covariances : (n, 6, 6) of each pose
     """
     own: Floats = covariances[average.members].mean(axis=0)
     n = len(average.members)
     if n == 1:
         return own
-    apart = np.array([error_of(average.T, one) for one in poses[average.members]])
-    result: Floats = own * (0.5 + 0.5 / n) + apart.T @ apart / (n * (n - 1))
+    errors = np.array([pose_error(average.T, pose) for pose in poses[average.members]])
+    result: Floats = own * (0.5 + 0.5 / n) + errors.T @ errors / (n * (n - 1))
     return result
 
 
-def error_of(T: Floats, true: Floats) -> Floats:
-    """(x, y, z, rx, ry, rz) by which a transform (4, 4) is off; see the module."""
+def pose_error(T: Floats, true: Floats) -> Floats:
+    """Return the error (x, y, z, rx, ry, rz) of a transform (4, 4); see the module."""
     turn = true[:3, :3] @ T[:3, :3].T
     axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    sine = float(np.linalg.norm(axis))  # twice that of the angle
+    sine = float(np.linalg.norm(axis))  # twice the sine of the angle
     angle = rotation_angle(turn)
     rotation = axis / 2 if sine < 1e-9 else axis / sine * angle
     return np.concatenate([true[:3, 3] - T[:3, 3], rotation])
 
 
 def _scale(p: CovarianceParameters) -> Floats:
-    """What makes metres of an error's six numbers."""
+    """Return the factors that convert an error's six numbers to metres."""
     return np.array([1.0, 1.0, 1.0, p.lever, p.lever, p.lever])

@@ -1,11 +1,18 @@
-"""Sec. III-E, evidence: how well two surfaces agree under a transform.
+"""Measure how well two surfaces agree under a transform (Sec. III-E, evidence).
 
     points of the source, surface of the target, T  --agreements-->  inliers, violations
+    Surface  --lookup_target-->  LookupTarget    LookupTarget, point  --nearest_alike-->  index
+    Geometry  --plane_view-->  PlaneView         transforms  --plane_agreement-->  PlaneAgreement
 
-Points are looked up where the target's camera would see them: no search tree, and what the
-sensor saw *through* counts too. A point that lies before the surface that the target saw
-violates free space: had it been there, the target would have seen it. Where the target has no
-viewpoint, points are looked up by place, and nothing is known of free space.
+Points are projected into the target's camera: no search tree is needed, and a point in front of the
+target's surface violates free space, because the target would have seen it. If the target has no
+viewpoint, points are looked up by position, and free space is unknown.
+
+Unordered points are stored in a hash of cubes. One point per small cube is kept, so a cube holds a
+bounded number of points.
+
+A floor may be half of what a sensor sees, yet a floor on a floor is weak evidence for a transform.
+So patches that lie in one plane share one weight.
 """
 
 from __future__ import annotations
@@ -44,27 +51,20 @@ from sceneprint.types import (
     camera_of,
 )
 
-# Sec. III-E, a surface made ready to be looked up: by its camera, or by place where it has none.
-#
-#     Surface  --target_of-->  Target        Target, point  --nearest_alike-->  index
-#
-# Points in no order are found in a hash of cubes. Of the points in a small cube one is kept, so
-# that a cube holds a bounded number of them, however many a cloud has in one place.
-
-#: Small cubes along the reach; a cube of the hash is two reaches wide.
+#: Number of small cubes along the reach; a cube of the hash is two reaches wide.
 FINENESS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class LookupTarget:
-    """A surface as kernels look it up.
+    """A surface prepared for look-ups by kernels.
 
     Parameters
     ----------
-    points, normals : (h, w, 3); (1, N, 3) of a cloud in no order
-    camera : (7,) of `camera_of`; of a cloud in no order its third number is the reach, and its
-        fourth the secret of the hash
-    heads, chain : of the hash: the first point of each slot, the next of each point, -1 for none
+    points, normals : (h, w, 3); (1, N, 3) if unordered
+    camera : (7,) of `camera_of`; if unordered, its third number is the reach, and its fourth the
+        secret of the hash
+    heads, chain : hash table: first point of each slot, and next point of each point; -1 for none
     """
 
     points: Floats32
@@ -76,13 +76,13 @@ class LookupTarget:
 
 @kernel
 def _slot(i: int, j: int, k: int, slots: int, secret: int) -> int:
-    """Of a cube: slots is a power of two."""
+    """Return the slot of a cube; the number of slots is a power of two."""
     return hash_key((((i << 21) + j) << 21) + k, secret) & (slots - 1)
 
 
 @kernel
 def _fill(points: Floats32, cube: float, secret: int, heads: Ints32, chain: Ints32) -> None:
-    """Every point in the slot of its cube, the last first."""
+    """Enter every point into the slot of its cube, the last first."""
     for n in range(len(points)):
         slot = _slot(
             int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
@@ -97,7 +97,7 @@ def nearest_alike(
     points: Floats32, normals: Floats32, camera: Floats, heads: Ints32, chain: Ints32,
     at: Floats, facing: Floats, least_cosine: float,
 ) -> tuple[int, float]:  # fmt: skip
-    """The nearest point within reach whose normal is alike: index, -1 for none, and squared."""
+    """Return the nearest point in reach with a similar normal: index, -1 for none, and square."""
     reach, secret, slots = camera[2], int(camera[3]), len(heads)
     cube = 2.0 * reach
     # the eight cubes that a ball of this reach can touch
@@ -114,7 +114,7 @@ def nearest_alike(
                         at[0] - points[0, n, 0], at[1] - points[0, n, 1], at[2] - points[0, n, 2]
                     )  # fmt: skip
                     square = ex * ex + ey * ey + ez * ez
-                    # of two as near the first, in whatever order slots are walked
+                    # of equals the first, independent of the order of the slots
                     if square < least or (square == least and found > n):
                         cosine = (
                             facing[0] * normals[0, n, 0]
@@ -131,9 +131,9 @@ def nearest_alike(
 def _first_in_cubes(
     points: Floats32, cube: np.float32, secret: int, table: Ints32, cells: Ints64, kept: Ints32
 ) -> int:
-    """Points in whose cube none comes before; how many.
+    """Write the indices of the points that are first in their cubes; return their number.
 
-    table: of slots, a power of two, all -1. cells: (N, 3), cubes of the points that are kept.
+    table: slots, a power of two, all -1. cells: (N, 3), cubes of these points.
     """
     mask, found = len(table) - 1, 0
     for n in range(len(points)):
@@ -141,7 +141,7 @@ def _first_in_cubes(
             int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
             int(np.floor(points[n, 2] / cube)),
         )  # fmt: skip
-        # twice, as cubes may be so many that three numbers do not fit in one
+        # hash twice, because three indices may not fit in one number
         slot = hash_key((hash_key((i << 32) ^ j, secret) << 19) + k, secret) & mask
         while True:
             other = table[slot]
@@ -157,8 +157,8 @@ def _first_in_cubes(
     return found
 
 
-def one_of_each(points: Floats32, cube: float) -> Ints32:
-    """Indices, rising, of the first point (N, 3) in each occupied cube of this width, metres."""
+def first_per_cube(points: Floats32, cube: float) -> Ints32:
+    """Return ascending indices of the first point (N, 3) in each occupied cube; width in metres."""
     n = len(points)
     table = np.full(1 << max((2 * n - 1).bit_length(), 1), -1, np.int32)
     cells, kept = np.empty((n, 3), np.int64), np.empty(n, np.int32)
@@ -168,89 +168,89 @@ def one_of_each(points: Floats32, cube: float) -> Ints32:
 
 
 @cached_per_frame
-def target_of(surface: Surface, nearest: float, reach: float) -> LookupTarget:
-    """A surface made ready to be looked up.
+def lookup_target(surface: Surface, nearest: float, reach: float) -> LookupTarget:
+    """Return a surface prepared for look-ups.
 
     Parameters
     ----------
-    surface : of any kind
-    nearest : points this near its camera are not looked up, metres of depth
-    reach : how far off a point may be that is in no order, metres
+    surface : surface of any kind
+    nearest : least depth of a point in its camera, metres
+    reach : greatest distance to an unordered point, metres
     """
     camera, none = camera_of(surface.camera, nearest), np.zeros(0, np.int32)
     if surface.camera is not None:
         return LookupTarget(surface.points, surface.normals, camera, none, none)
-    secret = secrets.randbits(52)  # what a float64 holds whole
+    secret = secrets.randbits(52)  # exact in float64
     camera[2:4] = reach, secret
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
-    kept = one_of_each(points, reach / FINENESS)
-    points, normals = points[kept], normals[kept]
+    indices = first_per_cube(points, reach / FINENESS)
+    points, normals = points[indices], normals[indices]
     slots = 1 << max(int(2 * len(points) - 1).bit_length(), 1)
     heads, chain = np.full(slots, -1, np.int32), np.full(len(points), -1, np.int32)
     _fill(points, 2.0 * reach, secret, heads, chain)
     return LookupTarget(points[None], normals[None], camera, heads, chain)
 
 
-def thinned(surface: Surface, most: int, cube: float = 0.0) -> Surface:
-    """At most so many of a surface's points in no order, spread over all that it shows.
+def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
+    """Return at most `most` of a surface's unordered points, spread evenly.
 
     Parameters
     ----------
-    surface : without a camera
-    most : at least 1
-    cube : width of the first grid that is tried, metres; default: a 4096th of all that it shows
+    surface : surface without a camera
+    most : maximum number of points, at least 1
+    cube : width of the first grid, metres; default: a 4096th of the extent
 
     Returns
     -------
-    surface : the first point in each cube of a grid, as wide as it must be; the valid points
-        themselves where they are no more than that
+    surface : the first point in each cube of a grid that is wide enough; all valid points if there
+        are few
     """
     points = surface.points[surface.valid]
-    kept = np.arange(len(points), dtype=np.int32)
+    indices = np.arange(len(points), dtype=np.int32)
     cube = cube or float(np.ptp(points, axis=0).max(initial=0.0)) / 4096
-    while len(kept) > most:
-        # of n cubes about a surface half are left when they are wider by the root of 2
-        cube *= max((len(kept) / most) ** 0.5, 1.02)
-        kept = one_of_each(points, cube) if cube > 0 else kept[:1]
+    while len(indices) > most:
+        # widening by the root of 2 halves the number of cubes that a surface occupies
+        cube *= max((len(indices) / most) ** 0.5, 1.02)
+        indices = first_per_cube(points, cube) if cube > 0 else indices[:1]
     return Surface(
-        points[kept][None],
-        surface.normals[surface.valid][kept][None],
-        np.ones((1, len(kept)), np.bool_),
-        surface.areas[surface.valid][kept][None],
+        points[indices][None],
+        surface.normals[surface.valid][indices][None],
+        np.ones((1, len(indices)), np.bool_),
+        surface.areas[surface.valid][indices][None],
         None,
     )
 
 
-#: Of the surface of a depth image: 160 x 120.
+#: Number of pixels of a depth image's surface: 160 x 120.
 DEPTH_PIXELS = 19_200
 
 
 @dataclass(frozen=True)
 class OverlapParameters:
-    """The numbers of agreement; lengths grow by max(1, (z / `reference_depth`)^`growth`)."""
+    """Parameters of agreement; lengths grow by max(1, (z / `reference_depth`)^`growth`)."""
 
-    surface_tolerance: float = 0.05  #: of a point from the target's plane, metres
-    point_tolerance: float = 0.15  #: of a point from the target's point, metres
-    normal_cosine: float = 0.7  #: of the angle between normals that agree
-    free_space_margin: float = 0.1  #: before the surface, metres
-    reference_depth: float = 5.0**0.5  #: where a depth sensor's noise starts to matter, metres
-    edge_px: int = 2  #: a violation keeps this far from any pixel that agrees, pixels
-    stride: int = 5  #: of the pixels that are looked up
-    growth: int = 2  #: of lengths with depth: 2 as a depth sensor's noise, 1 or 0 as a scanner's
-    nearest: float = 0.1  #: points this near the target's camera are not looked up, metres
+    surface_tolerance: float = 0.05  #: greatest distance of a point from the target's plane, metres
+    point_tolerance: float = 0.15  #: greatest distance of a point from the target's point, metres
+    normal_cosine: float = 0.7  #: least cosine between normals that agree
+    free_space_margin: float = 0.1  #: least distance of a violation before the surface, metres
+    reference_depth: float = 5.0**0.5  #: depth from which a depth sensor's noise matters, metres
+    edge_px: int = 2  #: least distance of a violation from a pixel that agrees, pixels
+    stride: int = 5  #: stride of the pixels that are looked up
+    growth: int = 2  #: 2 for the noise of a depth sensor, 1 or 0 for a scanner's
+    nearest: float = 0.1  #: least depth of a point in the target's camera, metres
 
 
 @dataclass(frozen=True)
 class Overlap:
     """Counts of the source's points."""
 
-    points: int  #: all of them
-    inliers: int  #: that lie on the target's surface, normals alike
-    violations: int | None  #: that lie where the target saw through; None if it has no viewpoint
+    points: int  #: number of all points
+    inliers: int  #: points on the target's surface with similar normals
+    violations: int | None  #: points in the target's free space; None without a viewpoint
 
     @property
     def violation_share(self) -> float:
-        """Violations as a share of violations and inliers."""
+        """Return the share of violations among violations and inliers."""
         violations = self.violations or 0
         return violations / max(self.inliers + violations, 1)
 
@@ -260,7 +260,10 @@ def _copy_valid(
     points: Floats32, normals: Floats32, valid: NDArray[np.bool_],
     rows: tuple[int, int], columns: tuple[int, int], out: Floats32,
 ) -> int:  # fmt: skip
-    """Points and normals of valid pixels, line by line; how many. rows, columns: first and step."""
+    """Copy points and normals of valid pixels line by line; return their number.
+
+    rows, columns: first and step.
+    """
     found = 0
     for y in range(rows[0], valid.shape[0], rows[1]):
         for x in range(columns[0], valid.shape[1], columns[1]):
@@ -272,16 +275,12 @@ def _copy_valid(
 
 
 @cached_per_frame
-def sampled(surface: Surface, stride: int) -> Floats32:
-    """Valid pixels of every `stride`-th row and column; of a cloud, about as many points.
+def sample_points(surface: Surface, stride: int) -> Floats32:
+    """Return every `stride`-th row and column's valid points and normals, (N, 6) float32.
 
-    Two frames are to have equal say, whatever saw them: a sphere of more pixels than
-    `DEPTH_PIXELS` is strode through faster, and of the points of a scan about as many are taken.
-    A stride of 1 takes all of the map.
-
-    Returns
-    -------
-    (N, 6) float32, points and normals
+    Frames of all sensors should contribute equally: a sphere with more pixels than `DEPTH_PIXELS`
+    gets a greater stride, and about as many points of a scan are returned. A stride of 1 returns
+    the whole map.
     """
     if surface.spread is not None and stride > 1:
         points, normals = surface.spread.points[0], surface.spread.normals[0]
@@ -300,11 +299,9 @@ def sampled(surface: Surface, stride: int) -> Floats32:
     return both[:found].copy()
 
 
-#: What a target says of a point: nothing, that it lies on its surface, or that it saw through.
+#: Verdicts of a target on a point: unobserved, on its surface, or in its free space.
 UNKNOWN, AGREES, VIOLATES = 0, 1, 2
-
-
-#: What `_compare` leaves to `_sees_through`.
+#: Preliminary verdict of `_compare`, decided by `_saw_through`.
 _BEFORE = 3
 
 
@@ -313,10 +310,10 @@ def _compare(
     source: Floats32, start: int, places: Ints32, count: int, points: Floats32, normals: Floats32,
     camera: Floats, moved: Floats, pixels: Ints32, T: Floats, tolerances: Floats, said: Bytes,
 ) -> None:  # fmt: skip
-    """What the pixel at each point says of it; `_BEFORE` where the point lies before its surface.
+    """Write the verdict of each point's pixel; `_BEFORE` if the point lies before its surface.
 
-    source (6, N), places : from `start` on; moved (4, n), pixels (2, n) : of those points, their
-    coordinates and depth, and where they are seen
+    source (6, N), places : indices from `start` on; moved (4, n), pixels (2, n) : coordinates,
+    depth and pixels of these points
     """
     on_surface, on_point, least_cosine = tolerances[0], tolerances[1], tolerances[2]
     margin, reference, power = tolerances[3], tolerances[4], tolerances[6]
@@ -348,11 +345,12 @@ def _compare(
 
 
 @kernel
-def _sees_through(
+def _saw_through(
     points: Floats32, camera: Floats, u: int, v: int, depth: float, tolerances: Floats
 ) -> bool:
-    """Whether a point before the surface of its pixel lies before those of the pixels about it
-    too: at an edge, a pixel near by may show the surface that the point is on.
+    """Return whether a point lies before the surfaces of its pixel and of all pixels nearby.
+
+    At an edge, a pixel nearby may show the surface of the point.
     """
     height, width, edge = points.shape[0], points.shape[1], int(tolerances[5])
     nearest = depth_at(camera, points, v, u)
@@ -362,7 +360,7 @@ def _sees_through(
             if column < 0 or column >= width:
                 if camera[0] == 0 or camera[6] == 0:
                     continue
-                beside = column % width  # around the back of a closed sphere
+                beside = column % width  # across the seam of a closed sphere
             there = depth_at(camera, points, line, beside)
             if there > 0:
                 nearest = min(nearest, there)
@@ -375,7 +373,7 @@ def _look_up_seen(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
     tolerances: Floats, said: Bytes,
 ) -> None:  # fmt: skip
-    """What the maps of a target with a camera say of the source's points (6, N) under T, (N,)."""
+    """Write the verdicts (N,) of a target with a camera on points (6, N) under T."""
     height, width = points.shape[0], points.shape[1]
     moved, seen, inside = np.empty((3, BLOCK)), np.empty((3, BLOCK)), np.empty((4, BLOCK))
     places, pixels = np.empty(BLOCK, np.int32), np.empty((2, BLOCK), np.int32)
@@ -397,7 +395,7 @@ def _look_up_seen(
             says = own[i]
             if says == _BEFORE:
                 u, v = pixels[0, i], pixels[1, i]
-                through = _sees_through(points, camera, u, v, inside[3, i], tolerances)
+                through = _saw_through(points, camera, u, v, inside[3, i], tolerances)
                 says = VIOLATES if through else UNKNOWN
             said[start + places[i]] = says
 
@@ -407,7 +405,7 @@ def _look_up_near(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
     chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
 ) -> None:  # fmt: skip
-    """The same of a target whose points are in no order."""
+    """Write the verdicts (N,) of a target with unordered points on points (N, 6) under T."""
     at, facing = np.empty(3), np.empty(3)
     for i in range(len(source)):
         said[i] = UNKNOWN
@@ -432,7 +430,7 @@ def _look_up(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
     chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
 ) -> None:  # fmt: skip
-    """What a target says of each point of the source (N, 6) under T, (N,)."""
+    """Write the verdicts (N,) of a target on points (N, 6) under T."""
     if camera[0] == 2:
         _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, said)
     else:
@@ -444,7 +442,7 @@ def weigh_overlap(
     source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Weight of inliers and of violations of the source (N, 6) on a target under T."""
+    """Return the weights of inliers and of violations of points (N, 6) on a target under T."""
     said = np.empty(len(source), np.uint8)
     _look_up(source, points, normals, camera, heads, chain, T, tolerances, said)
     inliers, violations = 0.0, 0.0
@@ -468,7 +466,7 @@ def _weigh_all(
 
 
 def tolerances(p: OverlapParameters) -> Floats:
-    """The parameters as the kernel takes them."""
+    """Return the parameters as an array for the kernels."""
     return np.array(
         [
             p.surface_tolerance, p.point_tolerance, p.normal_cosine,
@@ -477,9 +475,9 @@ def tolerances(p: OverlapParameters) -> Floats:
     )  # fmt: skip
 
 
-def looked_up(surface: Surface, p: OverlapParameters) -> LookupTarget:
-    """A surface made ready for `weigh_overlap`."""
-    return target_of(surface, p.nearest, p.point_tolerance)
+def overlap_target(surface: Surface, p: OverlapParameters) -> LookupTarget:
+    """Return a surface prepared for `weigh_overlap`."""
+    return lookup_target(surface, p.nearest, p.point_tolerance)
 
 
 def agreements(
@@ -489,22 +487,18 @@ def agreements(
     p: OverlapParameters,
     weights: Floats32 | None = None,
 ) -> Floats:
-    """How a source's points fit what the target saw, under each of some transforms: Sec. III-E.
+    """Return the weights of inliers and violations, (n, 2), under each of n transforms: Sec. III-E.
 
     Parameters
     ----------
-    source : (N, 6) float32 of `sampled`
-    target : (h, w) surface, or points in no order, which show no violations
+    source : (N, 6) float32 result of `sample_points`
+    target : (h, w) surface, or unordered points, which have no violations
     transforms : (n, 4, 4) T_target_source
-    weights : (N,) of the points; default: 1 each
-
-    Returns
-    -------
-    (n, 2) weight of the inliers, and of the violations
+    weights : (N,) weights of the points; default: 1 each
     """
     out = np.zeros((len(transforms), 2))
     w = np.ones(len(source), np.float32) if weights is None else weights
-    t = looked_up(target, p)
+    t = overlap_target(target, p)
     _weigh_all(
         source, w, t.points, t.normals, t.camera, t.heads, t.chain,
         np.ascontiguousarray(transforms), tolerances(p), out,
@@ -515,17 +509,13 @@ def agreements(
 def look_up(
     source: Floats32, target: LookupTarget, T_target_source: Floats, tolerances: Floats
 ) -> Bytes:
-    """What a target says of each point of a source under one transform.
+    """Return a target's verdicts on points (N, 6): UNKNOWN, AGREES or VIOLATES, (N,) uint8.
 
     Parameters
     ----------
     source : (N, 6) float32
-    target : of `looked_up`
-    tolerances : of `tolerances`
-
-    Returns
-    -------
-    (N,) uint8: UNKNOWN, AGREES or VIOLATES
+    target : result of `overlap_target`
+    tolerances : result of `tolerances`
     """
     said = np.empty(len(source), np.uint8)
     _look_up(
@@ -538,36 +528,28 @@ def look_up(
 def overlap_counts(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Overlap:
-    """How a source's points fit what the target saw under one transform; see `agreements`."""
-    (inliers, violations) = agreements(source, target, T_target_source[None], p)[0].tolist()
-    known = target.camera is not None
-    return Overlap(len(source), round(inliers), round(violations) if known else None)
-
-
-# Sec. III-E, evidence by planes: what agrees, every plane counting as much as another.
-#
-#     Geometry  --plane_view-->  PlaneView        transforms  --explained-->  Explained
-#
-# That a floor lies on a floor says little, wherever on it one stands, and a floor may be half of
-# what a sensor sees. So patches that lie in one plane share one weight.
+    """Return the counts of agreement under one transform; see `agreements`."""
+    inliers, violations = agreements(source, target, T_target_source[None], p)[0].tolist()
+    has_viewpoint = target.camera is not None
+    return Overlap(len(source), round(inliers), round(violations) if has_viewpoint else None)
 
 
 @dataclass(frozen=True)
 class PlaneParameters:
-    """Which patches lie in one plane."""
+    """Limits within which patches lie in one plane."""
 
-    coplanar: float = math.radians(15.0)  #: normals this near may be of one plane
-    same_plane: float = 0.06  #: offsets this near are one plane, metres
+    coplanar: float = math.radians(15.0)  #: greatest angle between normals
+    same_plane: float = 0.06  #: greatest offset, metres
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneView:
-    """A frame as its planes are weighed.
+    """A frame with its patches weighed by planes.
 
     Parameters
     ----------
     points : (P, 6) float32, means and normals of the patches
-    weights : (P,) float32, of which those of one plane add up to 1
+    weights : (P,) float32; those of one plane add up to 1
     """
 
     surface: Surface
@@ -577,13 +559,13 @@ class PlaneView:
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
-    """How far transforms explain two frames, every plane counting the same.
+class PlaneAgreement:
+    """The agreement of two frames under transforms, all planes weighing the same.
 
     Parameters
     ----------
-    share : (n,) of both frames that agrees, 0 to 1
-    violations : (n,) of free space, as a share of what agrees or violates, 0 to 1
+    share : (n,) share of both frames that agrees, 0 to 1
+    violations : (n,) violations of free space as a share of agreements and violations, 0 to 1
     """
 
     share: Floats
@@ -592,7 +574,7 @@ class Explained:
 
 @kernel
 def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Ints32) -> None:
-    """How many patches lie in the plane of each, itself among them; arrays (3, P)."""
+    """Write the number of patches in the plane of each patch, itself included; arrays (3, P)."""
     x, y, z, nx, ny, nz = means[0], means[1], means[2], normals[0], normals[1], normals[2]
     for i in range(len(out)):
         ix, iy, iz, a, b, c = x[i], y[i], z[i], nx[i], ny[i], nz[i]
@@ -605,7 +587,7 @@ def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Int
 
 
 def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
-    """Weights of patches: 1 over the number of patches that lie in the plane of each, (P,)."""
+    """Return the weights of patches, (P,): 1 over the number of patches in the plane of each."""
     counts = np.zeros(len(patches), np.int32)
     means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
     _count(means, normals, math.cos(p.coplanar), p.same_plane, counts)
@@ -615,18 +597,18 @@ def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
 
 @cached_per_frame
 def plane_view(geometry: Geometry, p: PlaneParameters) -> PlaneView:
-    """A frame made ready for `explained`."""
+    """Return a frame prepared for `plane_agreement`."""
     patches = geometry.patches
     points = np.concatenate([patches.means, patches.normals], axis=1).astype(np.float32)
     return PlaneView(geometry.surface, patches, points, plane_weights(patches, p))
 
 
-def explained(
+def plane_agreement(
     query: PlaneView, match: PlaneView, transforms: Floats, p: OverlapParameters
-) -> Explained:
-    """How far each of some transforms (n, 4, 4), T_match_query, explains two frames."""
-    of_query = agreements(query.points, match.surface, transforms, p, query.weights)
-    of_match = agreements(match.points, query.surface, inverses(transforms), p, match.weights)
-    both = of_query + of_match
-    everything = float(query.weights.sum(dtype=float) + match.weights.sum(dtype=float))
-    return Explained(both[:, 0] / everything, both[:, 1] / np.maximum(both.sum(axis=1), 1e-9))
+) -> PlaneAgreement:
+    """Return the agreement of two frames under transforms (n, 4, 4) T_match_query."""
+    there = agreements(query.points, match.surface, transforms, p, query.weights)
+    back = agreements(match.points, query.surface, inverses(transforms), p, match.weights)
+    both = there + back
+    total = float(query.weights.sum(dtype=float) + match.weights.sum(dtype=float))
+    return PlaneAgreement(both[:, 0] / total, both[:, 1] / np.maximum(both.sum(axis=1), 1e-9))

@@ -1,10 +1,14 @@
-"""Sec. III-E, descriptors: how all other patches lie about each patch, as histograms.
+"""Describe the surroundings of each patch by histograms, and match patches by them (Sec. III-E).
 
     Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
+    descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
 
-The properties are of the kind of Eq. (1), and as macro-scale: of every other patch within reach,
-how far off in the plane of the patch it lies, how high over it, and how its normal stands to that
-plane and to the direction it lies in. None of them changes under a rigid motion.
+The properties resemble those of Eq. (1) and are as macro-scale: for every other patch within reach,
+its distance in the plane of the patch, its height over it, and the angles of its normal to the
+patch's normal and to its direction. All are invariant under rigid motion.
+
+Reading R10 (docs/paper.md): only the idea of the paper's patch matching is public. A random sample
+of the source's patches is compared with all of the target's, and each keeps its nearest.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ ANGLES = 3
 
 @dataclass(frozen=True)
 class PatchDescriptorParameters:
-    """The numbers of the histograms: reach in metres, then bins of distance and of height."""
+    """Parameters of the histograms: reach in metres, then bins of distance and of height."""
 
     near_radius: float = 0.4
     near_distances: int = 4
@@ -38,7 +42,7 @@ class PatchDescriptorParameters:
 
     @property
     def scales(self) -> Floats:
-        """(3, 3): radius, bins of distance, bins of height of each scale."""
+        """Return radius, bins of distance, and bins of height of each scale, (3, 3)."""
         return np.array(
             [
                 (self.near_radius, self.near_distances, self.near_heights),
@@ -50,13 +54,13 @@ class PatchDescriptorParameters:
 
     @property
     def dimension(self) -> int:
-        """D, bins of all scales."""
+        """Return D, the number of bins of all scales."""
         return int((self.scales[:, 1] * self.scales[:, 2]).sum()) * ANGLES * ANGLES
 
 
 @dataclass(frozen=True, eq=False)
 class Compression:
-    """What descriptors keep of histograms: their principal components, learnt once.
+    """The principal components of histograms, learnt once.
 
     Parameters
     ----------
@@ -69,19 +73,19 @@ class Compression:
 
     @property
     def offset(self) -> Floats32:
-        """The mean's own components, (d,)."""
+        """Return the mean's own components, (d,)."""
         result: Floats32 = (self.matrix.astype(float) @ self.mean).astype(np.float32)
         return result
 
 
-#: Of 128 components of a unit vector few leave [-RANGE, RANGE]. Those are clipped, so that one
-#: large component, such as that of lying in a floor, does not outweigh all others.
+#: Limit of the components of a unit vector. Few of 128 exceed it; clipping keeps one large
+#: component, such as that of floors, from outweighing all others.
 RANGE = 0.25
 
 
 @disjoint_kernel
 def _squares(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> None:
-    """Squared distances of patch i from all."""
+    """Write the squared distances of patch i from all patches."""
     ix, iy, iz = x[i], y[i], z[i]
     for j in range(len(out)):
         dx, dy, dz = x[j] - ix, y[j] - iy, z[j] - iz
@@ -90,7 +94,7 @@ def _squares(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> None:
 
 @disjoint_kernel
 def _nearer(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
-    """Indices of squared distances below a limit, but for one; how many."""
+    """Write the indices of squared distances below a limit, except `but`; return their number."""
     found = 0
     for j in range(count):
         places[found] = j
@@ -99,14 +103,14 @@ def _nearer(squares: Floats, count: int, but: int, limit: float, places: Ints32)
 
 
 @disjoint_kernel
-def _lie(
+def _locate(
     points: Floats, normals: Floats, areas: Floats, squares: Floats, i: int, places: Ints32,
     count: int, angles: int, lies: Floats, bins: Ints32,
 ) -> None:  # fmt: skip
-    """How other patches lie about patch i.
+    """Write the positions of other patches relative to patch i.
 
     lies (6, n): squared distance, distance in the plane, height, share of the upper bin of either
-    angle, and area. bins (4, n): of both angles, the upper one of the second changing first.
+    angle, and area. bins (4, n): bins of both angles; that of the second changes first.
     """
     x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
     ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
@@ -117,7 +121,7 @@ def _lie(
         height = dx * ax + dy * ay + dz * az
         cosine = ax * bx + ay * by + az * bz
         flat = np.sqrt(max(squares[j] - height * height, 0.0))
-        # of the other normal, along the direction in the plane
+        # component of the other normal along the direction in the plane
         radial = (bx * dx + by * dy + bz * dz - height * cosine) / flat
         radial = radial if flat > 1e-3 else 0.0
         e = min(max((cosine + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
@@ -136,7 +140,7 @@ def _spread(
     lies: Floats, places: Ints32, count: int, radius: float, n_flat: int, n_high: int,
     n_angles: int, weights: Floats, starts: Ints32,
 ) -> None:  # fmt: skip
-    """Weights (4, n) of patches in bins of distance and height, and where these start."""
+    """Write the weights (4, n) of patches in bins of distance and height, and the bins' starts."""
     flat, height, area = lies[1], lies[2], lies[5]
     for k in range(count):
         i = np.uint64(places[k])
@@ -159,7 +163,7 @@ def _add(
     lies: Floats, bins: Ints32, places: Ints32, count: int, weights: Floats, starts: Ints32,
     histogram: Floats32,
 ) -> None:  # fmt: skip
-    """The sixteen shares of each patch, one patch after the other."""
+    """Add the sixteen shares of each patch to the histogram, in the order of the patches."""
     for k in range(count):
         i = np.uint64(places[k])
         fe, fg = lies[3, i], lies[4, i]
@@ -176,7 +180,7 @@ def _add(
 def _accumulate(
     points: Floats, normals: Floats, areas: Floats, scales: Floats, angles: int, out: Floats32
 ) -> None:
-    """Each pair's area into the sixteen bins about it, at each scale that reaches it.
+    """Add the area of each pair to the sixteen bins around it, at each scale that reaches it.
 
     points, normals : (3, P)
     """
@@ -190,7 +194,7 @@ def _accumulate(
     for i in range(count):
         _squares(points[0], points[1], points[2], i, squares)
         reached = _nearer(squares, count, i, reach * reach, within)
-        _lie(points, normals, areas, squares, i, within, reached, angles, lies, bins)
+        _locate(points, normals, areas, squares, i, within, reached, angles, lies, bins)
         start = 0
         for s in range(len(scales)):
             radius, n_flat, n_high = scales[s, 0], int(scales[s, 1]), int(scales[s, 2])
@@ -202,8 +206,8 @@ def _accumulate(
 
 
 @disjoint_kernel
-def _filled(row: Floats32, first: int, last: int, places: Ints32) -> int:
-    """Places of bins that are not empty; how many."""
+def _occupied_bins(row: Floats32, first: int, last: int, places: Ints32) -> int:
+    """Write the indices of the occupied bins; return their number."""
     found = 0
     for k in range(first, last):
         places[found] = k
@@ -213,19 +217,19 @@ def _filled(row: Floats32, first: int, last: int, places: Ints32) -> int:
 
 @kernel
 def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
-    """Root of every bin, then length 1 / sqrt(scales) for every scale (Hellinger kernel).
+    """Take the root of every bin, and normalise every scale to 1 / sqrt(scales) (Hellinger kernel).
 
-    Two thirds of the bins are empty, and stay so.
+    Two thirds of the bins are empty and stay so.
     """
     places = np.empty(out.shape[1], np.int32)
     for i in range(len(out)):
         start, row = 0, out[i]
         for s in range(len(scales)):
             end = start + int(scales[s, 1]) * int(scales[s, 2]) * angles * angles
-            found, total = _filled(row, start, end, places), 0.0
+            found, total = _occupied_bins(row, start, end, places), 0.0
             for n in range(found):
                 total += row[places[n]]
-            if found > 0:  # the root's squared length is the sum
+            if found > 0:  # the squared length of the roots is the sum
                 factor = 1.0 / np.sqrt(total * len(scales))
                 for n in range(found):
                     k = places[n]
@@ -234,15 +238,11 @@ def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
 
 
 def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats32:
-    """Histograms of the macro-scale surroundings of each patch.
-
-    Parameters
-    ----------
-    patches : P of them
+    """Return histograms of the macro-scale surroundings of each patch.
 
     Returns
     -------
-    (P, D) float32, each row of length 1 where there is a patch within the nearest reach
+    (P, D) float32, rows of unit length if there is a patch within the nearest reach
     """
     out = np.zeros((len(patches), p.dimension), np.float32)
     points, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
@@ -251,15 +251,15 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
     return out
 
 
-#: Bins whose rows of the matrix stay in the cache while all histograms are multiplied with them.
+#: Number of bins whose rows of the matrix stay in the cache during multiplication.
 _BINS = 256
 
 
 @disjoint_kernel
 def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floats32) -> None:
-    """Rows times matrix (D, d), less the offset; most bins of a histogram are empty.
+    """Write rows times matrix (D, d), less the offset; most bins of a histogram are empty.
 
-    Four bins at a time, added in their order: a row is read and written a quarter as often.
+    Four bins are added at a time, in their order, which quarters the reads and writes of a row.
     """
     places = np.empty(_BINS, np.int32)
     for i in range(len(histograms)):
@@ -269,7 +269,7 @@ def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floa
         end = min(start + _BINS, histograms.shape[1])
         for i in range(len(histograms)):
             histogram, row = histograms[i], out[i]
-            count = _filled(histogram, start, end, places)
+            count = _occupied_bins(histogram, start, end, places)
             fours = count - count % 4
             for at in range(0, fours, 4):
                 b0, b1, b2, b3 = places[at], places[at + 1], places[at + 2], places[at + 3]
@@ -284,18 +284,19 @@ def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floa
 
 
 def compress(histograms: Floats32, by: Compression) -> Bytes:
-    """Histograms to the bytes that are stored and compared.
+    """Compress histograms to the bytes that are stored and compared.
 
-    Components on the principal axes, brought to length 1; a byte is 1/255 of [-RANGE, RANGE].
+    They are components on the principal axes, normalised to unit length; a byte is 1/255 of
+    [-RANGE, RANGE].
 
     Parameters
     ----------
-    histograms : (P, D) of `patch_descriptors`
-    by : learnt on the same histograms' layout
+    histograms : (P, D) result of `patch_descriptors`
+    by : compression learnt on histograms of the same layout
 
     Returns
     -------
-    (P, d) uint8, 128 for nought
+    (P, d) uint8, 128 for 0
     """
     out = np.empty((len(histograms), len(by.matrix)), np.float32)
     _project(histograms, np.ascontiguousarray(by.matrix.T), by.offset, out)
@@ -306,42 +307,34 @@ def compress(histograms: Floats32, by: Compression) -> Bytes:
 
 
 def fit_compression(histograms: Floats32, dimension: int) -> Compression:
-    """The principal components of histograms.
+    """Return the principal components of histograms.
 
     Parameters
     ----------
     histograms : (N, D), N > D
-    dimension : d, components kept
+    dimension : d, number of components
 
     Raises
     ------
-    ValueError : fewer histograms than bins, or more components than bins.
+    ValueError : there are fewer histograms than bins, or more components than bins
     """
     count, bins = histograms.shape
     if count <= bins or not 1 <= dimension <= bins:
-        raise ValueError(f"{dimension} components of {histograms.shape} histograms")
+        raise ValueError(f"{histograms.shape} histograms cannot determine {dimension} components")
     mean = histograms.mean(axis=0, dtype=float)
     covariance = histograms.T.astype(float) @ histograms / count - np.outer(mean, mean)
     _, vectors = np.linalg.eigh(covariance)
     rows = vectors.T[::-1][:dimension]
-    signs = np.sign(rows[np.arange(dimension), np.abs(rows).argmax(axis=1)])  # a fixed choice
+    signs = np.sign(rows[np.arange(dimension), np.abs(rows).argmax(axis=1)])  # eigenvectors lack it
     return Compression(mean.astype(np.float32), (rows * signs[:, None]).astype(np.float32))
-
-
-# Sec. III-E, matching: patches of two frames whose surroundings are alike.
-#
-#     descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
-#
-# Reading R10 (docs/paper.md): of the paper's patch matching only the idea is public. A random few
-# of the source's patches are compared with all of the target's, and each keeps its nearest.
 
 
 @dataclass(frozen=True)
 class MatchingParameters:
-    """The numbers of matching."""
+    """Parameters of matching."""
 
-    n_sources: int = 100  #: patches drawn from the source
-    n_nearest: int = 3  #: correspondences each keeps
+    n_sources: int = 100  #: number of patches drawn from the source
+    n_nearest: int = 3  #: number of correspondences per patch
 
 
 @kernel
@@ -349,7 +342,7 @@ def _nearest(
     source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int, slopes: Floats, onto: Floats,
     gate: float, pairs: Ints32,
 ) -> int:  # fmt: skip
-    """The targets nearest to each source drawn, by squared distance, ties by index; how many."""
+    """Write the targets nearest to each sampled source; return the number of pairs."""
     count, length = target.shape
     farthest = np.int32(2147483647)
     squares = np.empty(count, np.int32)
@@ -371,7 +364,7 @@ def _nearest(
             for j in range(1, count):
                 if squares[j] < squares[best]:
                     best = j
-            if squares[best] == farthest:  # no other stands at this angle to up
+            if squares[best] == farthest:  # no other patch has this angle to up
                 break
             pairs[found, 0] = drawn[row]
             pairs[found, 1] = best
@@ -382,12 +375,12 @@ def _nearest(
 
 @dataclass(frozen=True, eq=False)
 class SlopeGate:
-    """Which patches may correspond where up is known in both frames.
+    """The gate of correspondences by the slopes of patches, if up is known in both frames.
 
     Parameters
     ----------
     source, target : (P,) and (P',) angles of the patches' normals to up, radians
-    most : that two may differ by
+    most : greatest difference of corresponding angles
     """
 
     source: Floats
@@ -402,25 +395,25 @@ def correspondences(
     p: MatchingParameters,
     gate: SlopeGate | None = None,
 ) -> Ints32:
-    """Correspondences of a random few of the source's patches: Sec. III-E.
+    """Return correspondences of a random sample of the source's patches: Sec. III-E.
 
     Parameters
     ----------
     source : (P, d) uint8 descriptors
     target : (P', d) uint8
-    rng : which patches are drawn depends on it alone
-    gate : only patches at about the same angle to up correspond; None: any
+    rng : generator of the sample
+    gate : gate of slopes, or None
 
     Returns
     -------
-    (M, 2) int32, index in source and in target; each drawn patch with its nearest, nearest first
+    (M, 2) int32, index in source and in target; each sampled patch with its nearest, nearest first
 
     Raises
     ------
-    ValueError : the descriptors have different lengths.
+    ValueError : the descriptors have different lengths
     """
     if source.shape[1] != target.shape[1]:
-        raise ValueError(f"descriptors of {source.shape[1]} and {target.shape[1]} bytes")
+        raise ValueError(f"descriptors have {source.shape[1]} and {target.shape[1]} bytes")
     drawn = np.sort(rng.choice(len(source), min(p.n_sources, len(source)), replace=False))
     n_nearest = min(p.n_nearest, len(target))
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)

@@ -1,14 +1,14 @@
-"""Sec. III-E, matching as the paper has it: sequences of neighbours, aligned.
+"""Match patches by aligning the sequences of their neighbours, as in the paper (Sec. III-E).
 
     Patches  --neighbour_sequences-->  Sequences
     Patches, Patches  --sequence_correspondences-->  pairs (M, 2)
 
-Reading R10 (docs/paper.md): of the paper's patch matching (GASP, 3DV 2014) only the idea is
-public. A patch is described by the patches about it, in the one order that does not depend on
-where they are seen from: once round its normal. Two such sequences are compared by what it costs
-to turn one into the other by replacing, inserting, leaving out and swapping neighbours
-(Damerau-Levenshtein), whichever neighbour the round begins with. "It suffices to validate at a
-coarse hierarchical level" (Sec. III-F): the neighbours are coarse patches.
+Reading R10 (docs/paper.md): only the idea of the paper's patch matching (GASP, 3DV 2014) is public.
+A patch is described by the patches around it, in the order of their azimuths about its normal,
+which does not depend on the viewpoint. Two such cyclic sequences are compared by their
+Damerau-Levenshtein distance: the cost of replacing, inserting, omitting and swapping neighbours.
+"It suffices to validate at a coarse hierarchical level" (Sec. III-F): the neighbours are coarse
+patches.
 """
 
 from __future__ import annotations
@@ -21,64 +21,56 @@ import numpy as np
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Floats, Ints32, Patches
 
-#: How correspondences are found: by the histograms of `patch_descriptors.py`, or by sequences.
+#: Method of matching: the histograms of `patch_descriptors.py`, or sequences.
 Matching = Literal["histograms", "sequence"]
 
 
 @dataclass(frozen=True)
 class SequenceParameters:
-    """The numbers of sequences and of their alignment."""
+    """Parameters of sequences and of their alignment."""
 
-    n_coarse: int = 60  #: patches that are neighbours
-    opposite_distance: float = 0.5  #: between patches back to back, when they are chosen, metres
-    n_neighbours: int = 12  #: of a patch, the nearest
+    n_coarse: int = 60  #: number of coarse patches
+    opposite_distance: float = 0.5  #: distance of patches with opposite normals, metres
+    n_neighbours: int = 12  #: number of nearest neighbours of a patch
     minimum_distance: float = 0.1  #: nearer patches are the patch itself, metres
-    radius: float = 1.6  #: farther patches are no neighbours, metres
-    length_scale: float = 0.35  #: twice so far off in all, a neighbour is another, metres
-    angle_scale: float = 1.0  #: the same of the two angles, radians
-    gap_cost: float = 0.5  #: of a neighbour inserted or left out; of another in its place: 1
-    swap_cost: float = 0.1  #: of two that change places, beside what they differ
-    n_sources: int = 100  #: patches drawn from the source
-    n_nearest: int = 3  #: correspondences each keeps
+    radius: float = 1.6  #: greatest distance of a neighbour, metres
+    length_scale: float = 0.35  #: difference of lengths that costs one half, metres
+    angle_scale: float = 1.0  #: difference of angles that costs one half, radians
+    gap_cost: float = 0.5  #: cost of an inserted or omitted neighbour; a replacement costs 1
+    swap_cost: float = 0.1  #: cost of a swap, beside that of the differences
+    n_sources: int = 100  #: number of patches drawn from the source
+    n_nearest: int = 3  #: number of correspondences per patch
 
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """The neighbours of each patch, once round its normal.
+    """The neighbours of each patch, in the order of azimuth about its normal.
 
     Parameters
     ----------
-    symbols : (P, n_neighbours, 4): of each neighbour its distance in the plane of the patch and
-        its height over it, metres, and the angles of its normal to the patch's normal and to the
-        direction that it lies in, radians
-    lengths : (P,) int32, neighbours there are
+    symbols : (P, n_neighbours, 4): each neighbour's distance in the plane of the patch and height
+        over it, metres, and the angles of its normal to the patch's normal and to its direction,
+        radians
+    lengths : (P,) int32, number of neighbours
     """
 
     symbols: Floats
     lengths: Ints32
 
 
-def coarse(patches: Patches, p: SequenceParameters) -> Patches:
-    """A few patches that lie far from each other, each the mean of those nearest to it.
+def coarse_patches(patches: Patches, p: SequenceParameters) -> Patches:
+    """Return up to `n_coarse` distant patches, each the mean of the patches nearest to it.
 
-    The largest is the first, and the next is always the one farthest from all before it, so that
-    a rigid motion of the patches moves the choice with them.
-
-    Parameters
-    ----------
-    patches : P of them
-
-    Returns
-    -------
-    patches : `n_coarse` of them, or P where these are fewer
+    The largest is first, and each next one is the farthest from all before it, so the selection
+    does not depend on rigid motion.
     """
     chosen = [int(np.argmax(patches.areas))]
     squares = np.full(len(patches), np.inf)
     nearest = np.zeros(len(patches), np.intp)
     while True:
         gap = ((patches.means - patches.means[chosen[-1]]) ** 2).sum(axis=1)
-        turned = 1.0 - patches.normals @ patches.normals[chosen[-1]]
-        gap = gap + p.opposite_distance**2 / 2 * turned
+        opposition = 1.0 - patches.normals @ patches.normals[chosen[-1]]
+        gap = gap + p.opposite_distance**2 / 2 * opposition
         closer = gap < squares
         squares[closer], nearest[closer] = gap[closer], len(chosen) - 1
         if len(chosen) == min(p.n_coarse, len(patches)):
@@ -87,8 +79,8 @@ def coarse(patches: Patches, p: SequenceParameters) -> Patches:
     count = len(chosen)
     areas: Floats = np.bincount(nearest, patches.areas, count).astype(float)
     means, normals = (
-        np.stack([np.bincount(nearest, patches.areas * of[:, k], count) for k in range(3)], axis=1)
-        for of in (patches.means, patches.normals)
+        np.stack([np.bincount(nearest, patches.areas * x[:, k], count) for k in range(3)], axis=1)
+        for x in (patches.means, patches.normals)
     )
     length = np.linalg.norm(normals, axis=1)
     return Patches(
@@ -110,7 +102,7 @@ def _sequences(
     found = np.empty((most, 4))
     for i in range(len(means)):
         n = normals[i]
-        # any direction in the plane will do to measure azimuths from: the start is chosen below
+        # any direction in the plane can be azimuth 0, since the start is selected below
         k = 0
         for d in range(1, 3):
             if abs(n[d]) < abs(n[k]):
@@ -151,7 +143,7 @@ def _sequences(
             m += 1
         lengths[i] = m
         order = np.argsort(azimuths[:m], kind="mergesort")
-        # the round begins after its widest gap: there a swap across the seam is least likely
+        # start after the widest gap, where a swap across the seam is least likely
         start, widest = 0, -1.0
         for s in range(m):
             before = azimuths[order[s - 1]] - (2 * np.pi if s == 0 else 0.0)
@@ -162,14 +154,15 @@ def _sequences(
 
 
 def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters) -> Sequences:
-    """The canonical sequence of each patch: its nearest neighbours, once round its normal.
+    """Return the canonical sequence of each patch's nearest neighbours.
 
-    Counter-clockwise seen from where the normal points to, beginning after the widest gap.
+    Neighbours are ordered counter-clockwise, seen from the side of the normal, starting after the
+    widest gap.
 
     Parameters
     ----------
-    patches : P, whose sequences
-    about : the neighbours, see `coarse`
+    patches : P patches
+    about : the neighbours, see `coarse_patches`
     """
     symbols = np.zeros((len(patches), p.n_neighbours, 4))
     lengths = np.zeros(len(patches), np.int32)
@@ -181,10 +174,10 @@ def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters)
 
 
 @kernel
-def _replacing(
+def _replacement_costs(
     a: Floats, m: int, b: Floats, n: int, length: float, angle: float, out: Floats
 ) -> None:
-    """Cost of each of `m` neighbours in place of each of `n`: 0 alike, 1 another."""
+    """Write the cost of each of `m` neighbours in place of each of `n`: 0 if alike, at most 1."""
     for i in range(m):
         for j in range(n):
             off = (abs(a[i, 0] - b[j, 0]) + abs(a[i, 1] - b[j, 1])) / length
@@ -193,13 +186,13 @@ def _replacing(
 
 
 @kernel
-def _edits(
+def _edit_cost(
     costs: Floats, m: int, n: int, turn: int, gap: float, swap: float, most: float, rows: Floats
 ) -> float:
-    """Damerau-Levenshtein cost of sequence 1 against sequence 2 begun at `turn`.
+    """Return the Damerau-Levenshtein cost of sequence 1 against sequence 2 started at `turn`.
 
-    In the form of optimal string alignment: what was swapped is not edited again. Infinite as
-    soon as it must exceed `most`. `rows`: (3, n + 1), room to work in.
+    It is the optimal string alignment, in which a swapped pair is not edited again; infinite once
+    it must exceed `most`. `rows`: (3, n + 1) scratch space.
     """
     for j in range(n + 1):
         rows[0, j] = j * gap
@@ -226,15 +219,15 @@ def _edits(
 
 
 @kernel
-def _cyclic(
+def _cyclic_cost(
     a: Floats, m: int, b: Floats, n: int, length: float, angle: float, gap: float, swap: float,
     most: float, costs: Floats, rows: Floats,
 ) -> float:  # fmt: skip
-    """Least share of the greatest cost there is, over the starts of the second: 0 to 1."""
+    """Return the least cost over the starts of the second sequence, as a share of the greatest."""
     if m == 0 or n == 0:
         return 1.0
-    _replacing(a, m, b, n, length, angle, costs)
-    # each neighbour has to go somewhere: a cheap bound that most pairs fail
+    _replacement_costs(a, m, b, n, length, angle, costs)
+    # a cheap lower bound, which excludes most pairs: each neighbour is replaced or omitted
     bound = 0.0
     for i in range(m):
         nearest = gap
@@ -246,9 +239,9 @@ def _cyclic(
         return 1.0
     limit = best = most * whole
     for turn in range(n):
-        cost = _edits(costs, m, n, turn, gap, swap, best, rows)
+        cost = _edit_cost(costs, m, n, turn, gap, swap, best, rows)
         best = min(best, cost)
-    # limit / whole may round to less than `most`, and would replace what is as near
+    # limit / whole may round to less than `most` and would displace an equal cost
     return best / whole if best < limit else 1.0
 
 
@@ -263,10 +256,10 @@ def _nearest(
     found = 0
     for row in range(len(drawn)):
         i = drawn[row]
-        best[:] = 1.0  # what has nothing in common corresponds to nothing
+        best[:] = 1.0  # sequences with nothing in common do not correspond
         at[:] = -1
         for j in range(len(target)):
-            cost = _cyclic(
+            cost = _cyclic_cost(
                 source[i], source_lengths[i], target[j], target_lengths[j],
                 length, angle, gap, swap, best[-1], costs, rows,
             )  # fmt: skip
@@ -286,20 +279,20 @@ def _nearest(
 def sequence_correspondences(
     source: Patches, target: Patches, rng: np.random.Generator, p: SequenceParameters
 ) -> Ints32:
-    """Correspondences of a random few of the source's patches, by their sequences: Sec. III-E.
+    """Return correspondences of a random sample of the source's patches by sequences: Sec. III-E.
 
     Parameters
     ----------
     source, target : patches of the two frames
-    rng : which patches are drawn depends on it alone
+    rng : generator of the sample
 
     Returns
     -------
-    (M, 2) int32, index in source and in target; each drawn patch with its nearest, nearest first
+    (M, 2) int32, index in source and in target; each sampled patch with its nearest, nearest first
     """
     drawn = np.sort(rng.choice(len(source), min(p.n_sources, len(source)), replace=False))
-    of_source = neighbour_sequences(source, coarse(source, p), p)
-    of_target = neighbour_sequences(target, coarse(target, p), p)
+    of_source = neighbour_sequences(source, coarse_patches(source, p), p)
+    of_target = neighbour_sequences(target, coarse_patches(target, p), p)
     n_nearest = min(p.n_nearest, len(target))
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)
     found = _nearest(

@@ -24,12 +24,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sceneprint.geometry.kernel import cached_per_frame, disjoint_kernel
-from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refined_all
+from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refine_all
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
     PlaneParameters,
     PlaneView,
-    explained,
+    plane_agreement,
 )
 from sceneprint.geometry.rigid import NO_UPS, Ups, are_level, are_near, select_distinct
 from sceneprint.types import Floats, Patches
@@ -397,16 +397,16 @@ def best_alternative(
     most_tilt : radians against them beyond which a transform is no rival
     """
     moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
-    near = far_from(T, refined_all(query.surface, match.surface, moved, p.first), p)
-    seen = explained(query, match, near, agreement_p)
+    near = far_from(T, refine_all(query.surface, match.surface, moved, p.first), p)
+    seen = plane_agreement(query, match, near, agreement_p)
     hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
     proposed = far_from(T, proposed, p)
     order = -np.arange(len(proposed), dtype=float)
     chosen = select_distinct(proposed, order, p.rival_m, p.rival_rad, p.n_proposed)
     hopeful = np.concatenate([hopeful, proposed[chosen]])
-    rivals = np.concatenate([voted, refined_all(query.surface, match.surface, hopeful, p.then)])
+    rivals = np.concatenate([voted, refine_all(query.surface, match.surface, hopeful, p.then)])
     rivals = far_from(T, rivals, p)
-    seen = explained(query, match, rivals, agreement_p)
+    seen = plane_agreement(query, match, rivals, agreement_p)
     share = np.where(seen.violations < max(p.refuted, violations), seen.share, 0.0)
     level = are_level(rivals, ups, most_tilt)
     tilted = float(share[~level].max(initial=0.0))

@@ -19,8 +19,8 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.registration.alignment import ConsensusParameters
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
-    looked_up,
-    sampled,
+    overlap_target,
+    sample_points,
     tolerances,
     weigh_overlap,
 )
@@ -76,7 +76,7 @@ def judged(
 ) -> Verdicts:
     """What becomes of each of a source's points (N, 6): (N,) NEITHER, AGREES or VIOLATES."""
     out = np.zeros(len(source), np.uint8)
-    t = looked_up(target, p)
+    t = overlap_target(target, p)
     _judge(
         source, t.points, t.normals, t.camera, t.heads, t.chain,
         np.ascontiguousarray(T_target_source), tolerances(p), out,
@@ -127,7 +127,7 @@ def residuals(
     where it does neither: it is seen by no pixel, or lies beside or behind the surface
     """
     out = np.zeros(len(source), np.uint8)
-    t = looked_up(target, p)
+    t = overlap_target(target, p)
     _measure(
         source, t.points, t.normals, t.camera, t.heads, t.chain,
         np.ascontiguousarray(T_target_source), tolerances(p), out,
@@ -153,7 +153,10 @@ def trace(
     traces : AGREES counts as often as `Validation.inliers` says
     """
     p = p or OverlapParameters()
-    of_query, of_match = sampled(query.surface, p.stride), sampled(match.surface, p.stride)
+    of_query, of_match = (
+        sample_points(query.surface, p.stride),
+        sample_points(match.surface, p.stride),
+    )
     pairs, distances = _coincident(
         query.patches, match.patches, T_match_query, patches_p or ConsensusParameters()
     )
@@ -220,7 +223,7 @@ def overlay(
     colours : (N, 3)
     """
     T = T_target_source
-    ours, theirs = sampled(source, 1), sampled(target, 1)
+    ours, theirs = sample_points(source, 1), sample_points(target, 1)
     points = np.concatenate(
         [transform_points(T, ours[:, :3].astype(float)), theirs[:, :3].astype(float)]
     )

@@ -27,7 +27,7 @@ from sceneprint.geometry.registration.overlap import (
     PlaneParameters,
     PlaneView,
     look_up,
-    looked_up,
+    overlap_target,
     plane_view,
     tolerances,
 )
@@ -199,7 +199,7 @@ def map_frame(
     T : (4, 4), see MapFrame
     p, overlap_p : see there
     """
-    target = looked_up(geometry.surface, overlap_p)
+    target = overlap_target(geometry.surface, overlap_p)
     return MapFrame(geometry, target, T, p.planes)
 
 

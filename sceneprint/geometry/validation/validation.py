@@ -35,7 +35,7 @@ from sceneprint.geometry.registration.alignment import (
     align_scans,
     are_scans,
     contradiction,
-    samples_of,
+    frame_samples,
 )
 from sceneprint.geometry.registration.icp import (
     FINE,
@@ -45,11 +45,11 @@ from sceneprint.geometry.registration.icp import (
     refine,
 )
 from sceneprint.geometry.registration.overlap import (
-    Explained,
     OverlapParameters,
-    explained,
+    PlaneAgreement,
     overlap_counts,
-    sampled,
+    plane_agreement,
+    sample_points,
 )
 from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.rigid import (
@@ -202,8 +202,10 @@ def refined_at(
     """
     p = p or FINE
     a, b = query.surface, match.surface
-    there = refine(sampled(a, p.stride), b.fitted, T_match_query, p, kind_of(a.camera))
-    back = refine(sampled(b, p.stride), a.fitted, inverse(T_match_query), p, kind_of(b.camera))
+    there = refine(sample_points(a, p.stride), b.fitted, T_match_query, p, kind_of(a.camera))
+    back = refine(
+        sample_points(b, p.stride), a.fitted, inverse(T_match_query), p, kind_of(b.camera)
+    )
     if there is None or back is None:
         return None
     return middle(there.T, inverse(back.T))
@@ -277,7 +279,9 @@ def _samples(
     query: Geometry, match: Geometry, ups: Ups, p: ValidationParameters
 ) -> tuple[FrameSamples, FrameSamples]:
     stride, planes = p.agreement.stride, p.rivals.planes
-    return samples_of(query, stride, planes, ups[0]), samples_of(match, stride, planes, ups[1])
+    return frame_samples(query, stride, planes, ups[0]), frame_samples(
+        match, stride, planes, ups[1]
+    )
 
 
 def validate_guided(
@@ -434,7 +438,7 @@ def _decided(
     residual, estimates = _estimates(there, back, p.acceptance)
     found_by = tuple(one for one in (there, back) if one is not None)
     transforms = list(estimates.values())
-    seen = explained(query.planes, match.planes, np.stack(transforms), p.agreement)
+    seen = plane_agreement(query.planes, match.planes, np.stack(transforms), p.agreement)
     best = int(np.argmax(seen.share - p.alignment.rank_violations * seen.violations))
     (directions, T), *others = sorted(
         estimates.items(), key=lambda one: one[1] is not transforms[best]
@@ -545,7 +549,7 @@ def _refined_both_ways(
         return None
     residual, _ = _estimates(there, back, p.acceptance)
     T = middle(there.T, inverse(back.T))
-    seen = explained(query.planes, match.planes, T[None], p.agreement)
+    seen = plane_agreement(query.planes, match.planes, T[None], p.agreement)
     evidence = _evidence(query, match, (there, back), T, residual, seen, 0, p)
     return _Proposal(T, one.directions, (there, back), *evidence)
 
@@ -600,7 +604,7 @@ def _sees_around(frame: Geometry) -> bool:
 
 def _evidence(
     query: FrameSamples, match: FrameSamples, found_by: Sequence[Alignment], T: Floats,
-    residual: tuple[float, float], by_planes: Explained, k: int, p: ValidationParameters,
+    residual: tuple[float, float], by_planes: PlaneAgreement, k: int, p: ValidationParameters,
 ) -> tuple[Evidence, int]:  # fmt: skip
     """Return the evidence for transform `k` of those explained, and how many points agree."""
     of_query = overlap_counts(query.points, match.geometry.surface, T, p.agreement)
