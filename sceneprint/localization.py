@@ -24,7 +24,7 @@ from sceneprint.geometry.rigid import PoseAverage, average_poses
 from sceneprint.geometry.validation.acceptance import Strength
 from sceneprint.geometry.validation.confidence import (
     PlaceEvidence,
-    confidences_of,
+    compute_confidences,
     weakest_evidence,
 )
 from sceneprint.geometry.validation.map_verification import (
@@ -374,7 +374,7 @@ def _known(evidence: PlaceEvidence | None) -> PlaceEvidence:
 
 def _confidences(places: Sequence[Place], p: LocalizationParameters) -> list[float]:
     """Return the confidence of each place; 0 of those that need votes and have none."""
-    judged = confidences_of([_known(place.evidence) for place in places], p.judgement)
+    judged = compute_confidences([_known(place.evidence) for place in places], p.judgement)
     return [
         0.0 if p.voted_only and not place.votes else one
         for place, one in zip(places, judged, strict=True)

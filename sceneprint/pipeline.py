@@ -34,11 +34,15 @@ from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
 from sceneprint.geometry.surface.voxels import Voxels
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.map_verification import MapParameters, at_place, different_views
+from sceneprint.geometry.validation.map_verification import (
+    MapParameters,
+    at_place,
+    distinct_viewpoints,
+)
 from sceneprint.geometry.validation.validation import (
     PairValidation,
     ValidationParameters,
-    preferred,
+    rank_accepted,
 )
 from sceneprint.geometry.validation.validation import validate as validate_geometry
 from sceneprint.geometry.validation.validation import validate_guided as check_predicted
@@ -416,7 +420,7 @@ def associate(
             _retry_without_up(query, tried, open_geometry, seed, p, go_on)
         if all(match.validation.status != "accepted" for match in tried):
             _retry_tilted(query, tried, open_geometry, seed, p, go_on)
-    first = preferred([match.validation for match in tried])
+    first = rank_accepted([match.validation for match in tried])
     rest = [i for i in range(len(tried)) if i not in first]
     rest.sort(key=lambda i: not tried[i].validation.contradicts_up)
     return [tried[i] for i in [*first, *rest]]
@@ -455,7 +459,7 @@ def _predicted(
             viewpoints.append(known[1])
     if len(strong) < _GUIDES:
         return None
-    different = different_views(np.stack(viewpoints), p)
+    different = distinct_viewpoints(np.stack(viewpoints), p)
     if len(different) < _GUIDES:
         return None
     T_parent_query = average_poses(np.stack(strong)[different]).T

@@ -24,13 +24,13 @@ from sceneprint.geometry.validation.map_verification import (
     ScoredPose,
     at_place,
     compare_poses,
-    different_views,
+    distinct_viewpoints,
     map_frame,
-    refined_starts,
+    prior_starts,
+    refine_starts,
     same_place,
-    starts_about,
 )
-from sceneprint.geometry.validation.validation import preferred
+from sceneprint.geometry.validation.validation import rank_accepted
 from sceneprint.models.model import AnswerParameters
 from sceneprint.pipeline import PairMatch, answer_numbers
 from sceneprint.types import Floats, Geometry
@@ -205,9 +205,9 @@ def judged_places(
     if views_of is None or (not len(suggested.T) and prior is None):
         return parent, prior, [_place(group, None, p) for group in _grouped(votes, [], p)]
     ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
-    starts = _NONE if prior is None else starts_about(prior.T, prior.covariance, p.map)
+    starts = _NONE if prior is None else prior_starts(prior.T, prior.covariance, p.map)
     views = views_of(parent, np.concatenate([starts[:1], suggested.T]))
-    near = refined_starts(ready, starts, views, p.map, overlap_p)
+    near = refine_starts(ready, starts, views, p.map, overlap_p)
     scored = compare_poses(ready, np.concatenate([near, suggested.T]), views, p.map, overlap_p)
     return parent, prior, _places(votes, scored, suggested, views, p)
 
@@ -287,7 +287,7 @@ def _votes(
     """Return the votes of accepted matches, best first, then those of ambiguous ones."""
     votes: list[_Vote] = []
     for frame in frames:
-        first = preferred([match.validation for match in frame.matches])
+        first = rank_accepted([match.validation for match in frame.matches])
         unsure = [i for i, m in enumerate(frame.matches) if m.validation.status == "ambiguous"]
         for match in [frame.matches[i] for i in [*first, *unsure]]:
             v, viewpoint = match.validation, poses[match.index]
@@ -300,7 +300,7 @@ def _votes(
             T = viewpoint @ v.T_match_query @ inverse(frame.T)
             votes.append(_Vote(match, T, covariance, viewpoint, weight))
     if len(frames) > 1:
-        order = preferred([vote.match.validation for vote in votes])
+        order = rank_accepted([vote.match.validation for vote in votes])
         votes = [votes[i] for i in order] + [vote for vote in votes if not vote.accepted]
     return votes
 
@@ -363,7 +363,7 @@ def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, flo
     """
     voting = [vote for vote in group if not vote.match.validation.guided]
     viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
-    different = different_views(viewpoints, p.map)
+    different = distinct_viewpoints(viewpoints, p.map)
     return len(different), sum(voting[i].weight for i in different)
 
 
@@ -384,10 +384,10 @@ def _evidence(
     weight = _weight(group, p)[1]
     strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]
     leading = np.array([v.viewpoint for v in group if v.accepted]).reshape(-1, 4, 4)
-    accepted = len(different_views(leading, p.map))
+    accepted = len(distinct_viewpoints(leading, p.map))
     T = group[0].T if pose is None else pose.T
     here = at_place(suggested.T, T, p.map)
-    suggesting = len(different_views(suggested.viewpoints[here], p.map))
+    suggesting = len(distinct_viewpoints(suggested.viewpoints[here], p.map))
     similarity = float(suggested.similarities[here].max(initial=0.0))
     if pose is None:
         return PlaceEvidence(
@@ -395,7 +395,7 @@ def _evidence(
             1.0, rival_weight, views.mostly_rendered(()),
         )  # fmt: skip
     agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
-    seen_from = len(different_views(views.poses[agreeing], p.map))
+    seen_from = len(distinct_viewpoints(views.poses[agreeing], p.map))
     excess = pose.violations + pose.hidden - min(pose.noise, p.most_noise)
     ratio = max(rival, 0.0) / pose.score if pose.score > 0 else 1.0
     return PlaceEvidence(

@@ -26,8 +26,8 @@ from sceneprint.geometry.validation.map_verification import (
     MapViews,
     compare_poses,
     map_frame,
+    prior_starts,
     score_pose,
-    starts_about,
 )
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import (
@@ -805,7 +805,7 @@ def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(
 
 def test_starts_lie_a_deviation_about_a_prior() -> None:
     T = shifted(1.0, 2.0) @ about_up(30.0)
-    starts = starts_about(T, np.diag([0.04, 0.09, 4.0, 1.0, 1.0, 1.0]), MapParameters())
+    starts = prior_starts(T, np.diag([0.04, 0.09, 4.0, 1.0, 1.0, 1.0]), MapParameters())
     np.testing.assert_array_equal(starts[:, :3, :3], np.tile(T[:3, :3], (7, 1, 1)))
     by_hand = [
         (0, 0, 0), (0.2, 0, 0), (-0.2, 0, 0), (0, 0.3, 0), (0, -0.3, 0), (0, 0, 0.5), (0, 0, -0.5),

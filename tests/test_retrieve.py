@@ -13,7 +13,7 @@ from sceneprint.geometry.registration.patch_descriptors import compress, patch_d
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.retrieval.ranking import diversify as select
 from sceneprint.geometry.signature.segmentation import extract_patches, segment
-from sceneprint.geometry.validation.validation import PairValidation, expected_error, preferred
+from sceneprint.geometry.validation.validation import PairValidation, expected_error, rank_accepted
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import (
     PairMatch,
@@ -261,10 +261,10 @@ def test_candidates_are_tried_in_order_until_enough(
 def test_preferred() -> None:
     strong, weak = outcome(), outcome(strength="weak")
     no, unsure = outcome("rejected"), outcome("ambiguous")
-    assert preferred([]) == []
-    assert preferred([no, unsure]) == []
-    assert preferred([weak, no, strong, weak, unsure, strong]) == [2, 5, 0, 3]
-    assert preferred([strong, strong]) == [0, 1]  # equals: the order of R
+    assert rank_accepted([]) == []
+    assert rank_accepted([no, unsure]) == []
+    assert rank_accepted([weak, no, strong, weak, unsure, strong]) == [2, 5, 0, 3]
+    assert rank_accepted([strong, strong]) == [0, 1]  # equals: the order of R
 
 
 def test_of_cameras_the_least_expected_error_goes_first() -> None:
@@ -278,7 +278,7 @@ def test_of_cameras_the_least_expected_error_goes_first() -> None:
     errors = [expected_error(one) for one in (near, far, aside)]
     np.testing.assert_allclose(errors, [0.01, 0.03, math.hypot(0.01, 0.02)], rtol=1e-12)
     weak = replace(near, strength="weak")
-    assert preferred([far, weak, near, aside, outcome("rejected")]) == [2, 3, 0, 1]
+    assert rank_accepted([far, weak, near, aside, outcome("rejected")]) == [2, 3, 0, 1]
     assert expected_error(outcome()) == math.inf  # nothing is known of its precision
 
 
@@ -286,11 +286,11 @@ def test_of_scans_all_around_the_nearest_goes_first() -> None:
     far, near, nearest = (outcome(T=shifted(x)) for x in (3.0, -2.0, 1.0))
     weak = outcome(strength="weak", T=shifted(0.5))
     said = [far, weak, near, nearest]
-    assert preferred(said) == [0, 2, 3, 1]  # cameras: they share the same, so the order of R
+    assert rank_accepted(said) == [0, 2, 3, 1]  # cameras: they share the same, so the order of R
     around = [replace(one, around=True) for one in said]
-    assert preferred(around) == [3, 2, 0, 1]
-    assert preferred([*around[:3], nearest]) == [0, 2, 3, 1]  # one of a camera: not comparable
-    assert preferred([replace(far, around=True)]) == [0]
+    assert rank_accepted(around) == [3, 2, 0, 1]
+    assert rank_accepted([*around[:3], nearest]) == [0, 2, 3, 1]  # one of a camera: not comparable
+    assert rank_accepted([replace(far, around=True)]) == [0]
 
 
 def test_frames_are_judged_by_the_numbers_of_their_model(

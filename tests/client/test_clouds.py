@@ -72,7 +72,7 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
     assert abs(told[second.frame_id].distance - apart) < 0.02 * apart  # centimetres are rounded
     assert told[first.frame_id].validation.status == "accepted"
     assert np.allclose(told[first.frame_id].transform.matrix, np.eye(4), atol=0.02)
-    # one weak match, which the map's frames bear out
+    # one weak match, which the map's frames confirm
     assert answer.location is not None
     assert (answer.status, answer.location.verified_by) == ("found", "map")
     assert (answer.location.support, answer.location.pose.parent_frame) == (

@@ -14,8 +14,8 @@ from sceneprint.geometry.validation.confidence import (
     ConfidenceParameters,
     Penalty,
     PlaceEvidence,
-    confidences_of,
-    penalties_of,
+    compute_confidences,
+    compute_penalties,
 )
 from sceneprint_lab.confidence import JudgedQuery, fit, steps_of
 from sceneprint_lab.evaluation.measures import calibration
@@ -49,7 +49,7 @@ def test_the_penalty_is_the_sum_of_its_steps() -> None:
         for p in (getattr(TRUTH, name),)
         for size in (p.fair, p.poor - p.fair, p.worst - p.poor)
     ]
-    by_hand = [sum(penalties_of(e, TRUTH).values()) for e in evidence]
+    by_hand = [sum(compute_penalties(e, TRUTH).values()) for e in evidence]
     np.testing.assert_allclose(steps @ np.array(increments), by_hand, atol=1e-9)
 
 
@@ -59,7 +59,7 @@ def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
     samples = []
     for number in range(4000):
         pair = (drawn(rng), drawn(rng))
-        confidences = confidences_of(pair, ConfidenceModel(TRUTH))
+        confidences = compute_confidences(pair, ConfidenceModel(TRUTH))
         which = int(rng.choice(3, p=[*confidences, 1.0 - sum(confidences)]))
         samples.append(
             JudgedQuery("site", "rooms", number, pair, tuple(k == which for k in range(2)))
@@ -70,7 +70,8 @@ def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
         abs(a - b)
         for pair in tried
         for a, b in zip(
-            *(confidences_of(pair, ConfidenceModel(one)) for one in (learnt, TRUTH)), strict=True
+            *(compute_confidences(pair, ConfidenceModel(one)) for one in (learnt, TRUTH)),
+            strict=True,
         )
     ]
     assert float(np.mean(off)) < 0.03
@@ -86,7 +87,7 @@ def test_kinds_count_by_their_shares() -> None:
     samples = [JudgedQuery("a", "rooms", k, (e,), (True,)) for k in range(30)]
     samples += [JudgedQuery("b", "absent", k, (e,), (False,)) for k in range(90)]
     learnt = fit(samples, {"rooms": 3.0, "absent": 1.0}, ridge=0.0)
-    assert confidences_of([e], ConfidenceModel(learnt)) == pytest.approx([0.75], abs=1e-3)
+    assert compute_confidences([e], ConfidenceModel(learnt)) == pytest.approx([0.75], abs=1e-3)
 
 
 def test_a_calibration_by_hand() -> None:

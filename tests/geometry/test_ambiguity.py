@@ -19,7 +19,7 @@ from sceneprint.geometry.rigid import inverse, inverses, pose_difference, transf
 from sceneprint.geometry.validation.acceptance import (
     AmbiguityParameters,
     best_alternative,
-    far_from,
+    select_rivals,
     symmetries,
 )
 from sceneprint.models import read_model
@@ -145,9 +145,9 @@ def test_far_from_equals_the_difference() -> None:
     apart = [pose_difference(T, other) for other in others]
     far = [metres > P.rival_m or radians > P.rival_rad for metres, radians in apart]
     assert 50 < sum(far) < 250
-    np.testing.assert_array_equal(far_from(T, others, P), others[far])
-    assert far_from(T, others[:0], P).shape == (0, 4, 4)
-    assert far_from(T, T[None], P).shape == (0, 4, 4)
+    np.testing.assert_array_equal(select_rivals(T, others, P), others[far])
+    assert select_rivals(T, others[:0], P).shape == (0, 4, 4)
+    assert select_rivals(T, T[None], P).shape == (0, 4, 4)
 
 
 def test_inverses() -> None:

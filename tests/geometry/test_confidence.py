@@ -13,8 +13,8 @@ from sceneprint.geometry.validation.confidence import (
     ConfidenceParameters,
     Penalty,
     PlaceEvidence,
-    confidences_of,
-    penalties_of,
+    compute_confidences,
+    compute_penalties,
     weakest_evidence,
 )
 
@@ -29,18 +29,20 @@ JUDGEMENT = ConfidenceModel(P, VIEWS)
 
 
 def test_the_best_evidence_costs_nothing() -> None:
-    assert set(penalties_of(BEST, P).values()) == {0.0}
-    assert confidences_of([BEST], JUDGEMENT) == pytest.approx([1 / (1 + math.exp(-6.0))])
+    assert set(compute_penalties(BEST, P).values()) == {0.0}
+    assert compute_confidences([BEST], JUDGEMENT) == pytest.approx([1 / (1 + math.exp(-6.0))])
 
 
 def test_a_penalty_is_linear_between_its_knots() -> None:
     """Planes: 3 at 3 planes, 2 at 6, 1 at 12, 0 from 24 on."""
     for planes, penalty in ((1.0, 3.0), (3.0, 3.0), (4.5, 2.5), (12.0, 1.0), (18.0, 0.5)):
-        assert penalties_of(replace(BEST, planes=planes), P)["planes"] == pytest.approx(penalty)
+        assert compute_penalties(replace(BEST, planes=planes), P)["planes"] == pytest.approx(
+            penalty
+        )
     for rival, penalty in ((1.5, 3.0), (0.9, 2.5), (0.5, 1.0), (0.35, 0.5), (0.2, 0.0)):
-        assert penalties_of(replace(BEST, rival=rival), P)["rival"] == pytest.approx(penalty)
+        assert compute_penalties(replace(BEST, rival=rival), P)["rival"] == pytest.approx(penalty)
     two = replace(BEST, planes=12.0, rival=0.8)
-    assert confidences_of([two], JUDGEMENT) == pytest.approx([1 / (1 + math.exp(-3.0))])
+    assert compute_confidences([two], JUDGEMENT) == pytest.approx([1 / (1 + math.exp(-3.0))])
 
 
 def test_accepted_matches_count_by_the_frames_that_see_the_place() -> None:
@@ -52,9 +54,9 @@ def test_accepted_matches_count_by_the_frames_that_see_the_place() -> None:
 def test_candidates_share_what_one_of_them_has() -> None:
     """Odds of e^6 and e^5 against 1 that none is right."""
     whole = 1 + math.exp(6.0) + math.exp(5.0)
-    found = confidences_of([BEST, replace(BEST, planes=12.0)], JUDGEMENT)
+    found = compute_confidences([BEST, replace(BEST, planes=12.0)], JUDGEMENT)
     assert found == pytest.approx([math.exp(6.0) / whole, math.exp(5.0) / whole])
-    assert confidences_of([], JUDGEMENT) == []
+    assert compute_confidences([], JUDGEMENT) == []
 
 
 @pytest.mark.parametrize("name", KNOTS)
@@ -64,7 +66,7 @@ def test_better_evidence_never_lowers_a_confidence(name: str) -> None:
     # five frames or more see the place, and each accepted match is a fifth
     field, times = ("accepted", 5.0) if name == "acceptance" else (name, 1.0)
     tried = [replace(BEST, **{field: times * x}) for x in steps]
-    found = [confidences_of([e], ConfidenceModel())[0] for e in tried]
+    found = [compute_confidences([e], ConfidenceModel())[0] for e in tried]
     assert found == sorted(found)
 
 
@@ -72,7 +74,7 @@ def test_rendered_views_have_numbers_of_their_own() -> None:
     """5 % excess costs 1 beside frames and nothing beside views; a rival of .8 costs 2, or 6."""
     at_once = replace(BEST, excess=0.05), replace(BEST, rival=0.8, rendered=True)
     whole = 1 + math.exp(5.0) + math.exp(0.0)
-    assert confidences_of(at_once, JUDGEMENT) == pytest.approx(
+    assert compute_confidences(at_once, JUDGEMENT) == pytest.approx(
         [math.exp(5.0) / whole, math.exp(0.0) / whole]
     )
     weak = replace(BEST, excess=0.1, rival=0.4)

@@ -12,7 +12,7 @@ from sceneprint.geometry.registration.overlap import first_per_cube, sample_poin
 from sceneprint.geometry.registration.plan_search import PlanParameters, draw_plan
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
-from sceneprint.geometry.validation.validation import refined_at
+from sceneprint.geometry.validation.validation import refine_transform
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
@@ -125,11 +125,11 @@ def test_refinement_works_on_the_points(lidar: Model) -> None:
     T = np.eye(4)
     T[:3, 3] = np.array(places[0]) - np.array(places[1])
     fine = lidar.parameters.validation.alignment.fine
-    found = refined_at(a, b, T, fine)
+    found = refine_transform(a, b, T, fine)
     assert found is not None
     assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 0.02
     plain = [replace(one, surface=replace(one.surface, spread=None)) for one in (a, b)]
-    coarse = refined_at(plain[0], plain[1], T, fine)
+    coarse = refine_transform(plain[0], plain[1], T, fine)
     off = math.inf if coarse is None else float(np.linalg.norm(coarse[:3, 3] - T[:3, 3]))
     assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < off
 

@@ -24,8 +24,8 @@ from sceneprint.geometry.validation.inspection import (
     TOLERANCE,
     VIOLATES,
     VIOLATION,
-    judged,
     overlay,
+    point_verdicts,
     residuals,
     trace,
 )
@@ -63,7 +63,7 @@ def framed(surface: Surface, of: Patches) -> Geometry:
 def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -> None:
     seen, _ = scenes.corner()
     points = sample_points(seen, P.stride)
-    counts, verdicts = overlap_counts(points, seen, T, P), judged(points, seen, T, P)
+    counts, verdicts = overlap_counts(points, seen, T, P), point_verdicts(points, seen, T, P)
     assert (verdicts == AGREES).sum() == counts.inliers
     assert (verdicts == VIOLATES).sum() == counts.violations
     for i in range(0, len(points), 41):
@@ -73,8 +73,8 @@ def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -
 
 def test_a_wall_before_a_wall(scenes: ModuleType) -> None:
     near, far = wall(scenes, 1.5), wall(scenes, 2.0)
-    assert set(judged(sample_points(near, 3), far, shifted(), P).tolist()) == {VIOLATES}
-    assert set(judged(sample_points(far, 3), near, shifted(), P).tolist()) == {NEITHER}
+    assert set(point_verdicts(sample_points(near, 3), far, shifted(), P).tolist()) == {VIOLATES}
+    assert set(point_verdicts(sample_points(far, 3), near, shifted(), P).tolist()) == {NEITHER}
 
 
 @pytest.mark.parametrize("tolerance", [0.05, 0.12])
@@ -93,13 +93,13 @@ def test_residuals_by_hand(scenes: ModuleType, tolerance: float) -> None:
 def test_residuals_agree_with_verdicts(scenes: ModuleType) -> None:
     seen, _ = scenes.corner()
     points, T = sample_points(seen, 2), shifted(0.04, 0.03)
-    told, verdicts = residuals(points, seen, T, P), judged(points, seen, T, P)
+    told, verdicts = residuals(points, seen, T, P), point_verdicts(points, seen, T, P)
     assert ((told <= TOLERANCE) == (verdicts == AGREES)).all()
     assert ((told == VIOLATION) == (verdicts == VIOLATES)).all()
     assert ((told == OUTSIDE) == (verdicts == NEITHER)).all()
     for step in (3, 77, 200):  # as if that were all that is allowed
         less = replace(P, surface_tolerance=P.surface_tolerance * step / TOLERANCE)
-        assert ((told <= step) == (judged(points, seen, T, less) == AGREES)).all()
+        assert ((told <= step) == (point_verdicts(points, seen, T, less) == AGREES)).all()
 
 
 def test_patches_coincide_with_each_others_nearest(scenes: ModuleType) -> None:
@@ -116,8 +116,8 @@ def test_patches_coincide_with_each_others_nearest(scenes: ModuleType) -> None:
     # (4: at 5.0 with cos 0.8)
     assert found.pairs.tolist() == [[2, 3], [0, 4]]
     assert found.distances == pytest.approx([0.01, 0.05])
-    assert (found.of_query == judged(found.query, surface, T, P)).all()
-    assert (found.of_match == judged(found.match, surface, inverse(T), P)).all()
+    assert (found.of_query == point_verdicts(found.query, surface, T, P)).all()
+    assert (found.of_match == point_verdicts(found.match, surface, inverse(T), P)).all()
     nothing = trace(framed(surface, patches((0, 0, 9))), framed(surface, match), T, P)
     assert (nothing.pairs.shape, nothing.distances.shape) == ((0, 2), (0,))
 

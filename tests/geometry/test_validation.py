@@ -22,9 +22,9 @@ from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.validation.validation import (
     PairValidation,
     ValidationParameters,
-    _decided,
+    _decide,
     middle,
-    refined_at,
+    refine_transform,
     validate,
 )
 from sceneprint.models import Model, read_model
@@ -407,9 +407,9 @@ def test_what_one_search_alone_finds_is_judged_by_the_evidence(
             (there, elsewhere(back), "query_to_match"),
             (elsewhere(there), back, "match_to_query"),
         ):
-            found = sane(_decided(a, b, one, other, 0, p, "full"))
+            found = sane(_decide(a, b, one, other, 0, p, "full"))
             # the residual alone cannot tell the two apart
-            assert _decided(a, b, one, other, 0, p, "paper").status == "rejected"
+            assert _decide(a, b, one, other, 0, p, "paper").status == "rejected"
             assert found.directions == (who,)
             assert found.T_other is not None
             if found.status != "accepted":
@@ -443,11 +443,11 @@ def test_of_two_places_that_both_explain_the_frames_neither_is_believed(model: M
     assert there is not None
     assert back is not None
     apart = replace(there, T=v.T_match_query), replace(back, T=inverse(v.T_rival))
-    found = sane(_decided(a, b, *apart, 0, p, "full"))
+    found = sane(_decide(a, b, *apart, 0, p, "full"))
     assert found.status == "rejected"
     assert "the two directions disagree" in found.reason
     free = replace(p.acceptance, ambiguous=9.0, ambiguous_share=9.0)
-    assert _decided(a, b, *apart, 0, replace(p, acceptance=free), "full").status == "accepted"
+    assert _decide(a, b, *apart, 0, replace(p, acceptance=free), "full").status == "accepted"
 
 
 def test_a_free_direction_is_seen_without_rivals(model: Model) -> None:
@@ -505,14 +505,14 @@ def test_refined_at_the_truth_stays_there(
     pairs: list[tuple[Geometry, Geometry, Floats]],
 ) -> None:
     for query, match, T in pairs:
-        found = refined_at(query, match, T)
+        found = refine_transform(query, match, T)
         assert found is not None
         metres, radians = pose_difference(found, T)
         assert metres < 0.03
         assert math.degrees(radians) < 1.0
     far = np.eye(4)
     far[2, 3] = -50.0
-    assert refined_at(pairs[0][0], pairs[0][1], far) is None
+    assert refine_transform(pairs[0][0], pairs[0][1], far) is None
 
 
 def test_middle_by_hand() -> None:

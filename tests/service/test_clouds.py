@@ -85,7 +85,7 @@ def found(answer: Any, status: str = "found") -> dict[str, Any]:
 
 
 def found_by_the_map(answer: Any) -> dict[str, Any]:
-    """Return an answer whose only match is weak, and which the map's frames bear out."""
+    """Return an answer whose only match is weak, and which the map's frames confirm."""
     told = found(answer)
     assert told["location"]["verified_by"] == "map"
     assert told["matches"][0]["validation"]["strength"] == "weak"

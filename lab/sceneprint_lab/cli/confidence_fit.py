@@ -17,7 +17,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sceneprint.geometry.validation.confidence import PlaceEvidence, confidences_of
+from sceneprint.geometry.validation.confidence import PlaceEvidence, compute_confidences
 from sceneprint.models import PRESETS, read_model
 from sceneprint.models.model_file import save_model
 from sceneprint.pipeline import Signer, open_signer
@@ -121,7 +121,7 @@ def main() -> None:
     samples = read_samples(options.evidence)
     parameters = fit(samples, SHARES[sensor], lone=0.0 if options.views else LONE[sensor])
     own = replace(model.answer.confidence, **{"views" if options.views else "frames": parameters})
-    confidences = [c for one in samples for c in confidences_of(one.evidence, own)]
+    confidences = [c for one in samples for c in compute_confidences(one.evidence, own)]
     measured = calibration(confidences, [right for one in samples for right in one.right])
     print(
         f"{len(confidences)} poses; calibration error {measured.error:.3f}, "

@@ -25,12 +25,12 @@ from sceneprint.geometry.retrieval.ranking import (
 )
 from sceneprint.geometry.rigid import average_poses, inverse
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.confidence import confidences_of
+from sceneprint.geometry.validation.confidence import compute_confidences
 from sceneprint.geometry.validation.map_verification import MapParameters, looks_ahead
 from sceneprint.geometry.validation.validation import (
     PairValidation,
     ValidationParameters,
-    refined_at,
+    refine_transform,
 )
 from sceneprint.localization import PosedFrame, PoseEstimate, decide, localize, views_of_rows
 from sceneprint.models.model import AnswerParameters
@@ -303,7 +303,7 @@ def _judged_answer(
         return pose_error(T, task.pose) if estimate.parent == task.scene else Error()
 
     known = [(one, one.evidence) for one in estimate.places if one.evidence is not None]
-    confidences = confidences_of([evidence for _, evidence in known], p.judgement)
+    confidences = compute_confidences([evidence for _, evidence in known], p.judgement)
     places = []
     for i in sorted(range(len(known)), key=lambda i: -confidences[i]):
         place, evidence = known[i]
@@ -354,7 +354,7 @@ def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> Validate
 def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) -> Floats | None:
     """Return the transform that refinement reaches from the true pose; see `refined_at`."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
-    return refined_at(query, match, true_transform(task, candidate), judging.p.alignment.fine)
+    return refine_transform(query, match, true_transform(task, candidate), judging.p.alignment.fine)
 
 
 def _average(

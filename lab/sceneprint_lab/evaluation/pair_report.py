@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Evidence
-from sceneprint.geometry.validation.map_verification import at_place, different_views
+from sceneprint.geometry.validation.map_verification import at_place, distinct_viewpoints
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.types import Floats
 from sceneprint_lab.evaluation.measures import (
@@ -314,7 +314,7 @@ def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
                 views = np.stack([match.pose, other.pose])
                 if match.scene != other.scene:
                     agree.append(False)
-                elif len(different_views(views, p)) > 1:
+                elif len(distinct_viewpoints(views, p)) > 1:
                     agree.append(bool(at_place(poses[j][None], poses[i], p)[0]))
             said[i] = "supported" if any(agree) else "contradicted" if agree else "alone"
     return said

@@ -25,7 +25,7 @@ from sceneprint.geometry.registration.sequence_alignment import Matching
 from sceneprint.geometry.signature.pair_features import PropertyParameters
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.geometry.validation.map_verification import MapParameters
-from sceneprint.geometry.validation.validation import refined_at
+from sceneprint.geometry.validation.validation import refine_transform
 from sceneprint.models import Model, ModelParameters
 from sceneprint.pipeline import Signer, geometry_of
 from sceneprint.signing import see
@@ -457,7 +457,7 @@ def refined_by_us(
 ) -> Floats | None:
     """Return our refinement of another's transform, with wide gates first as for our hypotheses."""
     coarse = refine_all(query.surface, match.surface, T[None], p.coarse)
-    return refined_at(query, match, coarse[0] if len(coarse) else T, p.fine)
+    return refine_transform(query, match, coarse[0] if len(coarse) else T, p.fine)
 
 
 def _error(T: Floats | None, true: Floats) -> Error:

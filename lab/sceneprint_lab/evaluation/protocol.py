@@ -32,7 +32,7 @@ from sceneprint.geometry.validation.confidence import PlaceEvidence
 from sceneprint.geometry.validation.validation import (
     PairValidation,
     ValidationParameters,
-    preferred,
+    rank_accepted,
 )
 from sceneprint.localization import LocalizationStatus
 from sceneprint.models import Model
@@ -250,7 +250,7 @@ class QueryOutcome:
 
 def in_preferred_order(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
     """Return accepted pairs, strong ones first: the order in which they are believed."""
-    return [pairs[i] for i in preferred([pair.validation for pair in pairs])]
+    return [pairs[i] for i in rank_accepted([pair.validation for pair in pairs])]
 
 
 def pose_error(T: Floats, truth: Floats) -> Error:

@@ -1,1 +1,1 @@
-"""Whether to believe a transform: acceptance, ambiguity, validation in the map."""
+"""Decide whether a transform is right: acceptance, ambiguity, validation in the map."""

@@ -1,18 +1,17 @@
-"""Sec. III-E, acceptance: decide by the evidence for a transform and its rivals to accept it.
+"""Decide by evidence and rivals whether to accept a transform (Sec. III-E).
 
-    Evidence  --objection-->  why not        Evidence, ambiguity  --belief-->  how far
+    Evidence  --objection-->  reason to refuse     Evidence, ambiguity  --belief-->  strength
     Evidence, deviation  --sparse_evidence_suffices-->  whether little is enough
-    T, hypotheses, planes  --best_alternative-->  ambiguity, T_alternative
+    T, hypotheses, planes  --best_alternative-->  Rival
 
-A lone box looks the same from its four sides, a corridor the same at every door. Two frames of
-such a place agree perfectly under a wrong transform, and nothing in the residual, the overlap or
-the free space shows it. What does show is that *another* transform is not refuted either. So
-rivals are looked for: the other hypotheses that correspondences voted for, and the transform
-found, turned by quarter turns about the normals of the main planes or shifted along them, which
-is how rooms and what stands in them repeat.
+A box looks the same from its four sides, a corridor the same at every door. Two frames of such a
+place agree perfectly under a wrong transform; only other transforms that are not refuted either
+reveal it. So rivals are searched: the other hypotheses of correspondences, and the transform
+itself, rotated by quarter turns about the normals of the main planes or shifted along them, since
+rooms and furniture repeat that way.
 
-What a rival agrees on counts by planes (`overlap.py`). Where up is known in both frames, what tilts
-against it is no rival.
+The agreement of a rival counts by planes (`overlap.py`). If up is known in both frames, a transform
+that tilts is no rival.
 """
 
 from __future__ import annotations
@@ -41,54 +40,58 @@ Mode = Literal["full", "paper"]
 
 @dataclass(frozen=True)
 class AcceptanceParameters:
-    """The numbers of acceptance; how they were chosen: docs/evaluation.md."""
+    """Parameters of acceptance; docs/evaluation.md describes how they were tuned.
 
-    residual_m: float = 0.08  #: of the two directions composed: epsilon_val of Sec. III-E
-    residual_rad: float = math.radians(5.0)
+    "blind" limits hold if free space is unknown, "sparse" limits if the frames share little or only
+    one search found the transform, "apart" limits if its refinements then differ by more than
+    `residual_m`.
+    """
+
+    residual_m: float = 0.08  #: greatest residual of the composed directions: epsilon_val, metres
+    residual_rad: float = math.radians(5.0)  #: and radians
     violation_weight: float = 5.0  #: evidence = overlap - this x violations
-    evidence: float = 0.2  #: least
-    plane_overlap: float = 0.15  #: least
+    evidence: float = 0.2  #: least evidence
+    plane_overlap: float = 0.15  #: least plane overlap
     net_weight: float = 3.0  #: net plane overlap = plane overlap - this x violations
-    net: float = 0.1  #: least of it
-    net_strong: float = 0.1  #: of it, below which an accepted match is weak
+    net: float = 0.1  #: least net plane overlap
+    net_strong: float = 0.1  #: net plane overlap below which an accepted match is weak
     planes: float = 0.0  #: least number of distinct planes that agree
-    plane_violations: float = 1.0  #: most, by planes
-    worst_violations: float = 0.05  #: most, in the worse of the two directions
+    plane_violations: float = 1.0  #: greatest share of violations by planes
+    worst_violations: float = 0.05  #: greatest share of violations in either direction
     strong: float = 0.3  #: evidence below which an accepted match is weak
-    weak: float = 0.05  #: ambiguity from which on an accepted match is weak
-    ambiguous: float = 0.14  #: ambiguity from which on nothing is accepted
-    ambiguous_share: float = 0.5  #: nor from this share of `plane_overlap` on
+    weak: float = 0.05  #: ambiguity from which an accepted match is weak
+    ambiguous: float = 0.14  #: ambiguity from which nothing is accepted
+    ambiguous_share: float = 0.5  #: the same as a share of `plane_overlap`
     stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
-    blind_evidence: float = 0.4  #: least where nothing is known of free space
-    blind_plane_overlap: float = 0.3  #: and least of `plane_overlap`
-    blind_ambiguous_share: float = 0.75  #: of which, in the place of both above: fewer rivals fall
-    sparse_evidence: float = 0.1  #: least where little is shared, or one search alone found it
-    sparse_plane_overlap: float = 0.1  #: and least of `plane_overlap`
-    sparse_planes: float = 5.0  #: and least number of distinct planes
-    alone_planes: float = 6.0  #: the same of what one search alone found
-    sparse_plane_violations: float = 0.06  #: and most of `plane_violations`
-    sparse_worst_violations: float = 0.03  #: and most of `worst_violations`
-    sparse_deviation_m: float = 0.045  #: and most of the deviation of the translation, metres
-    apart_m: float = 0.2  #: most of the residual, where one search found it and both refine it
-    apart_rad: float = math.radians(4.0)
-    apart_planes: float = 12.0  #: then least number of distinct planes, beyond `residual_m`
-    apart_plane_overlap: float = 0.2  #: and least of `plane_overlap`
+    blind_evidence: float = 0.4  #: least evidence
+    blind_plane_overlap: float = 0.3  #: least plane overlap
+    blind_ambiguous_share: float = 0.75  #: replaces both limits of ambiguity: fewer rivals fall
+    sparse_evidence: float = 0.1  #: least evidence
+    sparse_plane_overlap: float = 0.1  #: least plane overlap
+    sparse_planes: float = 5.0  #: least number of distinct planes
+    alone_planes: float = 6.0  #: the same if only one search found the transform
+    sparse_plane_violations: float = 0.06  #: greatest `plane_violations`
+    sparse_worst_violations: float = 0.03  #: greatest `worst_violations`
+    sparse_deviation_m: float = 0.045  #: greatest deviation of the translation, metres
+    apart_m: float = 0.2  #: greatest residual of the two refinements, metres
+    apart_rad: float = math.radians(4.0)  #: and radians
+    apart_planes: float = 12.0  #: least number of distinct planes
+    apart_plane_overlap: float = 0.2  #: least plane overlap
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence for and against a transform, before its rivals are searched.
+    """The evidence for and against a transform, before the search for rivals.
 
     Parameters
     ----------
-    residual_m, residual_rad, overlap, plane_overlap : as in Validation
-    violations : as in Validation; None where there is no evidence of free space
-    stiffness : the less of both directions', as in Alignment
-    one_sided : free space of one of the frames is not known
-    planes : how many distinct planes agree, the mean of both frames
-    plane_violations : free-space violations with every plane counting the same, as a share of
-        what agrees or violates
-    worst_violations : violations of the frame that violates more, as a share of its own
+    residual_m, residual_rad, overlap, plane_overlap : see PairValidation
+    violations : see PairValidation; None without evidence of free space
+    stiffness : the lesser of both directions', see Alignment
+    one_sided : whether free space of one of the frames is unknown
+    planes : number of distinct planes that agree, the mean of both frames
+    plane_violations : share of free-space violations, all planes weighing the same
+    worst_violations : share of violations of the frame that violates more
     """
 
     residual_m: float
@@ -112,13 +115,9 @@ class Evidence:
 
 
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
-    """Return why not to accept a transform, whatever its rivals, or None: Sec. III-E.
+    """Return the reason to refuse a transform, whatever its rivals, or None: Sec. III-E.
 
-    Parameters
-    ----------
-    e : see Evidence
-    p : see AcceptanceParameters
-    mode : "paper" asks for the residual alone
+    Mode "paper" checks the residual alone.
     """
     if e.residual_m > p.residual_m or e.residual_rad > p.residual_rad:
         if not math.isfinite(e.residual_m):
@@ -131,7 +130,7 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
     evidence = p.blind_evidence if blind else p.evidence
     if e.total(p) < evidence:
         if e.violations is None:
-            return "rejected", f"only {e.overlap:.0%} agrees, and free space is not known"
+            return "rejected", f"only {e.overlap:.0%} agrees, and free space is unknown"
         if e.overlap < evidence:
             return "rejected", f"only {e.overlap:.0%} of the surfaces agree"
         return "rejected", f"{e.violations:.1%} lies where the other frame saw through"
@@ -147,7 +146,7 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
         return "rejected", f"{share:.1%} lies where the other frame saw through"
     if e.planes < p.planes:
         return "ambiguous", (
-            f"only {e.planes:.0f} distinct planes agree, too few to tell corridors apart"
+            f"only {e.planes:.0f} distinct planes agree, too few to distinguish corridors"
         )
     if e.stiffness < p.stiffness:
         return "ambiguous", "what the frames share leaves a direction free, as a plane does"
@@ -157,21 +156,19 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
 def sparse_evidence_suffices(
     e: Evidence, deviation_m: float, p: AcceptanceParameters, *, alone: bool = False
 ) -> bool:
-    """Return whether little evidence is enough, because all of it speaks for the transform.
+    """Return whether little evidence is enough, because all of it supports the transform.
 
-    Two frames that share a tenth of what they see cannot show the overlap that `objection` asks
-    for, and the search from one of them may miss what the search from the other finds. Such a
-    transform must be refined to the same place in both directions, several planes must agree,
-    next to nothing may lie in free space of either frame, and the surfaces must fix it firmly.
-    Depth that a sensor distorts lets the two refinements of a right transform settle some
-    centimetres apart: there many planes must agree.
+    Two frames that share a tenth of their surfaces cannot show the overlap that `objection`
+    requires, and one of the searches may miss the transform. Such a transform must be refined to
+    one place in both directions, several planes must agree, next to nothing may lie in free space
+    of either frame, and the surfaces must constrain it well. Distorted depth separates the two
+    refinements of a right transform by some centimetres; then many planes must agree.
 
     Parameters
     ----------
-    e : of the transform, with the residual of its two refinements
-    deviation_m : standard deviation of its translation, metres
-    p : see AcceptanceParameters
-    alone : whether only one of the two searches found it
+    e : evidence with the residual of the two refinements
+    deviation_m : standard deviation of the translation, metres
+    alone : whether only one of the two searches found the transform
     """
     if e.violations is None or e.one_sided:
         return False
@@ -202,19 +199,19 @@ def sparse_evidence_suffices(
 def belief(
     e: Evidence, ambiguity: float, p: AcceptanceParameters
 ) -> tuple[Status, Strength | None, str]:
-    """Return the status, strength and reason of a transform that has no objection but rivals."""
+    """Return status, strength and reason of a transform without objection, by its ambiguity."""
     most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
-    if e.violations is None:  # no rival is refuted by free space either
+    if e.violations is None:  # free space refutes no rival either
         most = p.blind_ambiguous_share * e.plane_overlap
     if ambiguity >= most:
         return "ambiguous", None, "another transform explains the frames as well"
     if e.violations is None:
-        return "accepted", "weak", "surfaces agree, but nothing is known of free space"
+        return "accepted", "weak", "surfaces agree, but free space is unknown"
     if ambiguity >= p.weak:
         return "accepted", "weak", "another transform is not ruled out"
     if e.total(p) < p.strong or e.net(p) < p.net_strong:
         return "accepted", "weak", f"{e.overlap:.0%} of the surfaces agree"
-    if e.one_sided:  # what one frame has and the other lacks may speak against it unheard
+    if e.one_sided:  # surfaces that only one frame has may contradict it
         return "accepted", "weak", "surfaces agree, but free space is known of one frame only"
     return "accepted", "strong", "surfaces agree, and nothing speaks against it"
 
@@ -224,52 +221,41 @@ def _two_digits(value: float) -> str:
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
-# Ambiguity: other transforms that would explain the same two frames.
-
-
 @dataclass(frozen=True)
 class AmbiguityParameters:
-    """The numbers of the search for rivals."""
+    """Parameters of the search for rivals."""
 
-    n_axes: int = 2  #: directions that most surface faces
-    n_planes: int = 3  #: planes across each, by area
-    same_direction: float = math.radians(12.0)  #: normals this near are parallel
-    shift: float = 0.5  #: steps along a corridor, metres: what refinement can bridge
-    n_shifts: int = 6  #: each way
-    least_crossing: float = 0.5  #: sine of the angle between the main families of planes
-    n_proposed: int = 16  #: hypotheses of the plans that are refined as rivals
+    n_axes: int = 2  #: number of main directions of normals
+    n_planes: int = 3  #: number of planes across each, by area
+    same_direction: float = math.radians(12.0)  #: greatest angle of parallel normals
+    shift: float = 0.5  #: step along a corridor, metres, which refinement can bridge
+    n_shifts: int = 6  #: number of steps each way
+    least_crossing: float = 0.5  #: least sine of the angle between the main families of planes
+    n_proposed: int = 16  #: number of plans' hypotheses that are refined as rivals
     planes: PlaneParameters = field(default_factory=PlaneParameters)
-    first: RefinementParameters = QUICK  #: of all
-    hopeful_share: float = 0.04  #: after it, those that explain less are dropped
-    hopeful_violations: float = 0.15  #: and those that violate more
-    then: RefinementParameters = COARSE  #: of the rest
-    refuted: float = 0.02  #: violations from which on a rival is none, if the transform has fewer
-    rival_m: float = 0.25  #: a rival differs by this, metres
-    rival_rad: float = math.radians(15.0)  #: or by this
+    first: RefinementParameters = QUICK  #: refinement of all rivals
+    hopeful_share: float = 0.04  #: least share that a rival explains after it
+    hopeful_violations: float = 0.15  #: greatest share of its violations
+    then: RefinementParameters = COARSE  #: refinement of the rest
+    refuted: float = 0.02  #: violations that refute a rival, if the transform has fewer
+    rival_m: float = 0.25  #: least difference of a rival, metres
+    rival_rad: float = math.radians(15.0)  #: or radians
 
 
 @cached_per_frame
 def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
-    """Return motions that map the main planes of the patches onto themselves.
+    """Return motions (n, 4, 4) that map the main planes of the patches onto themselves.
 
-    These are turns by 90, 180 and 270 degrees about the middle of each plane, and shifts along the
-    direction in which the two main families of planes both run, as a corridor does.
-
-    Parameters
-    ----------
-    patches : P of one frame
-    p : see AmbiguityParameters
-
-    Returns
-    -------
-    (n, 4, 4) with n at most 3 n_axes n_planes + 2 n_shifts
+    These are rotations by 90, 180 and 270 degrees about the middle of each plane, and shifts along
+    the intersection of the two main families of planes, as along a corridor. n is at most 3 n_axes
+    n_planes + 2 n_shifts.
     """
     left = patches.areas.copy()
     normals, mass = np.ascontiguousarray(patches.normals.T), np.empty(len(patches))
     motions: list[Floats] = []
     axes: list[Floats] = []
     for _ in range(p.n_axes):
-        _facing(normals, left, math.cos(p.same_direction), mass)
+        _sum_parallel(normals, left, math.cos(p.same_direction), mass)
         most = int(np.argmax(mass))
         if left[most] <= 0:
             break
@@ -287,16 +273,18 @@ def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
         length = float(np.linalg.norm(along))
         if length > p.least_crossing:
             steps = p.shift * np.arange(1, p.n_shifts + 1)
-            motions += [_shift(along / length * s) for s in np.concatenate([steps, -steps])]
+            shifts = np.tile(np.eye(4), (2 * p.n_shifts, 1, 1))
+            shifts[:, :3, 3] = along / length * np.concatenate([steps, -steps])[:, None]
+            motions += [*shifts]
     return np.array(motions).reshape(-1, 4, 4)
 
 
 def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameters) -> list[Floats]:
-    """Return the middles of the largest planes across an axis, of patches that have an area."""
+    """Return the middles of the largest planes across an axis, of patches with positive area."""
     offsets, mass = (patches.means * axis).sum(axis=1), np.empty(len(patches))
     middles: list[Floats] = []
     for _ in range(p.n_planes):
-        _level(offsets, area, p.planes.same_plane, mass)
+        _sum_level(offsets, area, p.planes.same_plane, mass)
         best = int(np.argmax(np.where(area > 0, mass, 0.0)))
         if area[best] <= 0:
             break
@@ -307,10 +295,10 @@ def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameter
 
 
 @disjoint_kernel
-def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
-    """Sum, for each patch, the areas of those that face its way or away from it; normals (3, P).
+def _sum_parallel(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
+    """Write for each patch the area of the patches parallel to it; normals (3, P).
 
-    The inner loop runs over the sums, not over the terms of one sum, so that it vectorises.
+    The inner loop runs over the sums, not over the terms of one sum, so that it vectorizes.
     """
     x, y, z = normals[0], normals[1], normals[2]
     mass[:] = 0.0
@@ -322,8 +310,8 @@ def _facing(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None
 
 
 @disjoint_kernel
-def _level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
-    """Sum, for each patch, the areas of those with a near offset, as `_facing` does."""
+def _sum_level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
+    """Write for each patch the area of the patches with a near offset, as `_sum_parallel` does."""
     mass[:] = 0.0
     for j in range(len(areas)):
         offset, area = offsets[j], areas[j]
@@ -332,14 +320,8 @@ def _level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
                 mass[i] += area if abs(offset - offsets[i]) < apart else 0.0
 
 
-def _shift(by: Floats) -> Floats:
-    result = np.eye(4)
-    result[:3, 3] = by
-    return result
-
-
 def _turns(axis: Floats, middles: list[Floats]) -> list[Floats]:
-    """Return turns by 90, 180 and 270 degrees about an axis through each of some points."""
+    """Return rotations by 90, 180 and 270 degrees about an axis through each of some points."""
     x, y, z = axis
     cross, outer = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.outer(axis, axis)
     rotations = [
@@ -355,8 +337,8 @@ def _turns(axis: Floats, middles: list[Floats]) -> list[Floats]:
     return turns
 
 
-def far_from(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
-    """Return those of the others (n, 4, 4) that differ from T enough to be rivals."""
+def select_rivals(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
+    """Return the transforms (n, 4, 4) that differ from T enough to be rivals."""
     return others[~are_near(others, T, p.rival_m, p.rival_rad)]
 
 
@@ -365,10 +347,9 @@ class Rival(NamedTuple):
 
     Parameters
     ----------
-    share : that it explains, every plane counting the same, 0 to 1; 0 where there is none
-    T : (4, 4) of it, or None
-    tilted : share that the best of those explains that tilt against `up`, and that nothing else
-        refutes
+    share : share of the frames that it explains, all planes weighing the same, 0 to 1; 0 if none
+    T : (4, 4) transform, or None
+    tilted : greatest share explained by a transform that only `up` refutes
     """
 
     share: float
@@ -385,27 +366,25 @@ def best_alternative(
 
     Parameters
     ----------
-    query, match : of `plane_view`
+    query, match : results of `plane_view`
     T : (4, 4) T_match_query
-    violations : of T, with every plane counting the same: free space refutes no rival for what it
-        holds against T as well
+    violations : violations of T by planes: free space refutes no rival that violates as little
     voted : (n, 4, 4) other hypotheses, refined
-    proposed : (m, 4, 4) hypotheses that were not, best first: of those that differ from T and
-        from each other as rivals do, the best are refined now
-    p, agreement_p : see there
-    ups : of query and match
-    most_tilt : radians against them beyond which a transform is no rival
+    proposed : (m, 4, 4) unrefined hypotheses, best first: the best that differ from T and from each
+        other as rivals do are refined
+    ups : up vectors of query and match
+    most_tilt : greatest tilt of a rival, radians
     """
     moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
-    near = far_from(T, refine_all(query.surface, match.surface, moved, p.first), p)
+    near = select_rivals(T, refine_all(query.surface, match.surface, moved, p.first), p)
     seen = plane_agreement(query, match, near, agreement_p)
     hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
-    proposed = far_from(T, proposed, p)
+    proposed = select_rivals(T, proposed, p)
     order = -np.arange(len(proposed), dtype=float)
     chosen = select_distinct(proposed, order, p.rival_m, p.rival_rad, p.n_proposed)
     hopeful = np.concatenate([hopeful, proposed[chosen]])
     rivals = np.concatenate([voted, refine_all(query.surface, match.surface, hopeful, p.then)])
-    rivals = far_from(T, rivals, p)
+    rivals = select_rivals(T, rivals, p)
     seen = plane_agreement(query, match, rivals, agreement_p)
     share = np.where(seen.violations < max(p.refuted, violations), seen.share, 0.0)
     level = are_level(rivals, ups, most_tilt)

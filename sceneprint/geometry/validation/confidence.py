@@ -1,14 +1,13 @@
-"""Confidence: the probability that a candidate pose is right, computed from its evidence.
+"""Compute the confidence of a candidate pose: the probability that it is right.
 
-    PlaceEvidence of every candidate  --confidences_of-->  P(right) of each, 1 at most together
-    PlaceEvidence  --weakest_evidence-->  a sentence on what keeps it from being more
+    PlaceEvidence of every candidate  --compute_confidences-->  P(right) of each, sum <= 1
+    PlaceEvidence  --weakest_evidence-->  sentence on the evidence that lowers it most
 
-One of the candidates is right, or none. The logarithm of the odds of each, against none, is what a
-pose with the best evidence has, less one penalty for each kind of evidence. A penalty is a
-piecewise linear function of its evidence that never rises with better evidence, so more support
-never lowers a confidence, and a better rival never raises one. `sceneprint_lab.confidence` learns
-the penalties on synthetic places; docs/trust.md shows how well the confidences are calibrated on
-recordings.
+At most one of the candidates is right. The log odds of each, against none, are those of a pose with
+the best evidence, less one penalty per kind of evidence. A penalty is a piecewise linear function
+that never rises with better evidence, so more support never lowers a confidence, and a better rival
+never raises one. `sceneprint_lab.confidence` learns the penalties on synthetic places;
+docs/trust.md shows the calibration on recordings.
 """
 
 from __future__ import annotations
@@ -26,22 +25,22 @@ class PlaceEvidence:
 
     Parameters
     ----------
-    score : how well the map's frames bear the pose out, see ScoredPose; at most 1
-    share : share of the query's surface that the map shows there, every plane counting the same
-    planes : distinct planes of the query that agree with the map
-    frames : frames of the map that agree
-    viewpoints : different viewpoints of these frames
-    excess : free-space violations of both sides, less those that the map's own frames show among
-        themselves; a share
-    weight : of the matches that vote for the pose, one for each viewpoint: 1 of a strong match,
-        less of a weak or an ambiguous one
-    strong : different viewpoints of strong matches that vote for it
-    accepted : different viewpoints of accepted matches that lead to it, those that were guided by
-        others among them
-    suggested : different viewpoints of candidates that suggest it, whether accepted or not
-    similarity : of the signatures of the query and the nearest of these candidates, 0 to 1
-    rival : score of the best other place, relative to this one's; 0 where there is none
-    rival_weight : largest weight of the votes for another place
+    score : agreement with the map's frames, see ScoredPose; at most 1
+    share : share of the query's surface that the map shows there, all planes weighing the same
+    planes : number of distinct planes of the query that agree with the map
+    frames : number of frames of the map that agree
+    viewpoints : number of their viewpoints
+    excess : share of free-space violations of both sides, less that of the map's own frames among
+        themselves
+    weight : sum of the weights of votes for the pose, one per viewpoint: 1 for a strong match, less
+        for a weak or an ambiguous one
+    strong : number of viewpoints of strong matches that vote for it
+    accepted : number of viewpoints of accepted matches that lead to it, guided ones included
+    suggested : number of viewpoints of candidates that suggest it, accepted or not
+    similarity : similarity of the signatures of the query and the nearest of these candidates, 0 to
+        1
+    rival : score of the best other place relative to this one's; 0 if there is none
+    rival_weight : greatest weight of the votes for another place
     rendered : whether most of these frames are views rendered from one surface
     """
 
@@ -62,10 +61,10 @@ class PlaceEvidence:
 
     @property
     def acceptance(self) -> float:
-        """Accepted matches for each frame that sees the place, of five at most: 0 to 1.
+        """Return the accepted matches per frame that sees the place, of at most five: 0 to 1.
 
-        Where many frames of the map see the right place, most of their matches are accepted, and no
-        more than five are tried for; at a place that only looks alike few are.
+        If many frames see the right place, most of their matches are accepted, and at most five are
+        tried; at a place that only looks alike few are accepted.
         """
         return min(self.accepted / max(min(self.frames, 5), 1), 1.0)
 
@@ -76,7 +75,7 @@ class Penalty:
 
     Parameters
     ----------
-    worst, poor, fair : at the first, second and third knot; none below the next
+    worst, poor, fair : penalties at the first, second and third knot, in falling order
     """
 
     worst: float = 0.0
@@ -85,11 +84,11 @@ class Penalty:
 
     @property
     def values(self) -> tuple[float, float, float, float]:
-        """The penalties at the four knots."""
+        """Return the penalties at the four knots."""
         return self.worst, self.poor, self.fair, 0.0
 
 
-#: The four values of each kind of evidence between which its penalty is linear, the worst first.
+#: Four values of each kind of evidence, worst first; its penalty is linear between them.
 KNOTS: Mapping[str, tuple[float, float, float, float]] = {
     "score": (0.05, 0.15, 0.3, 0.6),
     "planes": (3.0, 6.0, 12.0, 24.0),
@@ -107,11 +106,11 @@ KNOTS: Mapping[str, tuple[float, float, float, float]] = {
 
 @dataclass(frozen=True)
 class ConfidenceParameters:
-    """The numbers of the confidence, learnt on synthetic places.
+    """Parameters of the confidence, learnt on synthetic places.
 
     Parameters
     ----------
-    best : logarithm of the odds of a pose with the best evidence of every kind
+    best : log odds of a pose with the best evidence of every kind
     score, planes, ... : penalty of each kind of evidence
     """
 
@@ -131,28 +130,28 @@ class ConfidenceParameters:
 
 @dataclass(frozen=True)
 class ConfidenceModel:
-    """The numbers of the confidence, by what the map is made of.
+    """Parameters of the confidence, by the kind of map.
 
-    Views of one surface agree with each other perfectly, whatever is wrong with that surface: they
-    show no violations among themselves that could be allowed for. So free space that a real frame
-    violates says less there, and the other kinds of evidence have to say more.
+    Views of one surface agree perfectly with each other, even if the surface is wrong, and show no
+    violations among themselves. So a real frame's violations are weaker evidence there, and other
+    kinds count more.
 
     Parameters
     ----------
-    frames : where the map has frames of a sensor
-    views : where it has views rendered from a surface
+    frames : for maps of a sensor's frames
+    views : for maps of views rendered from a surface
     """
 
     frames: ConfidenceParameters = field(default_factory=ConfidenceParameters)
     views: ConfidenceParameters = field(default_factory=ConfidenceParameters)
 
     def of(self, e: PlaceEvidence) -> ConfidenceParameters:
-        """Return the numbers for a pose."""
+        """Return the parameters for a pose."""
         return self.views if e.rendered else self.frames
 
 
-def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
-    """Return how much each kind of evidence reduces the log odds: >= 0, by name."""
+def compute_penalties(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
+    """Return the reduction of the log odds by each kind of evidence, >= 0, by name."""
     penalties = {}
     for name, knots in KNOTS.items():
         values = getattr(p, name).values
@@ -162,32 +161,29 @@ def penalties_of(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
     return penalties
 
 
-def confidences_of(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -> list[float]:
-    """Return the probability of each candidate pose of a query to be the right one.
+def compute_confidences(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -> list[float]:
+    """Return the probability that each candidate pose of a query is right, in the same order.
+
+    1 minus their sum is the probability that none is right.
 
     Parameters
     ----------
-    evidence : of every candidate of one query, each of another place
-    p : see ConfidenceModel
-
-    Returns
-    -------
-    confidences : in the same order; 1 less their sum is the probability that none is right
+    evidence : evidence of all candidates of one query, each at another place
     """
-    odds = [math.exp(p.of(e).best - sum(penalties_of(e, p.of(e)).values())) for e in evidence]
-    whole = 1.0 + sum(odds)
-    return [one / whole for one in odds]
+    odds = [math.exp(p.of(e).best - sum(compute_penalties(e, p.of(e)).values())) for e in evidence]
+    total = 1.0 + sum(odds)
+    return [each / total for each in odds]
 
 
 def weakest_evidence(e: PlaceEvidence, p: ConfidenceModel) -> str:
     """Return a sentence on the evidence that lowers the confidence of a pose most."""
-    penalties = penalties_of(e, p.of(e))
+    penalties = compute_penalties(e, p.of(e))
     name = max(penalties, key=penalties.__getitem__)
     return {
-        "score": f"the map shows only {e.share:.0%} of what the frame sees",
+        "score": f"the map shows only {e.share:.0%} of the frame's surface",
         "planes": f"only {e.planes:.0f} distinct planes agree, and a few planes fit in many places",
         "frames": "few frames of the map see this place",
-        "excess": f"a pose fits, but {max(e.excess, 0.0):.0%} of what should be in sight there is "
+        "excess": f"a pose fits, but {max(e.excess, 0.0):.0%} of the surface in view there is "
         "missing: another place may look like this one, or this one has changed",
         "weight": "too few matches vote for the pose",
         "strong": "no strong match votes for the pose",

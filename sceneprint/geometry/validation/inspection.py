@@ -1,10 +1,12 @@
-"""Sec. III-E, to look at: what a validation's figures were counted on, point by point.
+"""Return the evidence of a validation point by point, for display (Sec. III-E).
 
     Geometry, Geometry, T  --trace-->  Traces: corresponding patches, inliers, violations
-    points, Surface, T  --judged-->  which agree, which violate free space
-    points, Surface, T  --residuals-->  and how far those that agree are from the surface
+    points, Surface, T  --point_verdicts-->  agreements and violations of free space
+    points, Surface, T  --residuals-->  distances of the points that agree from the surface
+    Surface, Surface, T  --overlay-->  points, normals, colours, in the target's frame
+    points, normals, Patches  --patches_at-->  (N,) indices
 
-Nothing here decides: the points are judged by `overlap.py`, one at a time.
+`overlap.py` judges the points one at a time.
 """
 
 from __future__ import annotations
@@ -27,9 +29,9 @@ from sceneprint.geometry.registration.overlap import (
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Surface
 
-#: What becomes of a point: nothing to compare it with, or beside the surface; on it; before it.
+#: Verdicts: unobserved or beside the surface, on the surface, in free space.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
-#: And how far it is from the surface, as `sceneprint.formats.export` tells it.
+#: Greatest residual, and codes for verdicts, as `sceneprint.formats.export` encodes them.
 TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254
 
 Verdicts = NDArray[np.uint8]
@@ -37,13 +39,13 @@ Verdicts = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """What two frames have to do with each other under one transform.
+    """The correspondence of two frames under a transform.
 
     Parameters
     ----------
-    pairs : (M, 2) indices of a patch of the query and the patch of the match it coincides with
-    distances : (M,) between their means, metres
-    query, match : (N, 6) points and normals, each in its own frame, that evidence is counted on
+    pairs : (M, 2) indices of coinciding patches of the query and of the match
+    distances : (M,) distances of their means, metres
+    query, match : (N, 6) points and normals of the evidence, each in its own frame
     of_query, of_match : (N,) NEITHER, AGREES or VIOLATES
     """
 
@@ -71,10 +73,10 @@ def _judge(
             out[i] = 2
 
 
-def judged(
+def point_verdicts(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """What becomes of each of a source's points (N, 6): (N,) NEITHER, AGREES or VIOLATES."""
+    """Return the verdicts on a source's points (N, 6): (N,) NEITHER, AGREES or VIOLATES."""
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
     _judge(
@@ -114,17 +116,18 @@ def _measure(
 def residuals(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """How far each of a source's points is from the target's surface, in steps of what agrees.
+    """Return the distances of a source's points from the target's surface, as steps of the
+    tolerance.
 
     Parameters
     ----------
-    source, target, T_target_source, p : see `agreements`
+    source, target, T_target_source, p : arguments of `agreements`
 
     Returns
     -------
-    (N,) the least k of 1 to TOLERANCE such that it agrees within k / TOLERANCE of
-    `surface_tolerance`, which grows with distance; VIOLATION where it violates free space, OUTSIDE
-    where it does neither: it is seen by no pixel, or lies beside or behind the surface
+    (N,) the least k of 1 to TOLERANCE such that the point agrees within k / TOLERANCE of
+        `surface_tolerance`, which grows with distance; VIOLATION if it violates free space; OUTSIDE
+        if no pixel sees it, or it lies beside or behind the surface
     """
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
@@ -139,62 +142,50 @@ def trace(
     query: Geometry, match: Geometry, T_match_query: Floats,
     p: OverlapParameters | None = None, patches_p: ConsensusParameters | None = None,
 ) -> Traces:  # fmt: skip
-    """What the figures of a validation were counted on: Sec. III-E.
+    """Return the points and patches that a validation counted: Sec. III-E.
 
     Parameters
     ----------
     query, match : geometry artifacts
     T_match_query : (4, 4)
-    p : that it was validated with
-    patches_p : when patches coincide, as correspondences do
-
-    Returns
-    -------
-    traces : AGREES counts as often as `Validation.inliers` says
+    p : parameters of the validation
+    patches_p : limits of coinciding patches
     """
     p = p or OverlapParameters()
-    of_query, of_match = (
-        sample_points(query.surface, p.stride),
-        sample_points(match.surface, p.stride),
-    )
-    pairs, distances = _coincident(
+    ours, theirs = (sample_points(frame.surface, p.stride) for frame in (query, match))
+    pairs, distances = _coincident_patches(
         query.patches, match.patches, T_match_query, patches_p or ConsensusParameters()
     )
     return Traces(
-        pairs, distances, of_query, of_match,
-        judged(of_query, match.surface, T_match_query, p),
-        judged(of_match, query.surface, inverse(T_match_query), p),
+        pairs, distances, ours, theirs,
+        point_verdicts(ours, match.surface, T_match_query, p),
+        point_verdicts(theirs, query.surface, inverse(T_match_query), p),
     )  # fmt: skip
 
 
-def _coincident(
+def _coincident_patches(
     query: Patches, match: Patches, T: Floats, p: ConsensusParameters
 ) -> tuple[Ints32, Floats]:
-    """Patches that are each other's nearest with a like normal, by distance."""
+    """Return patches that are each other's nearest with a similar normal, by distance."""
     if not len(query) or not len(match):
         return np.zeros((0, 2), np.int32), np.zeros(0)
     apart = np.linalg.norm(transform_points(T, query.means)[:, None] - match.means, axis=2)
     cosines = (query.normals @ T[:3, :3].T) @ match.normals.T
     apart = np.where(cosines > p.inlier_cosine, apart, np.inf)
     there, back = apart.argmin(axis=1), apart.argmin(axis=0)
-    one = np.flatnonzero(back[there] == np.arange(len(query)))
-    one = one[apart[one, there[one]] < p.inlier_distance]
-    distances = apart[one, there[one]]
+    mutual = np.flatnonzero(back[there] == np.arange(len(query)))
+    mutual = mutual[apart[mutual, there[mutual]] < p.inlier_distance]
+    distances = apart[mutual, there[mutual]]
     order = np.argsort(distances, kind="stable")
-    pairs = np.stack([one, there[one]], axis=1)[order].astype(np.int32)
+    pairs = np.stack([mutual, there[mutual]], axis=1)[order].astype(np.int32)
     return pairs, distances[order]
 
 
-# Two frames laid on each other, to see how well they fit.
-#
-# Surface, Surface, T  --overlay-->  points, normals, colours, in the target's frame
-
 Colour = Literal["source", "normal", "residual"]
 
-#: Of the source's points, and of the target's.
+#: Colours of the source's and of the target's points.
 SOURCE, TARGET = (217, 119, 43), (43, 108, 176)
-#: Distances from the other's surface, of `TOLERANCE` of what validation allows, and the colours of
-#: the points that keep them; then of those that lie beside it or where it did not look, and of
+#: Upper limits of residuals, and the colours of points within them, of points outside, and of
 #: violations.
 STEPS = (50, 100, TOLERANCE)
 STEP_COLOURS = np.array(
@@ -206,16 +197,16 @@ def overlay(
     source: Surface, target: Surface, T_target_source: Floats, colour: Colour = "source",
     p: OverlapParameters | None = None,
 ) -> tuple[Floats, Floats, Bytes]:  # fmt: skip
-    """Both surfaces as one coloured cloud, the source's points first.
+    """Return both surfaces as one coloured cloud, the source's points first.
 
     Parameters
     ----------
-    source, target : every valid pixel of both
+    source, target : all valid pixels of both are shown
     T_target_source : (4, 4)
-    colour : "source" tells the frames apart, "normal" the directions of the surfaces (x, y, z in
-        the target's frame from -1 to 1 as red, green, blue from 0 to 255), "residual" how far a
-        point is from the other's surface (`STEPS`)
-    p : when points agree and when they violate free space
+    colour : "source" distinguishes the frames, "normal" shows normals (x, y, z in the target's
+        frame from -1 to 1 as red, green, blue from 0 to 255), "residual" the distances from the
+        other's surface (`STEPS`)
+    p : limits of agreement and of violations
 
     Returns
     -------
@@ -227,14 +218,14 @@ def overlay(
     points = np.concatenate(
         [transform_points(T, ours[:, :3].astype(float)), theirs[:, :3].astype(float)]
     )
-    turned = ours[:, 3:].astype(float) @ T[:3, :3].T
-    normals = np.concatenate([turned, theirs[:, 3:].astype(float)])
+    rotated = ours[:, 3:].astype(float) @ T[:3, :3].T
+    normals = np.concatenate([rotated, theirs[:, 3:].astype(float)])
     if colour == "normal":
         shade = np.clip(np.rint((normals + 1.0) * 127.5), 0, 255)
         return points, normals, shade.astype(np.uint8)
     if colour == "source":
-        of = np.repeat(np.array([SOURCE, TARGET], np.uint8), [len(ours), len(theirs)], axis=0)
-        return points, normals, of
+        pair = np.array([SOURCE, TARGET], np.uint8)
+        return points, normals, np.repeat(pair, [len(ours), len(theirs)], axis=0)
     p = p or OverlapParameters()
     steps: NDArray[np.intp] = np.searchsorted(
         (*STEPS, OUTSIDE),
@@ -243,16 +234,9 @@ def overlay(
     return points, normals, STEP_COLOURS[steps]
 
 
-# Sec. III-F backwards: which patch a point of a surface lies on, for who has the patches alone.
-#
-# points, normals, Patches  --patches_at-->  (N,) indices
-#
-# Artifacts do not keep which point went into which patch. Of patches of about one size, as those of
-# validation are, the nearest mean with a like normal is nearly it.
-
 #: Least cosine between the normals of a point and of its patch.
 _COSINE = 0.5
-#: A point lies at most so many radii of a patch (of a disc of its area) from its mean.
+#: Greatest distance of a point from its patch's mean, in radii of a disc of the patch's area.
 _RADII = 4.0
 
 
@@ -275,18 +259,17 @@ def _nearest(
 
 
 def patches_at(points: Floats32, patches: Patches) -> Ints32:
-    """The patch that each point lies on.
+    """Return the patch of each point, (N,): the nearest with a similar normal, or -1.
+
+    Artifacts do not store the labels of points; for patches of similar sizes this is nearly the
+    same.
 
     Parameters
     ----------
-    points : (N, 6) float32 of `sampled`, points and normals
-    patches : of the same surface
-
-    Returns
-    -------
-    (N,) the nearest of the patches with a like normal; -1 where none is within reach
+    points : (N, 6) float32 result of `sample_points`, points and normals
+    patches : patches of the same surface
     """
-    found = np.full(len(points), -1, np.int32)
+    indices = np.full(len(points), -1, np.int32)
     reaches = _RADII * np.sqrt(patches.areas / np.pi)
-    _nearest(points, patches.means, patches.normals, reaches, _COSINE, found)
-    return found
+    _nearest(points, patches.means, patches.normals, reaches, _COSINE, indices)
+    return indices

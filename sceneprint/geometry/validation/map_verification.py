@@ -1,11 +1,11 @@
-"""Verification in the map: compare poses of a query on all frames that would see its surfaces.
+"""Compare poses of a query on all frames of the map that would see its surfaces.
 
     query, poses, MapViews  --compare_poses-->  ScoredPose, the best of each place first
 
 Two frames can agree under a wrong transform: a cabinet looks alike from both sides. The frames
-around it then tell the poses apart, as each shows what the query would have to see from there.
-So a pose is scored on many views at once. A surface of the query that one view does not show
-another may, and what most of the views saw through speaks against the pose.
+around it distinguish the poses, because each predicts what the query would see. So a pose is scored
+on many views: a surface of the query may be visible in only some of them, and free space that most
+of them saw contradicts the pose.
 """
 
 from __future__ import annotations
@@ -32,35 +32,35 @@ from sceneprint.geometry.registration.overlap import (
     tolerances,
 )
 from sceneprint.geometry.rigid import are_near, average_poses, inverse, select_distinct
-from sceneprint.geometry.validation.validation import refined_at
+from sceneprint.geometry.validation.validation import refine_transform
 from sceneprint.types import Floats, Geometry, Intrinsics
 
 
 @dataclass(frozen=True)
 class MapParameters:
-    """The numbers of verification in the map."""
+    """Parameters of verification in the map."""
 
-    n_views: int = 10  #: that a pose is scored on, at most
-    look_ahead: float = 1.5  #: of a camera, to the middle of what it sees, metres
-    reach: float = 3.5  #: between the middles of two views that may share surfaces, metres
-    around_reach: float = 4.0  #: the same where a sensor may look anywhere, metres
-    same_surfaces: float = 8.0  #: between two sensors that may still see the same surfaces, metres
-    near: float = 2.0  #: within which frames of the map are looked for first, metres
-    cell: float = 1.0  #: poses this near are looked about once, metres
-    start_shift: float = 0.5  #: from a prior to the starts about it, at most, metres
-    least_agreeing: float = 0.03  #: share of the query's points, below which a view has no say
-    violation_weight: float = 2.0  #: of the violations of either side, in the score
-    n_poses: int = 40  #: that are scored on the candidates
-    n_places: int = 6  #: places, the best of these, that are scored on all frames
-    hopeful: float = 0.2  #: of the best score, below which a place is not looked into further
-    n_refined: int = 3  #: places whose pose is refined
-    n_refining: int = 3  #: views that a pose is refined on
-    n_noise: int = 4  #: frames of the map whose own violations are taken for noise
-    least_noise: float = 0.02  #: violations of a pose below which that is not asked
-    same_m: float = 0.1  #: poses this near are one, metres
-    same_rad: float = math.radians(6.0)
-    place_m: float = 0.25  #: poses farther apart are of two places, metres
-    place_rad: float = math.radians(15.0)
+    n_views: int = 10  #: maximum number of views that score a pose
+    look_ahead: float = 1.5  #: distance of a camera to the middle of its view, metres
+    reach: float = 3.5  #: greatest distance of the middles of views with common surfaces, metres
+    around_reach: float = 4.0  #: the same if a sensor may look in any direction, metres
+    same_surfaces: float = 8.0  #: greatest distance of two sensors with common surfaces, metres
+    near: float = 2.0  #: radius of the first search for frames of the map, metres
+    cell: float = 1.0  #: poses within this distance share a search, metres
+    start_shift: float = 0.5  #: greatest distance of a start from its prior, metres
+    least_agreeing: float = 0.03  #: least share of agreeing points of a view that counts
+    violation_weight: float = 2.0  #: weight of the violations of either side in the score
+    n_poses: int = 40  #: number of poses that are scored on the candidates
+    n_places: int = 6  #: number of best places that are scored on all frames
+    hopeful: float = 0.2  #: least share of the best score of a place that is refined
+    n_refined: int = 3  #: number of places whose pose is refined
+    n_refining: int = 3  #: number of views for the refinement of a pose
+    n_noise: int = 4  #: number of map frames that measure noise by their own violations
+    least_noise: float = 0.02  #: violations of a pose above which noise is measured
+    same_m: float = 0.1  #: distance within which poses are equal, metres
+    same_rad: float = math.radians(6.0)  #: and radians
+    place_m: float = 0.25  #: distance within which poses are at one place, metres
+    place_rad: float = math.radians(15.0)  #: and radians
     refinement: RefinementParameters = COARSE
     planes: PlaneParameters = field(default_factory=PlaneParameters)
 
@@ -71,10 +71,10 @@ class MapFrame:
 
     Parameters
     ----------
-    geometry : of the frame
-    target : its surface, to be looked up
-    T : (4, 4) T_parent_sensor; of a frame of the query T_query_sensor
-    weighing : which of its patches lie in one plane
+    geometry : geometry of the frame
+    target : its surface, prepared for look-ups
+    T : (4, 4) T_parent_sensor; T_query_sensor for a frame of the query
+    weighing : limits of patches in one plane
     """
 
     geometry: Geometry
@@ -84,12 +84,12 @@ class MapFrame:
 
     @cached_property
     def planes(self) -> PlaneView:
-        """Its patches with their weights, when they are first needed."""
+        """Return its patches with their weights."""
         return plane_view(self.geometry, self.weighing)
 
     @cached_property
     def inverse_pose(self) -> Floats:
-        """(4, 4), the inverse of T: many poses are scored on one frame."""
+        """Return the inverse of T, (4, 4)."""
         return inverse(self.T)
 
 
@@ -100,14 +100,13 @@ class ScoredPose:
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    score : `share`, less for violations; 1 where all that the query sees is in the map
-    share : of the query's surface that the map shows there, every plane counting the same
-    planes : distinct planes of a frame of the query that agree, on average
-    violations : share of the query's surface that the map saw through, of what is decided
-    hidden : the same of the map's surfaces, which the query saw through
-    noise : violations that the map's frames about the pose show among themselves; 0 where it
-        was not asked for
-    views : frames of the query with positions of map frames that agree, most shared first
+    score : `share` reduced by violations; 1 if the map confirms the whole query
+    share : share of the query's surface that the map shows there, all planes weighing the same
+    planes : mean number of distinct planes of a query frame that agree
+    violations : violations as a share of agreements and violations, for the query's surface
+    hidden : the same for the map's surfaces in the query's free space
+    noise : violations among the map's own frames at the pose; 0 if not measured
+    views : pairs of query frame and map frame that agree, most agreement first
     starts : (4, 4) poses that were refined to this one, or to its place
     """
 
@@ -122,29 +121,27 @@ class ScoredPose:
     starts: tuple[Floats, ...] = ()
 
     def is_of(self, T: Floats, p: MapParameters) -> bool:
-        """Return whether a pose (4, 4) is at this place, or at one that was refined to it."""
+        """Return whether a pose (4, 4) is at this place, or at a place that was refined to it."""
         return bool(at_place(np.stack([self.T, *self.starts]), T, p).any())
 
 
 class MapViews:
-    """The frames of one parent frame that may see what a query sees, opened when needed."""
+    """The frames of one parent frame that may see the surfaces of a query, opened when needed."""
 
     def __init__(
         self, poses: Floats, open_geometry: Callable[[int], Geometry | None],
         p: MapParameters, overlap_p: OverlapParameters, candidates: Sequence[int] = (),
         ahead: Sequence[bool] | None = None, rendered: Sequence[bool] | None = None,
     ) -> None:  # fmt: skip
-        """Hold frames by their poses.
+        """Store frames by their poses.
 
         Parameters
         ----------
         poses : (n, 4, 4) T_parent_sensor
-        open_geometry : the artifact of the i-th; None where it cannot be read
-        p, overlap_p : see there
-        candidates : positions of those that poses are first compared on, being open already;
-            none: all
-        ahead : of each, whether its sensor looks along z, as depth cameras do; default: all do
-        rendered : of each, whether it is a view rendered from a surface; default: none is
+        open_geometry : opens the artifact of frame i; None if it is unreadable
+        candidates : indices of open frames for the first comparison; default: all frames
+        ahead : whether each sensor looks along z, as depth cameras do; default: all do
+        rendered : whether each frame is a view rendered from a surface; default: none is
         """
         self.poses, self._open, self._p, self._overlap = poses, open_geometry, p, overlap_p
         self.candidates = np.array(candidates, np.intp)
@@ -153,7 +150,7 @@ class MapViews:
         self._frames: dict[int, MapFrame | None] = {}
 
     def __getitem__(self, i: int) -> MapFrame | None:
-        """Return the i-th frame, or None where its artifact cannot be read."""
+        """Return frame i, or None if its artifact is unreadable."""
         if i not in self._frames:
             geometry = self._open(i)
             self._frames[i] = None if geometry is None else map_frame(
@@ -162,21 +159,18 @@ class MapViews:
         return self._frames[i]
 
     def mostly_rendered(self, frames: Sequence[int] | NDArray[np.intp]) -> bool:
-        """Return whether more than half of some frames are views rendered from a surface.
-
-        Of all, where none is named.
-        """
+        """Return whether most of some frames, or of all, are views rendered from a surface."""
         among = self._rendered[list(frames)] if len(frames) else self._rendered
         return 2 * int(among.sum()) > len(among)
 
     def near(self, T: Floats, ahead: bool, among: NDArray[np.intp] | None = None) -> list[int]:
-        """Return the frames that most likely see what a sensor at T sees, nearest first.
+        """Return the frames most likely to see the surfaces that a sensor at T sees, nearest first.
 
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
-        ahead : whether it looks along z; where both sensors do, directions count beside distance
-        among : positions of the frames to choose from; default: all
+        ahead : whether it looks along z; if both sensors do, directions count beside distance
+        among : indices of the frames to search; default: all
         """
         p = self._p
         poses = self.poses if among is None else self.poses[among]
@@ -191,14 +185,7 @@ class MapViews:
 def map_frame(
     geometry: Geometry, T: Floats, p: MapParameters, overlap_p: OverlapParameters
 ) -> MapFrame:
-    """Return a frame prepared for comparison with others of its parent frame.
-
-    Parameters
-    ----------
-    geometry : of the frame
-    T : (4, 4), see MapFrame
-    p, overlap_p : see there
-    """
+    """Return a frame prepared for comparison with others of its parent frame; T as in MapFrame."""
     target = overlap_target(geometry.surface, overlap_p)
     return MapFrame(geometry, target, T, p.planes)
 
@@ -214,7 +201,7 @@ def looks_ahead(geometry: Geometry) -> bool:
 def view_separations(
     poses: Floats, look_ahead: NDArray[np.bool_], T: Floats, ahead: bool, p: MapParameters
 ) -> Floats:
-    """Return how far the views of sensors are from that of a sensor at T: (n,).
+    """Return the separations of the views of sensors from that of a sensor at T, (n,).
 
     Views at 1 or more are too far apart to share surfaces.
 
@@ -222,9 +209,8 @@ def view_separations(
     ----------
     poses : (n, 4, 4) T_parent_sensor
     look_ahead : (n,) whether each looks along z
-    T, ahead : (4, 4) of the one sensor, and whether it does; where both do, directions count
-        beside distance
-    p : see there
+    T, ahead : (4, 4) pose of the one sensor, and whether it looks along z; if both sensors do,
+        directions count beside distance
     """
     axes = poses[:, :3, 2]
     middles = poses[:, :3, 3] + np.where(look_ahead, p.look_ahead, 0.0)[:, None] * axes
@@ -243,11 +229,11 @@ def score_pose(
 
     Parameters
     ----------
-    frames : of the query, of `map_frame`: each with its T_query_sensor, the identity for one
+    frames : results of `map_frame` for the query: each with its T_query_sensor, the identity for
+        one
     T : (4, 4) T_parent_query
-    views : of the same parent frame
-    p, overlap_p : see there
-    among : positions of the frames that it is scored on; default: all
+    views : views of the same parent frame
+    among : indices of the frames that score it; default: all
     """
     limits = tolerances(overlap_p)
     total = agreeing = violating = seen = through = 0.0
@@ -261,11 +247,10 @@ def score_pose(
             if view is None:
                 continue
             T_view_sensor = view.inverse_pose @ T_parent_sensor
-            said = look_up(points, view.target, T_view_sensor, limits)
-            agreed = said == AGREES
-            count = int(np.count_nonzero(agreed))
-            agree += agreed
-            violate += said == VIOLATES
+            verdicts = look_up(points, view.target, T_view_sensor, limits)
+            count = int(np.count_nonzero(verdicts == AGREES))
+            agree += verdicts == AGREES
+            violate += verdicts == VIOLATES
             if count < p.least_agreeing * len(points):
                 continue
             shared.append((-count, number, i))
@@ -288,12 +273,7 @@ def map_noise(
 ) -> float:
     """Return the median violations among the map's frames that agree with a pose.
 
-    Poses that drift and things that were moved let free space speak against right poses too.
-
-    Parameters
-    ----------
-    pose : of `score_pose`
-    views, p, overlap_p : see there
+    Drifting poses and moved objects violate free space under right poses too.
     """
     noises = []
     agreeing = np.unique([i for _, i in pose.views])
@@ -306,30 +286,30 @@ def map_noise(
     return float(np.median(noises)) if noises else 0.0
 
 
-def refined_pose(
+def refine_pose(
     frames: Sequence[MapFrame], pose: ScoredPose, views: MapViews, p: MapParameters
 ) -> Floats | None:
-    """Return a pose refined on the views that share most with it, and averaged: (4, 4), or None."""
+    """Refine a pose on the views that share most with it, and average: (4, 4), or None."""
     refined = []
     for number, i in pose.views[: p.n_refining]:
         frame, view = frames[number], views[i]
         if view is None:
             continue
         start = inverse(view.T) @ pose.T @ frame.T
-        T = refined_at(frame.geometry, view.geometry, start, p.refinement)
+        T = refine_transform(frame.geometry, view.geometry, start, p.refinement)
         if T is not None:
             refined.append(view.T @ T @ inverse(frame.T))
     return average_poses(np.stack(refined)).T if refined else None
 
 
-def starts_about(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
-    """Return a pose and six about it, a deviation away along each axis: (7, 4, 4).
+def prior_starts(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
+    """Return a pose and six around it, a deviation away along each axis, (7, 4, 4).
 
     Parameters
     ----------
-    T : (4, 4) T_parent_sensor that is believed
-    covariance : (6, 6) of it, metres before radians
-    p : shifts are `p.start_shift` at most, as refinement bridges no more
+    T : (4, 4) T_parent_sensor of the prior
+    covariance : (6, 6) of T, metres before radians
+    p : shifts are at most `p.start_shift`, because refinement bridges no more
     """
     starts = np.tile(T, (7, 1, 1))
     deviations = np.minimum(np.sqrt(np.diag(covariance)[:3]), p.start_shift)
@@ -339,14 +319,14 @@ def starts_about(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
     return starts
 
 
-def refined_starts(
+def refine_starts(
     frames: Sequence[MapFrame], starts: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Return poses of a prior (n, 4, 4) after refinement on the map: (m, 4, 4)."""
+    """Refine poses of a prior (n, 4, 4) on the map; return the successful, (m, 4, 4)."""
     refined = []
     for start in starts:
-        T = refined_pose(frames, score_pose(frames, start, views, p, overlap_p), views, p)
+        T = refine_pose(frames, score_pose(frames, start, views, p, overlap_p), views, p)
         if T is not None:
             refined.append(T)
     return np.array(refined).reshape(-1, 4, 4)
@@ -356,73 +336,72 @@ def compare_poses(
     frames: Sequence[MapFrame], poses: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> list[ScoredPose]:  # fmt: skip
-    """Return poses of the query, the best of each place, best first.
+    """Return the best pose of the query at each place, best first.
 
-    All are compared on the candidates first, and the best places on all frames that would see them.
-    The first few places are refined on the map before they are compared, as a pose that is off
-    by a few centimetres shows violations that the right one has not.
+    All poses are compared on the candidates first, and the best places on all frames that would see
+    them. The first few places are refined on the map before, because an error of a few centimetres
+    causes violations.
 
     Parameters
     ----------
-    frames : of the query, as in `score_pose`
-    poses : (n, 4, 4) T_parent_query, those to believe most first; beyond `n_poses` distinct ones
-        the rest is left out
-    views : of the same parent frame
-    p, overlap_p : see there
+    frames : frames of the query, as in `score_pose`
+    poses : (n, 4, 4) T_parent_query, most plausible first; distinct ones beyond `n_poses` are
+        ignored
+    views : views of the same parent frame
     """
     first = -np.arange(len(poses), dtype=float)
     chosen = select_distinct(poses, first, p.same_m, p.same_rad, p.n_poses)
     among = views.candidates if len(views.candidates) else None
     scored = [score_pose(frames, poses[i], views, p, overlap_p, among) for i in chosen]
-    places = _hopeful(best_of_places(scored, p), p)[: p.n_places]
+    places = _select_hopeful(best_per_place(scored, p), p)[: p.n_places]
     scored = [score_pose(frames, place.T, views, p, overlap_p) for place in places]
-    places = _refined_places(frames, best_of_places(scored, p), views, p, overlap_p)
+    places = _refine_places(frames, best_per_place(scored, p), views, p, overlap_p)
     for k, pose in enumerate(places[: p.n_refined]):
         if pose.violations + pose.hidden > p.least_noise:
             places[k] = replace(pose, noise=map_noise(pose, views, p, overlap_p))
     return places
 
 
-def _refined_places(
+def _refine_places(
     frames: Sequence[MapFrame], places: list[ScoredPose], views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> list[ScoredPose]:  # fmt: skip
-    """Refine places, best first, until `n_refined` different ones are left: best first.
+    """Refine places, best first, until `n_refined` different ones remain.
 
-    A pose that refines to a better one is no other place: it started in the same basin, and would
-    pass for a rival of what it leads to.
+    A pose that refines to a better one started in the same basin: it is no other place, and would
+    count as a rival of its result.
     """
-    hopeful = _hopeful(places, p)
+    hopeful = _select_hopeful(places, p)
     settled: list[ScoredPose] = []
     for pose in hopeful:
         if len(settled) == p.n_refined:
             break
-        T = refined_pose(frames, pose, views, p)
+        T = refine_pose(frames, pose, views, p)
         refined = pose if T is None else score_pose(frames, T, views, p, overlap_p)
-        near = [same_place(one.T, refined.T, p) for one in settled]
+        near = [same_place(place.T, refined.T, p) for place in settled]
         if any(near):
             k = near.index(True)
-            best = max(settled[k], refined, key=lambda one: one.score)
+            best = max(settled[k], refined, key=lambda place: place.score)
             settled[k] = replace(best, starts=(*settled[k].starts, pose.T))
             continue
-        best = max(pose, refined, key=lambda one: one.score)
+        best = max(pose, refined, key=lambda place: place.score)
         settled.append(replace(best, starts=(pose.T,)))
-    own = np.array([T for one in settled for T in (one.T, *one.starts)]).reshape(-1, 4, 4)
-    rest = [one for one in places if not at_place(own, one.T, p).any()]
-    return best_of_places([*settled, *rest], p)
+    own = np.array([T for place in settled for T in (place.T, *place.starts)]).reshape(-1, 4, 4)
+    rest = [place for place in places if not at_place(own, place.T, p).any()]
+    return best_per_place([*settled, *rest], p)
 
 
-def _hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
-    """Return the places whose score may still come near that of the first, which is the best."""
-    return [one for one in places if one is places[0] or one.score >= p.hopeful * places[0].score]
+def _select_hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
+    """Return the places whose score may still approach that of the first, which is the best."""
+    return places[:1] + [pose for pose in places[1:] if pose.score >= p.hopeful * places[0].score]
 
 
-def best_of_places(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
+def best_per_place(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
     """Return the best pose of each place, best first; ties keep their order."""
     places: list[ScoredPose] = []
-    for one in sorted(scored, key=lambda pose: -pose.score):
-        if not places or not at_place(np.stack([other.T for other in places]), one.T, p).any():
-            places.append(one)
+    for pose in sorted(scored, key=lambda pose: -pose.score):
+        if not places or not at_place(np.stack([place.T for place in places]), pose.T, p).any():
+            places.append(pose)
     return places
 
 
@@ -432,11 +411,11 @@ def same_place(a: Floats, b: Floats, p: MapParameters) -> bool:
 
 
 def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
-    """Return which of some poses (n, 4, 4) are at the place of T: (n,)."""
+    """Return a mask (n,) of the poses (n, 4, 4) at the place of T."""
     return are_near(poses, T, p.place_m, p.place_rad)
 
 
-def different_views(viewpoints: Floats, p: MapParameters) -> list[int]:
+def distinct_viewpoints(viewpoints: Floats, p: MapParameters) -> list[int]:
     """Return the indices of the first of some views (n, 4, 4) from each viewpoint."""
     order = -np.arange(len(viewpoints), dtype=float)
     return select_distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))

@@ -1,18 +1,17 @@
-"""Sec. III-E, validation: align two frames by a rigid transform, and decide whether it is right.
+"""Align two frames by a rigid transform, and decide whether it is right (Sec. III-E).
 
-    Geometry, Geometry, seed  --validate-->  Validation
-    validations  --preferred-->  C_vld
+    Geometry, Geometry, seed  --validate-->  PairValidation
+    validations  --rank_accepted-->  C_vld
 
-The transform is estimated both ways, independently. That both agree is the paper's test. By
-itself it believes too much: two estimates from the same two frames may fall into the same wrong
-place, where plane lies on plane. So the transform must also explain what both sensors saw: enough
-of both surfaces agrees, and next to nothing lies where the other frame saw through.
+The paper estimates the transform in both directions independently, and accepts it if they agree.
+That accepts too much, because both estimates may fall into the same wrong place. So the transform
+must also explain both frames: enough of both surfaces agrees, and next to nothing lies in free
+space of the other frame.
 
-By itself it also believes too little: of two depth images that share a tenth of what they see, one
-search may miss what the other one finds. Such a transform is refined in both directions, and little
-that agrees is enough for a weak match if several planes are among it and nothing contradicts it.
-What the other search found is then a rival like any other hypothesis. The searches themselves stay
-independent.
+It also accepts too little, because one of two depth images that share a tenth of their surfaces may
+miss the transform that the other finds. Such a transform is refined in both directions, and little
+agreement is enough for a weak match if it includes several planes and nothing contradicts it. The
+result of the other search is then a rival like any other hypothesis.
 """
 
 from __future__ import annotations
@@ -77,12 +76,12 @@ from sceneprint.geometry.validation.acceptance import (
 )
 from sceneprint.types import Floats, Geometry, Sphere, kind_of
 
-#: From which frame to which a transform was searched for.
+#: Direction of a search.
 Direction = Literal["query_to_match", "match_to_query"]
 THERE: Direction = "query_to_match"
 BACK: Direction = "match_to_query"
 _NONE = np.empty((0, 4, 4))
-#: Where `up` itself is wrong, the right transform is among those that it calls impossible.
+#: Reason if a transform that `up` excludes may be right, because `up` may be wrong.
 _MORE_TILTED = (
     "a transform that tilts against `up` explains more: check the IMU and the axes of `up`"
 )
@@ -90,12 +89,12 @@ _MORE_TILTED = (
 
 @dataclass(frozen=True)
 class ValidationParameters:
-    """The numbers of every step."""
+    """Parameters of every step."""
 
-    minimum_patches: int = 10  #: of either frame
-    n_hypotheses: int = 4  #: of each direction, beside what was found, that a map may confirm
-    guided_m: float = 0.15  #: from a predicted transform to the one found there, at most
-    guided_rad: float = math.radians(6.0)  #: and between their rotations
+    minimum_patches: int = 10  #: least number of patches of either frame
+    n_hypotheses: int = 4  #: number of further hypotheses per direction, for verification in a map
+    guided_m: float = 0.15  #: greatest distance of a guided transform from its prediction, metres
+    guided_rad: float = math.radians(6.0)  #: and radians
     acceptance: AcceptanceParameters = field(default_factory=AcceptanceParameters)
     rivals: AmbiguityParameters = field(default_factory=AmbiguityParameters)
     alignment: AlignmentParameters = field(default_factory=AlignmentParameters)
@@ -109,43 +108,41 @@ class PairValidation:
 
     Parameters
     ----------
-    status : accepted, rejected, or ambiguous (a rival transform explains the frames as well, or
-        what they share leaves a direction free)
-    strength : of an accepted match: strong, or weak where a rival comes near, little agrees, or a
-        frame has no viewpoint; else None
-    reason : a short sentence
-    T_match_query : (4, 4) query coordinates to the match's, x_match = T @ x_query; the best there
-        is, whatever the status: halfway between the two directions, or where these disagree, the
-        one that more speaks for; None where the frames gave no hypothesis at all
-    residual_m, residual_rad : of the two directions composed, T_match_query T_query_match;
-        infinite where there is none. Of an accepted match with `T_other`, or with one direction
-        only, those of its two refinements
+    status : accepted, rejected, or ambiguous (a rival transform explains the frames as well, or a
+        direction is free)
+    strength : of an accepted match: strong, or weak if a rival is close, little agrees, or a frame
+        has no viewpoint; else None
+    reason : short sentence
+    T_match_query : (4, 4) query coordinates to the match's, x_match = T @ x_query: the best
+        transform whatever the status, halfway between the two directions or, if they disagree, the
+        one with more evidence; None without any hypothesis
+    residual_m, residual_rad : residual of the two directions composed, T_match_query T_query_match;
+        infinite without one. For an accepted match with `T_other`, or with one direction only, the
+        residual of its two refinements
     overlap : share of both frames' points that agree under the transform, 0 to 1
-    plane_overlap : the same with every plane counting as much as another, however large, 0 to 1:
-        low where only a floor or a wall agrees
-    violations : free-space violations, as a share of violations and of the inliers counted with
-        them, 0 to 1; None where neither frame has a viewpoint: no evidence of free space
-    inliers : points of both frames that agree under the transform
+    plane_overlap : the same with all planes weighing the same, 0 to 1: low if only a floor or a
+        wall agrees
+    violations : free-space violations as a share of violations and their inliers, 0 to 1; None if
+        neither frame has a viewpoint
+    inliers : number of points of both frames that agree under the transform
     ambiguity : share of both frames that agrees under the best rival that free space does not
-        refute, every plane counting the same; 0 to 1. Rivals are looked for only where all else
-        speaks for accepting; elsewhere it is 0
+        refute, all planes weighing the same, 0 to 1; 0 if other evidence already decides against
+        the transform
     T_rival : (4, 4) that rival, or None
-    seed : of the random choices
-    covariance : (6, 6) of T_match_query where it is accepted, else None; see `icp.py`
+    seed : seed of the random choices
+    covariance : (6, 6) of T_match_query if it is accepted, else None; see `icp.py`
     around : whether both frames see all around their sensors, as spinning scanners do
-    planes : how many distinct planes agree, the mean of both frames
-    plane_violations : `violations` with every plane counting the same
-    search : what proposed the transform: correspondences of patches, the plans of two scans, or
-        the map's poses
-    directions : of the search, in which the transform was found: both, or the one that found it
-    T_other : (4, 4) where the two directions disagree, what the other one found; else None
+    planes : number of distinct planes that agree, the mean of both frames
+    plane_violations : `violations` with all planes weighing the same
+    search : source of the transform: correspondences, plans of two scans, or the map's poses
+    directions : the directions of the search that found the transform
+    T_other : (4, 4) result of the other direction if the two disagree; else None
     hypotheses : (n, 4, 4) T_match_query of the best that either direction refined, and of
-        `T_rival`: what the frames may stand to each other, for the map to decide between
-    ups : (3,) up in the query's and in the match's coordinates, as far as it was known
-    tilt_rad : by how much the transform tilts the one up against the other; None where either is
-        not known
-    contradicts_up : the surfaces alone would be believed, but the transform tilts too much
-    predicted : (4, 4) of a guided one, T_match_query that the map's poses gave; else None
+        `T_rival`, for verification in a map
+    ups : (3,) up in the query's and in the match's coordinates, or None
+    tilt_rad : tilt of the transform against them; None if either is unknown
+    contradicts_up : whether the surfaces alone would be accepted, but the transform tilts too much
+    predicted : (4, 4) T_match_query predicted by the map's poses, if it is guided; else None
     """
 
     status: Status
@@ -176,29 +173,29 @@ class PairValidation:
 
     @property
     def guided(self) -> bool:
-        """Whether other matches predicted the transform, so that it is no vote of its own."""
+        """Return whether other matches predicted the transform: then it is no independent vote."""
         return self.predicted is not None
 
 
 def middle(a: Floats, b: Floats) -> Floats:
-    """Return the transform halfway between two that are near each other: (4, 4)."""
+    """Return the transform halfway between two nearby transforms, (4, 4)."""
     result = np.eye(4)
     result[:3, :3] = nearest_rotation(a[:3, :3] + b[:3, :3])
     result[:3, 3] = (a[:3, 3] + b[:3, 3]) / 2
     return result
 
 
-def refined_at(
+def refine_transform(
     query: Geometry, match: Geometry, T_match_query: Floats, p: RefinementParameters | None = None
 ) -> Floats | None:
     """Refine a transform in both directions, and return the middle of the two.
 
-    What is left of the error when the start was the truth is the sensors' and the reference
-    poses', not that of the search.
+    If the initial transform is the truth, the change measures the errors of sensors and reference
+    poses.
 
     Returns
     -------
-    (4, 4) T_match_query, or None where the frames do not overlap there
+    (4, 4) T_match_query, or None if the frames do not overlap there
     """
     p = p or FINE
     a, b = query.surface, match.surface
@@ -226,21 +223,18 @@ def validate(
 
     Parameters
     ----------
-    query, match : geometry artifacts made with one model
-    seed : of the random choices, 0 or more; the same seed gives the same answer
-    p : see ValidationParameters
-    mode : "full", or "paper": accept where the residual of the two directions is small, on no
-        other evidence
-    matching : what correspondences are found by
-    ups : (3,) unit vectors, up in the query's and in the match's coordinates, where they are
-        known: where both are, what tilts the one against the other is impossible. Of scans, one
-        alone is of use as well
-    other_axes : whether scanners may have stood otherwise than upright; of scans without `ups`
+    query, match : geometry artifacts of one model
+    seed : seed of the random choices, 0 or more; equal seeds give equal results
+    mode : "full", or "paper": accept by the residual of the two directions alone
+    matching : method of matching
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates, if known: with both,
+        transforms that tilt are impossible; for scans, one alone helps too
+    other_axes : whether scanners without `ups` may not have stood upright
 
     Raises
     ------
-    ValueError : the descriptors have different lengths, an unknown mode or matching, or a
-        negative seed.
+    ValueError : the descriptors have different lengths, the mode or matching is unknown, or the
+        seed is negative
     """
     if mode not in ("full", "paper"):
         raise ValueError(f"mode {mode!r} is neither 'full' nor 'paper'")
@@ -249,11 +243,8 @@ def validate(
     p = p or ValidationParameters()
     fewest = min(len(query.patches), len(match.patches))
     if fewest < p.minimum_patches:
-        return _nothing(
-            f"a frame has {fewest} patches, and {p.minimum_patches} are needed to tell places "
-            "apart",
-            seed, query, match, ups,
-        )  # fmt: skip
+        reason = f"a frame has {fewest} patches; validation needs {p.minimum_patches}"
+        return _reject(reason, seed, query, match, ups)
     a, b = _samples(query, match, ups, p)
     numbers = p.alignment, p.agreement, matching
     there: Alignment | None
@@ -268,11 +259,11 @@ def validate(
             lambda: align(b, a, np.random.default_rng((seed, 1)), *numbers),
         )
     if there is None and back is None:
-        why = "no correspondences agree on a transform that the surfaces bear out"
+        reason = "no correspondences agree on a transform that the surfaces confirm"
         if tilt_of(np.eye(4), ups) is not None:
-            why += " without tilting against `up`"
-        return _nothing(why, seed, query, match, ups)
-    return _decided(a, b, there, back, seed, p, mode)
+            reason += " without tilting against `up`"
+        return _reject(reason, seed, query, match, ups)
+    return _decide(a, b, there, back, seed, p, mode)
 
 
 def _samples(
@@ -295,17 +286,17 @@ def validate_guided(
     """Check a transform that other matches and the map's poses predict: Sec. III-E without search.
 
     Both directions are refined from it and must meet, near it, with the evidence that `validate`
-    asks for. Neither other hypotheses nor rivals are looked for, so what is accepted makes a pose
-    more precise, but is no evidence of its own for it.
+    requires. Neither hypotheses nor rivals are searched, so an accepted transform makes a pose more
+    precise, but is no evidence for it.
 
     Parameters
     ----------
-    query, match, seed, p, ups : see `validate`
-    T_match_query : (4, 4) predicted
+    query, match, seed, p, ups : arguments of `validate`
+    T_match_query : (4, 4) prediction
 
     Returns
     -------
-    validation : accepted; or None where the frames are to be searched after all
+    validation : accepted; or None if the pair needs a search
     """
     p = p or ValidationParameters()
     if min(len(query.patches), len(match.patches)) < p.minimum_patches:
@@ -317,7 +308,7 @@ def validate_guided(
     )
     if there is None or back is None:
         return None
-    validation = _decided(a, b, there, back, seed, p, "full")
+    validation = _decide(a, b, there, back, seed, p, "full")
     if validation.status != "accepted" or validation.T_match_query is None:
         return None
     metres, radians = pose_difference(validation.T_match_query, T_match_query)
@@ -334,20 +325,19 @@ def validate_without_up(
     p: ValidationParameters | None,
     ups: Ups,
 ) -> PairValidation | None:
-    """Ask the surfaces alone, of a query that found nothing with `up`: the check of `up`.
+    """Validate by the surfaces alone, to check `up` if a query found nothing with it.
 
-    A transform that they accept and that does not tilt counts as ever. One that is strong and
-    tilts speaks against `up`, or is of a place that looks alike: it is rejected, and the reason
-    says so.
+    An accepted transform that does not tilt counts as usual. A strong one that tilts indicates a
+    wrong `up` or a similar place: it is rejected, with that reason.
 
     Parameters
     ----------
-    query, match, seed, p : see `validate`
-    ups : what was known of up
+    query, match, seed, p : arguments of `validate`
+    ups : known up vectors
 
     Returns
     -------
-    validation : or None where it adds nothing to what is known
+    validation : or None if it adds no information
     """
     p = p or ValidationParameters()
     validation = validate(query, match, seed, p)
@@ -370,7 +360,7 @@ def validate_without_up(
     )
 
 
-def _nothing(reason: str, seed: int, query: Geometry, match: Geometry, ups: Ups) -> PairValidation:
+def _reject(reason: str, seed: int, query: Geometry, match: Geometry, ups: Ups) -> PairValidation:
     blind = query.surface.camera is None and match.surface.camera is None
     violations = None if blind else 0.0
     return PairValidation(
@@ -381,13 +371,13 @@ def _nothing(reason: str, seed: int, query: Geometry, match: Geometry, ups: Ups)
 
 @dataclass(frozen=True, eq=False)
 class _Proposal:
-    """A transform that is judged.
+    """A transform under evaluation.
 
     Parameters
     ----------
     T : (4, 4) T_match_query
-    directions : of the search, in which it was found
-    refined_by : the alignments that it is the middle of, or the one that it is of
+    directions : directions of the search that found it
+    refined_by : the alignments whose middle it is, or its only one
     evidence, inliers : see Evidence and PairValidation
     """
 
@@ -398,11 +388,11 @@ class _Proposal:
     inliers: int
 
     def covariance(self, p: ValidationParameters) -> Floats | None:
-        """Return the covariance (6, 6) of T, or None where it was not refined both ways.
+        """Return the covariance (6, 6) of T, or None if it was not refined both ways.
 
-        Where the two refinements settle apart, what they differ by is part of the error.
+        If the two refinements differ, their difference is part of the error.
         """
-        refined = [one.refined for one in self.refined_by]
+        refined = [alignment.refined for alignment in self.refined_by]
         if len(refined) < 2 or refined[0] is None or refined[1] is None:
             return None
         covariance = pair_covariance(refined[0], refined[1], self.T, p.covariance)
@@ -410,20 +400,16 @@ class _Proposal:
         if covariance is None:
             return None
         if e.residual_m > limits.residual_m or e.residual_rad > limits.residual_rad:
-            off = _small_difference(refined[0].T, self.T)
-            covariance = covariance + np.outer(off, off)
+            shift = refined[0].T[:3, 3] - self.T[:3, 3]
+            D = refined[0].T[:3, :3] @ self.T[:3, :3].T
+            turn = [D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]
+            error = np.concatenate([shift, np.array(turn) / 2])
+            covariance = covariance + np.outer(error, error)
         return covariance
 
 
-def _small_difference(a: Floats, b: Floats) -> Floats:
-    """Return what must be added to b to give a: metres, then radians about the axes, (6,)."""
-    D = a[:3, :3] @ b[:3, :3].T
-    turn = [D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]
-    return np.concatenate([a[:3, 3] - b[:3, 3], np.array(turn) / 2])
-
-
 class _Verdict(NamedTuple):
-    """Status, strength and reason of a validation, and the rival that was found."""
+    """Status, strength and reason of a validation, and the best rival."""
 
     status: Status
     strength: Strength | None
@@ -431,17 +417,17 @@ class _Verdict(NamedTuple):
     rival: Rival = Rival(0.0, None)
 
 
-def _decided(
+def _decide(
     query: FrameSamples, match: FrameSamples, there: Alignment | None, back: Alignment | None,
     seed: int, p: ValidationParameters, mode: Mode,
 ) -> PairValidation:  # fmt: skip
     residual, estimates = _estimates(there, back, p.acceptance)
-    found_by = tuple(one for one in (there, back) if one is not None)
+    found_by = tuple(alignment for alignment in (there, back) if alignment is not None)
     transforms = list(estimates.values())
     seen = plane_agreement(query.planes, match.planes, np.stack(transforms), p.agreement)
     best = int(np.argmax(seen.share - p.alignment.rank_violations * seen.violations))
     (directions, T), *others = sorted(
-        estimates.items(), key=lambda one: one[1] is not transforms[best]
+        estimates.items(), key=lambda item: item[1] is not transforms[best]
     )
     evidence = _evidence(query, match, found_by, T, residual, seen, best, p)
     one = _Proposal(T, directions, found_by, *evidence)
@@ -466,7 +452,9 @@ def _verdict(
 ) -> _Verdict:  # fmt: skip
     """Judge a transform by the agreement of both directions, the evidence and its rivals."""
     e = one.evidence
-    against = objection(e, p.acceptance, mode) or _tilted(tilt_of(one.T, (query.up, match.up)), p)
+    against = objection(e, p.acceptance, mode) or _tilt_objection(
+        tilt_of(one.T, (query.up, match.up)), p
+    )
     if against is not None:
         return _Verdict(against[0], None, against[1])
     if mode == "paper":
@@ -502,25 +490,25 @@ def _sparse(
     query: FrameSamples, match: FrameSamples, one: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters,
 ) -> tuple[_Proposal, _Verdict] | None:  # fmt: skip
-    """Accept a transform of depth images as weak, if the little that it shows speaks for it.
+    """Accept a transform of depth images as weak, if all of its little evidence supports it.
 
-    What one search alone found is refined in both directions first. What the other search found
-    is a rival then, as all other hypotheses are.
+    A transform that only one search found is refined in both directions first; the result of the
+    other search is then a rival.
 
     Returns
     -------
-    the transform and its verdict, or None where the rejection stands
+    the transform and its verdict, or None if the rejection stands
     """
     if one.refined_by[0].search != "correspondences" or are_scans(query.geometry, match.geometry):
         return None
     alone = len(one.directions) < 2
     if alone:
-        refined = _refined_both_ways(query, match, one, p)
+        refined = _refine_proposal(query, match, one, p)
         if refined is None:
             return None
         one = refined
     e, covariance = one.evidence, one.covariance(p)
-    if covariance is None or _tilted(tilt_of(one.T, (query.up, match.up)), p) is not None:
+    if covariance is None or _tilt_objection(tilt_of(one.T, (query.up, match.up)), p) is not None:
         return None
     deviation = math.sqrt(max(float(np.trace(covariance[:3, :3])), 0.0))
     if not sparse_evidence_suffices(e, deviation, p.acceptance, alone=alone):
@@ -535,10 +523,10 @@ def _sparse(
     return one, _Verdict("accepted", "weak", reason, rival)
 
 
-def _refined_both_ways(
+def _refine_proposal(
     query: FrameSamples, match: FrameSamples, one: _Proposal, p: ValidationParameters
 ) -> _Proposal | None:
-    """Refine in both directions what one search found, where it explains enough to be worth it."""
+    """Refine the transform of one search in both directions, if it explains enough."""
     e = one.evidence
     half = p.acceptance.sparse_plane_overlap / 2
     if e.plane_overlap - e.plane_violations < half or e.plane_violations > 2 * half:
@@ -558,7 +546,7 @@ def _hypotheses(
     there: Alignment | None, back: Alignment | None, estimates: Sequence[Floats],
     T_rival: Floats | None, each: int,
 ) -> Floats:  # fmt: skip
-    """Return the estimates, the rival, and the next best of each direction: (n, 4, 4)."""
+    """Return the estimates, the rival, and the next best of each direction, (n, 4, 4)."""
     hypotheses = [*estimates] if T_rival is None else [*estimates, T_rival]
     if there is not None:
         hypotheses += [*there.others[:each]]
@@ -567,7 +555,7 @@ def _hypotheses(
     return np.array(hypotheses)
 
 
-def _tilted(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] | None:
+def _tilt_objection(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] | None:
     """Reject a transform that the last refinement tilted more than the search allows."""
     if tilt is None or tilt <= p.alignment.gravity.refined_tilt:
         return None
@@ -579,8 +567,7 @@ def _estimates(
 ) -> tuple[tuple[float, float], dict[tuple[Direction, ...], Floats]]:
     """Return the residual of the two directions, and T_match_query by the directions that found it.
 
-    Where the directions agree, the transform is halfway between them. Where they do not, each keeps
-    its own, as halfway between two places is neither.
+    If the directions agree, the transform is halfway between them; else each keeps its own.
     """
     if there is not None and back is not None:
         composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
@@ -606,71 +593,66 @@ def _evidence(
     query: FrameSamples, match: FrameSamples, found_by: Sequence[Alignment], T: Floats,
     residual: tuple[float, float], by_planes: PlaneAgreement, k: int, p: ValidationParameters,
 ) -> tuple[Evidence, int]:  # fmt: skip
-    """Return the evidence for transform `k` of those explained, and how many points agree."""
-    of_query = overlap_counts(query.points, match.geometry.surface, T, p.agreement)
-    of_match = overlap_counts(match.points, query.geometry.surface, inverse(T), p.agreement)
-    inliers = of_query.inliers + of_match.inliers
-    seen = [one for one in (of_query, of_match) if one.violations is not None]
-    violated = sum(one.violations or 0 for one in seen)
-    agreeing = sum(one.inliers for one in seen)
-    weights = sum(float(one.planes.weights.sum(dtype=float)) for one in (query, match))
+    """Return the evidence for transform `k` of `by_planes`, and the number of points that agree."""
+    there = overlap_counts(query.points, match.geometry.surface, T, p.agreement)
+    back = overlap_counts(match.points, query.geometry.surface, inverse(T), p.agreement)
+    inliers = there.inliers + back.inliers
+    seen = [counts for counts in (there, back) if counts.violations is not None]
+    violated = sum(counts.violations or 0 for counts in seen)
+    agreeing = sum(counts.inliers for counts in seen)
+    weights = sum(float(frame.planes.weights.sum(dtype=float)) for frame in (query, match))
     e = Evidence(
         *residual,
-        overlap=inliers / max(of_query.points + of_match.points, 1),
+        overlap=inliers / max(there.points + back.points, 1),
         plane_overlap=float(by_planes.share[k]),
         violations=violated / max(agreeing + violated, 1) if seen else None,
-        stiffness=min(one.stiffness for one in found_by),
+        stiffness=min(alignment.stiffness for alignment in found_by),
         one_sided=len(seen) == 1,
         planes=float(by_planes.share[k]) * weights / 2,
         plane_violations=float(by_planes.violations[k]),
-        worst_violations=max((one.violation_share for one in seen), default=0.0),
+        worst_violations=max((counts.violation_share for counts in seen), default=0.0),
     )
     return e, inliers
 
 
-# Association: which validated candidates to believe first.
-
-#: Error of a depth camera's transform for each radian between the two views, metres: distortion
-#: and reference poses that drift, of which the covariance of a refinement knows nothing.
+#: Error of a depth camera's transform per radian between the two views, metres: distortion and
+#: drift of reference poses, which the covariance of a refinement does not contain.
 _ERROR_PER_RADIAN = 0.04
 
 
-def preferred(validations: Sequence[PairValidation]) -> list[int]:
-    """Return the positions of accepted validations: strong before weak, each most precise first.
+def rank_accepted(validations: Sequence[PairValidation]) -> list[int]:
+    """Return the indices of accepted validations: strong before weak, each most precise first.
 
     The paper keeps the order of R. A weak match has a rival that explains the frames nearly as
-    well, so a later strong one goes before it. Of cameras, that with the least expected error
-    comes first. Where all frames see all around, the nearest sensor does.
+    well, so strong matches precede it. Cameras are ranked by expected error, frames that see all
+    around by the distance of their sensors.
 
     Parameters
     ----------
-    validations : in the order of R
+    validations : validations in the order of R
     """
     accepted = [i for i, v in enumerate(validations) if v.status == "accepted"]
     around = all(validations[i].around for i in accepted)
 
     def rank(i: int) -> tuple[bool, float]:
         validation = validations[i]
-        off = _away(validation) if around else expected_error(validation)
-        return validation.strength != "strong", off
+        if not around:
+            return validation.strength != "strong", expected_error(validation)
+        T = validation.T_match_query
+        distance = 0.0 if T is None else float(np.linalg.norm(T[:3, 3]))
+        return validation.strength != "strong", distance
 
     return sorted(accepted, key=rank)
 
 
 def expected_error(validation: PairValidation) -> float:
-    """Return by how many metres a transform between cameras is likely off.
+    """Return the expected error of a transform between cameras, metres; infinite if unknown.
 
-    It is the deviation of the translation and an error that grows with the angle between the views,
-    added in quadrature. It is infinite where the covariance is not known.
+    The deviation of the translation and an error that grows with the angle between the views are
+    added in quadrature.
     """
     T, covariance = validation.T_match_query, validation.covariance
     if T is None or covariance is None:
         return math.inf
     variance = max(float(np.trace(covariance[:3, :3])), 0.0)
     return math.hypot(math.sqrt(variance), _ERROR_PER_RADIAN * rotation_angle(T[:3, :3]))
-
-
-def _away(validation: PairValidation) -> float:
-    """Return the distance between the two sensors, metres."""
-    T = validation.T_match_query
-    return 0.0 if T is None else float(np.linalg.norm(T[:3, 3]))
