@@ -1,1 +1,1 @@
-"""Pure geometry: arrays in, arrays out. A file for each section of the paper."""
+"""Compute with arrays: pure functions, a file per section of the paper."""

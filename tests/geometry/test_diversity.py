@@ -17,7 +17,7 @@ from sceneprint.geometry.retrieval.ranking import (
     kernel_matrix,
     pairwise_distances,
     rank,
-    remaining,
+    remaining_gains,
 )
 from sceneprint.types import Floats
 
@@ -151,7 +151,7 @@ def test_what_is_left_is_what_a_determinant_would_gain(k: int) -> None:
     to_query, among = ranking(11, 15)
     p = DiversityParameters(sigma=0.8)
     taken = diversify(to_query, among, k, p).indices
-    found = remaining(among, taken, p)
+    found = remaining_gains(among, taken, p)
     likeness = np.exp(-among / (0.8 * np.median(among[np.triu_indices(15, 1)])))
     for i in range(15):
         both = [*taken.tolist(), i]
@@ -165,6 +165,6 @@ def test_a_duplicate_has_nothing_left_to_bring() -> None:
     among = ranking(3, 5)[1]
     twice = np.ix_([0, 1, 2, 2, 4], [0, 1, 2, 2, 4])
     taken = np.array([0, 2], np.intp)
-    found = remaining(among[twice], taken)
+    found = remaining_gains(among[twice], taken)
     assert found[[0, 2, 3]] == pytest.approx(0.0, abs=1e-12)
     assert (found[[1, 4]] > 0.01).all()

@@ -15,7 +15,12 @@ from sceneprint.geometry.views.free_space import candidate_places, find_floors
 from sceneprint.geometry.views.plan import level_axes
 from sceneprint.geometry.views.raster import draw_triangles, pinhole
 from sceneprint.geometry.views.render import cube_faces, rays_of
-from sceneprint.geometry.views.samples import blocks_of, on_surface, surfels, thinned
+from sceneprint.geometry.views.samples import (
+    average_cells,
+    project_to_planes,
+    sort_into_blocks,
+    surfels,
+)
 from sceneprint.models import read_model
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
 from sceneprint_lab.synth.dataset import room_and_rng
@@ -203,7 +208,7 @@ def test_blocks_out_of_view_hold_nothing_that_is_seen() -> None:
     rng = np.random.default_rng(7)
     points = rng.uniform(-6, 6, (4000, 3)).astype(np.float32)
     extents = rng.uniform(0, 0.2, 4000).astype(np.float32)
-    order, blocks = blocks_of(points, 1.0, extents)
+    order, blocks = sort_into_blocks(points, 1.0, extents)
     assert sorted(order.tolist()) == list(range(4000))
     T = inverse(looking((1.0, -2.0, 0.5), 0.8, 0.2))
     starts, ends = blocks.in_view(T, pinhole(CAMERA), (60, 80), 5.0)
@@ -217,7 +222,7 @@ def test_blocks_out_of_view_hold_nothing_that_is_seen() -> None:
 
 def test_points_of_a_cell_become_their_mean() -> None:
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [2.5, 0.0, 0.0]], np.float32)
-    found = thinned(points, 1.0)
+    found = average_cells(points, 1.0)
     # cells are counted from the least corner
     np.testing.assert_allclose(np.sort(found, axis=0)[:, 0], [0.2, 2.5], atol=1e-6)
     assert len(found) == 2
@@ -227,13 +232,13 @@ def test_the_normal_of_a_plane_of_points() -> None:
     rng = np.random.default_rng(8)
     flat = rng.uniform(-1, 1, (3000, 2))
     points = np.column_stack([flat, 0.5 * flat[:, 0]]).astype(np.float32)
-    _, normals, spacing = on_surface(points, 0.15)
+    _, normals, spacing = project_to_planes(points, 0.15)
     inner = np.abs(flat).max(axis=1) < 0.9
     expected = np.array([-0.5, 0, 1]) / math.sqrt(1.25)
     assert np.abs(normals[inner] @ expected).min() > 0.9999
     assert 0.02 < np.median(spacing) < 0.05  # 3000 points on 4.5 square metres: 0.039 m
     scattered = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
-    assert (on_surface(scattered, 0.3)[1] == 0).all(axis=1).mean() > 0.9
+    assert (project_to_planes(scattered, 0.3)[1] == 0).all(axis=1).mean() > 0.9
 
 
 def test_both_sides_of_a_thin_wall_are_pieces_of_their_own() -> None:

@@ -31,7 +31,7 @@ from sceneprint.geometry.retrieval.ranking import (
     Ranking,
     Selection,
     distances,
-    remaining,
+    remaining_gains,
     similarity,
 )
 from sceneprint.geometry.rigid import inverse
@@ -302,7 +302,7 @@ def explain(
     """
     left = None
     if among is not None and len(candidates.ranking):
-        left = remaining(among, np.asarray(tried.chosen, np.intp), p)
+        left = remaining_gains(among, np.asarray(tried.chosen, np.intp), p)
     records = {match.index: validation_record(match.validation) for match in tried.matches}
     return list(_each(candidates, tried, records, among, left))
 

@@ -1,1 +1,1 @@
-"""Signatures to rankings and diverse selections."""
+"""Rank signatures, and select diverse matches."""

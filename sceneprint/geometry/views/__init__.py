@@ -1,4 +1,4 @@
-"""Views of a surface that comes whole as a map, as a sensor in it would have them.
+"""Render views of an imported surface, as a sensor in it would have them.
 
 surface, parameters  --choose_views-->  ViewPlan, poses (V, 4, 4)
 Renderer(surface, parameters).view(pose)  -->  depth (H, W), or points (K, 3)

@@ -1,11 +1,10 @@
-"""Where a sensor may be: heights above the floors of a surface.
+"""Find the floors of a surface, and places for a sensor above them.
 
     surfels  --find_floors-->  Floors
     Floors, parameters  --candidate_places-->  places (C, 3)
 
-All in level axes, z upwards. A floor is what is level over a few metres, the lowest that there is,
-and again whatever is level a storey above that. Whether a place is free is seen from there: see
-`lookout.py`.
+All coordinates are in level axes, z upwards. A floor is the lowest surface that is level over a few
+metres, and every such surface a storey above. `lookout.py` checks whether a place is free.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from sceneprint.geometry.views.parameters import ViewParameters
 from sceneprint.geometry.views.samples import Surfels
 from sceneprint.types import Floats, Ints64
 
-#: Cosine between up and the normal of what is level.
+#: Least cosine between up and the normal of a level surface.
 _LEVEL = 0.9
-#: Surfaces that differ less in height are one floor, metres.
+#: Greatest difference in height within a floor, metres.
 _STEP = 0.15
 #: Least height of a storey, metres.
 _STOREY = 2.0
-#: A floor fills at least this share of the cells around a column, the lowest and one above.
+#: Least share of the cells around a column that a floor fills: the lowest, and those above.
 _LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
-#: What a camera sees as a floor is none where more than this share of the surface lies below it: a
-#: table, say, in a room whose floor was not seen. Below the ground outdoors there may be more.
+#: Greatest share of a camera's surface below its floor: more make it a table in a room whose floor
+#: was not seen. Outdoors there may be more below the ground.
 _MOST_BELOW = 0.07
-#: Places of a grid, and columns times heights of another, at most.
+#: Maximum numbers of places in a grid, and of bins (columns times heights).
 _MOST_COLUMNS, _MOST_BINS = 1_000_000, 8_000_000
-#: Heights that places are spread over, at most.
+#: Maximum number of heights of places without a floor, and of storeys.
 _MOST_HEIGHTS = 50
 _MOST_STOREYS = 12
 
@@ -45,8 +44,8 @@ class Floors:
     Parameters
     ----------
     low : (2,) corner of the grid, metres
-    side : of a column, metres
-    heights : (S, nx, ny) metres, by storey; NaN where there is none
+    side : width of a column, metres
+    heights : (S, nx, ny) metres, by storey; NaN if there is none
     level : (L, 3) points of level surfaces
     """
 
@@ -57,12 +56,12 @@ class Floors:
 
     @property
     def lowest(self) -> float | None:
-        """Return the height of the lowest floor, its median; None where there is no floor."""
+        """Return the median height of the lowest floor; None without a floor."""
         known = self.heights[0][np.isfinite(self.heights[0])]
         return float(np.median(known)) if len(known) else None
 
 
-def extent_of(pieces: Surfels) -> tuple[Floats, Floats]:
+def robust_extent(pieces: Surfels) -> tuple[Floats, Floats]:
     """Return the low and the high corner of a surface, without stray points far from it."""
     n = len(pieces.points)
     stray = max(n // 2000, min(n // 100, 4))
@@ -75,13 +74,13 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
 
     Parameters
     ----------
-    pieces : in level axes
-    side : of a column, metres; it grows where there were too many
-    has_tables : whether what is level may be furniture, as in the surface that a depth camera saw
+    pieces : surfels in level axes
+    side : width of a column, metres; it grows if there are too many
+    has_tables : whether level surfaces may be furniture, as in a depth camera's surface
     """
-    # either side up: a mesh may be inside out, and no place above a ceiling is free
+    # either side, because a mesh may be inside out, and no place above a ceiling is free
     level = pieces.points[np.abs(pieces.normals[:, 2]) > _LEVEL].astype(np.float64)
-    low, high = extent_of(pieces)
+    low, high = robust_extent(pieces)
     level = level[((level >= low) & (level <= high)).all(axis=1)]
     step = max(_STEP, float(high[2] - low[2]) / 2000.0)
     while True:
@@ -93,7 +92,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
     counts, sums = np.zeros(shape), np.zeros(shape)
     np.add.at(counts, tuple(bins.T), 1.0)
     np.add.at(sums, tuple(bins.T), level[:, 2])
-    counts, sums = (_with_neighbours(one) for one in (counts, sums))
+    counts, sums = _sum_neighbours(counts), _sum_neighbours(sums)
     whole = 9.0 * (side / pieces.cell) ** 2
     storeys, base = [], np.full(shape[:2], -np.inf)
     centres = low[2] + (np.arange(shape[2]) + 0.5) * step
@@ -103,7 +102,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
         exists = is_floor.any(axis=2)
         if not exists.any():
             break
-        # the fullest of the first few, so that a floor's own noise makes no second one
+        # the fullest of the first few bins, because a floor's noise may fill several
         first = is_floor.argmax(axis=2)
         near = np.abs(np.arange(shape[2]) - first[..., None]) <= 1
         at = np.where(near, counts, -1.0).argmax(axis=2)[..., None]
@@ -122,8 +121,8 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
     return Floors(low[:2], side, heights, level)
 
 
-def _with_neighbours(values: Floats) -> Floats:
-    """Sums over the 3 x 3 columns around each, and over the bins just above and below."""
+def _sum_neighbours(values: Floats) -> Floats:
+    """Return the sums over the 3 x 3 columns around each, and the bins above and below."""
     for axis in range(3):
         padded = np.pad(values, [(1, 1) if a == axis else (0, 0) for a in range(3)])
         before, own, after = (padded.take(range(k, k + values.shape[axis]), axis) for k in range(3))
@@ -134,18 +133,16 @@ def _with_neighbours(values: Floats) -> Floats:
 def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing: float) -> Floats:
     """Return places at the heights of the sensor above the floors, (C, 3) in level axes.
 
-    The front of a mesh tells what is free, so that places beside a floor that was not seen count
-    as well; in a cloud a place needs floor below it. Without any floor, places are spread over
-    all heights of the surface.
+    The front of a mesh shows free space, so places beside an unobserved floor count too; in a
+    cloud, a place needs a floor below it. Without any floor, places are spread over all heights.
 
     Parameters
     ----------
-    floors : of `find_floors`
-    pieces : of the surface, in level axes
-    p : see ViewParameters
-    spacing : between places, metres
+    floors : result of `find_floors`
+    pieces : surfels in level axes
+    spacing : distance between places, metres
     """
-    low, high = extent_of(pieces)
+    low, high = robust_extent(pieces)
     spacing = max(spacing, math.sqrt(float(np.prod((high - low)[:2])) / _MOST_COLUMNS))
     axes = [np.arange(a + spacing / 2, b, spacing) for a, b in zip(low[:2], high[:2], strict=True)]
     if any(len(axis) == 0 for axis in axes):
@@ -159,21 +156,21 @@ def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing
         return np.concatenate(places) if places else np.zeros((0, 3))
     column = np.floor((flat - floors.low) / floors.side).astype(np.int64)
     column = np.clip(column, 0, np.array(floors.heights.shape[1:]) - 1)
-    found = []
+    places = []
     for storey, heights in enumerate(floors.heights):
         height = heights[column[:, 0], column[:, 1]]
         if storey == 0 and pieces.one_sided:
             height = np.where(np.isnan(height), main, height)
         own, height = flat[~np.isnan(height)], height[~np.isnan(height)]
         if not pieces.one_sided:
-            held = _has_floor(floors.level, own, height, max(2.0 * pieces.cell, p.clearance))
-            own, height = own[held], height[held]
-        found += [np.column_stack([own, height + above]) for above in p.heights]
-    return np.concatenate(found)
+            on_floor = _has_floor(floors.level, own, height, max(2.0 * pieces.cell, p.clearance))
+            own, height = own[on_floor], height[on_floor]
+        places += [np.column_stack([own, height + above]) for above in p.heights]
+    return np.concatenate(places)
 
 
 def _has_floor(level: Floats, places: Floats, heights: Floats, reach: float) -> NDArray[np.bool_]:
-    """Whether there is something level below a place (P, 2), about as high as its floor."""
+    """Return a mask of the places (P, 2) with a level surface at the height of their floor."""
     low = np.minimum(level.min(axis=0), np.append(places.min(axis=0), heights.min())) - 2 * reach
     size = np.array([reach, reach, 2 * _STEP])
     span = np.floor((level.max(axis=0) - low) / size).astype(np.int64) + 4
@@ -183,14 +180,13 @@ def _has_floor(level: Floats, places: Floats, heights: Floats, reach: float) -> 
         numbers: Ints64 = (cells[..., 0] * span[1] + cells[..., 1]) * span[2] + cells[..., 2]
         return np.where(inside, numbers, -1)
 
-    known = np.unique(key(np.floor((level - low) / size).astype(np.int64)))
+    occupied = np.unique(key(np.floor((level - low) / size).astype(np.int64)))
     at = np.floor((np.column_stack([places, heights]) - low) / size).astype(np.int64)
     around = np.zeros(len(places), np.int64)
     for dx in (-1, 0, 1):
         for dy in (-1, 0, 1):
             near = np.zeros(len(places), np.bool_)
             for dz in (-1, 0, 1):
-                near |= np.isin(key(at + np.array([dx, dy, dz])), known)
+                near |= np.isin(key(at + np.array([dx, dy, dz])), occupied)
             around += near
-    # most of the nine: on a floor, not beside it
-    return around >= 6
+    return around >= 6  # most of the nine: on a floor, not beside it

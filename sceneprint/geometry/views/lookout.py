@@ -1,8 +1,8 @@
-"""What is seen of a surface from places: in which directions there is something, and of what.
+"""Compute the parts of a surface that are visible from places.
 
     Surfels, place  --Lookout.look-->  Sight
 
-Pieces of the surface are drawn on the faces of a cube about the place, a few degrees a pixel. An
+Pieces of the surface are drawn on the faces of a cube around the place, a few degrees a pixel. An
 element is a piece of surface seen from one side at one distance: (piece, azimuth, octave).
 """
 
@@ -17,34 +17,33 @@ from numpy.typing import NDArray
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.views.raster import draw_discs, pinhole
 from sceneprint.geometry.views.render import cube_faces, rays_of
-from sceneprint.geometry.views.samples import Surfels, blocks_of
+from sceneprint.geometry.views.samples import Surfels, sort_into_blocks
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 
 #: Pixels along an edge of the cube: three degrees each.
 _FACE_PX = 28
-#: What is beside a place is as high as it, or so much higher, rad.
+#: Greatest elevation of directions beside a place, rad.
 _BESIDE = math.radians(30.0)
-#: Sides that a piece is seen from, in azimuth, and octaves of distance that it is seen at.
+#: Number of azimuths from which a piece is seen, and of octaves of distance.
 SIDES, OCTAVES = 6, 3
 #: Bit of a mask: the piece is seen from behind its normal.
 BEHIND = np.uint32(1 << 31)
-#: A piece is seen unless something is nearer by this share of its distance, and by so many cells.
+#: Tolerance of the depth buffer: share of the distance, plus a number of cells.
 _SAME_SHARE, _SAME_CELLS = 0.03, 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What is seen from a place.
+    """The visible parts of a surface from a place.
 
     Parameters
     ----------
-    elements : (E,) int32 of what is seen
-    masks : (E,) uint32: bit d, it is in the d-th view from there; BEHIND
-    hit : (D,) share of each view in which there is something within range
-    beside : share of the directions from the horizon to 30 degrees above in which there is
-        something
-    back : (D,) share of what is hit that is seen from behind
-    close : (D,) share of what is hit that is nearer than a view should be
+    elements : (E,) int32 visible elements
+    masks : (E,) uint32: bit d is set if view d shows the element; BEHIND
+    hit : (D,) share of each view with a surface within range
+    beside : share of the directions from the horizon to 30 degrees above with a surface
+    back : (D,) share of the surface that is seen from behind
+    close : (D,) share of the surface that is nearer than a view should be
     nearest : distance of the nearest piece, metres
     """
 
@@ -63,7 +62,8 @@ def _see(
     size: int, depth: Floats32, reach: float, gap: float, views: Floats, limits: Floats,
     elements: Ints32, masks: NDArray[np.uint32],
 ) -> int:  # fmt: skip
-    """Elements that are seen through one face of the cube, and in which views; how many."""
+    """Write the elements visible through a face of the cube, and their views; return their number.
+    """
     found = 0
     half = size / 2.0
     for block in range(len(starts)):
@@ -111,7 +111,7 @@ def _assess(
     depth: Floats32, item: Ints32, normals: Floats32, rays: Floats, lengths: Floats,
     inside: NDArray[np.bool_], forward: Floats, farthest: float, close: float, sums: Floats,
 ) -> None:  # fmt: skip
-    """For each view, solid angles of: all, what is hit, what of it is seen from behind, or near."""
+    """Sum for each view the solid angles of all rays, hits, hits from behind, and near hits."""
     for n in range(len(depth)):
         distance, weight, i = depth[n] * lengths[n], lengths[n] ** -3.0, item[n]
         behind = False
@@ -128,17 +128,17 @@ def _assess(
 
 
 class Lookout:
-    """Pieces of a surface made ready to be looked at from places.
+    """Pieces of a surface prepared for looking from places.
 
     Parameters
     ----------
-    pieces : in level axes
-    reach : farther pieces are not counted as seen, metres
-    farthest : of the sensor, metres
-    close : depth that is rather near, metres
-    views : (D, 3, 3) R_level_view, 24 at most
-    camera : of the views; None: each view is all around
-    elevation : and so far above and below the horizon, rad
+    pieces : surfels in level axes
+    reach : greatest distance of a visible piece, metres
+    farthest : range of the sensor, metres
+    close : depth below which a surface is close, metres
+    views : (D, 3, 3) R_level_view, at most 24
+    camera : camera of the views; None: each view is all around
+    elevation : greatest elevation of such a view above and below the horizon, rad
     """
 
     def __init__(
@@ -148,19 +148,19 @@ class Lookout:
         self._cell, self._reach = pieces.cell, reach
         self._farthest, self._close = farthest, close
         extents = np.full(len(pieces.points), pieces.cell, np.float32)
-        order, self._blocks = blocks_of(pieces.points, reach / 8.0, extents)
+        order, self._blocks = sort_into_blocks(pieces.points, reach / 8.0, extents)
         self.points, self.normals = pieces.points[order], pieces.normals[order]
         self._radii = extents * np.float32(0.75)
         self._face, self._turns = cube_faces(_FACE_PX)
         self._pinhole = pinhole(self._face)
         self._views = views
-        # a cube's pixels in each view: directions, weights
+        # directions of the cube's pixels
         rays = np.concatenate([rays_of(self._face).reshape(-1, 3) @ R.T for R in self._turns])
         lengths = np.linalg.norm(rays, axis=1)
         self._rays = rays / lengths[:, None]
         self._lengths = lengths
         self._limits = np.array([math.sin(elevation), 0.0, 0.0, 0.0, 0.0])
-        # of each view, and of what is beside the place, no lower
+        # pixels inside each view, and pixels beside the place
         self._inside = np.abs(self._rays[None, :, 2]) <= math.sin(elevation)
         self._inside = self._inside.repeat(len(views) + 1, axis=0)
         self._inside[-1] = (self._rays[:, 2] > 0) & (self._rays[:, 2] < math.sin(_BESIDE))
@@ -180,15 +180,15 @@ class Lookout:
 
     @property
     def universe(self) -> int:
-        """How many elements there are."""
+        """Return the number of elements."""
         return len(self.points) * SIDES * OCTAVES
 
     def look(self, place: Floats) -> Sight:
-        """Return what is seen from a place (3,)."""
+        """Return the sight from a place (3,)."""
         size, gap = _FACE_PX, _SAME_CELLS * self._cell
         depths = np.full((6, size, size), np.inf, np.float32)
         items = np.full((6, size, size), -1, np.int32)
-        found = []
+        visible = []
         for R, depth, item in zip(self._turns, depths, items, strict=True):
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = R.T, -R.T @ place
@@ -200,15 +200,9 @@ class Lookout:
                 self.points, self.normals, starts, ends, place, R, size, depth, self._reach, gap,
                 self._views, self._limits, self._elements, self._masks,
             )  # fmt: skip
-            found.append((self._elements[:n].copy(), self._masks[:n].copy()))
-        return self._sight(
-            np.concatenate([e for e, _ in found]), np.concatenate([m for _, m in found]),
-            depths.reshape(-1), items.reshape(-1),
-        )  # fmt: skip
-
-    def _sight(
-        self, elements: Ints32, masks: NDArray[np.uint32], depth: Floats32, item: Ints32
-    ) -> Sight:
+            visible.append((self._elements[:n].copy(), self._masks[:n].copy()))
+        elements, masks = (np.concatenate(parts) for parts in zip(*visible, strict=True))
+        depth, item = depths.reshape(-1), items.reshape(-1)
         sums = np.zeros((len(self._views) + 1, 4))
         _assess(
             depth, item, self.normals, self._rays, self._lengths, self._inside, self._forward,

@@ -1,6 +1,6 @@
-"""The sensor that views are rendered for, and where it may be.
+"""Derive the parameters of views from a model and a robot's sensor.
 
-Lengths are shares of the sensor's range, but for heights above the floor: those are the robot's.
+Lengths are shares of the sensor's range, except heights above the floor, which are the robot's.
 """
 
 from __future__ import annotations
@@ -15,46 +15,46 @@ from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
 from sceneprint.types import Intrinsics
 
-#: A model that looks farther than this, in metres, is one of scans: no depth camera does.
+#: Greatest range of a depth camera's model, metres: models of scans see farther.
 _FARTHEST_CAMERA = 20.0
-#: The camera where none is named: that of a Kinect at half its resolution.
+#: Default camera: a Kinect at half its resolution.
 DEFAULT_CAMERA = Intrinsics(width=320, height=240, fx=292.5, fy=292.5, cx=159.5, cy=119.5)
-#: Heights of the sensor above the floor, metres, where none is named: of a camera on a small
-#: robot, on a large one and in a hand; of a scanner on a robot.
+#: Default heights of the sensor above the floor, metres: cameras on a small robot, on a large robot
+#: and in a hand; a scanner on a robot.
 CAMERA_HEIGHTS: tuple[float, ...] = (0.4, 1.0, 1.6)
 SCANNER_HEIGHTS: tuple[float, ...] = (1.0,)
-#: Scanners see about so far above and below their horizon, rad.
+#: Greatest elevation of a scanner above and below its horizon, rad.
 _ELEVATION = math.pi / 4.0
 
 
 class SensorModel(Protocol):
-    """What the parameters of a model say of its sensor."""
+    """The parameters of a model that describe its sensor."""
 
     @property
     def depth(self) -> DepthParameters:
-        """Range of a depth camera."""
+        """Return the range of a depth camera."""
 
     @property
     def cloud(self) -> CloudParameters:
-        """Range and resolution of a scanner."""
+        """Return the range and resolution of a scanner."""
 
 
 @dataclass(frozen=True)
 class ViewParameters:
-    """How views of a surface are chosen and rendered; lengths in metres.
+    """Parameters for selecting and rendering views of a surface; lengths in metres.
 
     Parameters
     ----------
     camera : a pinhole camera without distortion; None: a scanner that sees all around
-    step : angle between points that the scanner sees, rad
-    elevation : the scanner sees as far above and below its horizon, rad
+    step : angle between a scanner's points, rad
+    elevation : greatest elevation of a scanner above and below its horizon, rad
     nearest, farthest : range of the sensor
-    heights : of the sensor above the floor, rising
-    spacing : between viewpoints that are considered
-    clearance : from a viewpoint to the nearest surface
-    grain : points of a cloud that are nearer to each other become one
-    cell : size of the pieces of surface that views are to cover
-    most_views : that are chosen, at most
+    heights : ascending heights of the sensor above the floor
+    spacing : distance between candidate viewpoints
+    clearance : least distance from a viewpoint to a surface
+    grain : distance within which points of a cloud are merged
+    cell : size of the pieces of surface to cover
+    most_views : maximum number of views
     """
 
     camera: Intrinsics | None
@@ -73,22 +73,22 @@ class ViewParameters:
 def view_parameters(
     model: SensorModel, camera: Intrinsics | None = None, heights: Sequence[float] | None = None
 ) -> ViewParameters:
-    """Return how views are made for a model.
+    """Return the parameters of views for a model.
 
     Parameters
     ----------
-    model : parameters of the model; one that looks farther than 20 m is one of scans
-    camera : of the robot, its lens distortion is left out; None: a scanner where the model is one
-        of scans, else a usual camera
-    heights : of the sensor above the floor, metres; None: usual ones of such a sensor
+    model : parameters of the model; a range above 20 m means scans
+    camera : camera of the robot, without its lens distortion; None: a scanner for a model of scans,
+        else a default camera
+    heights : heights of the sensor above the floor, metres; None: defaults of the sensor
 
     Raises
     ------
-    InvalidRequest : there is no height, or one is not above 0.
+    InvalidRequest : there is no height, or one is not above 0
     """
     if heights is not None and not (heights and all(0 < h < math.inf for h in heights)):
         raise InvalidRequest(
-            f"The heights of the sensor above the floor are {list(heights)}. Name one or more, "
+            f"The heights of the sensor above the floor are {list(heights)}. Specify one or more, "
             "each above 0 metres."
         )
     if camera is None and model.cloud.maximum_range > _FARTHEST_CAMERA:

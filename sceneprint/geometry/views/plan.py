@@ -1,11 +1,11 @@
-"""Where views of a surface are taken from, so that they cover it.
+"""Select the poses of views that cover a surface.
 
     surface, parameters  --choose_views-->  ViewPlan
 
-Places above the floors are looked around from; those that are not free, and views of next to
-nothing, are left out. Of the rest, the view that sees most of what too few have seen yet is chosen,
-again and again. What is seen is counted by piece of surface, side and distance, so that a piece is
-covered when it was seen as any robot may see it.
+Views from places above the floors are candidates, unless the place is not free or the view shows
+next to nothing. Repeatedly the view that shows most of the insufficiently covered surface is
+selected. Coverage is counted by piece of surface, side and distance, so a covered piece was seen as
+any robot may see it.
 """
 
 from __future__ import annotations
@@ -25,33 +25,32 @@ from sceneprint.geometry.views.parameters import ViewParameters
 from sceneprint.geometry.views.samples import Surfels, surfels
 from sceneprint.types import Floats, ReferenceSurface
 
-#: Pieces of surface, and places that are looked around from, at most.
+#: Maximum numbers of pieces of surface, and of places.
 _MOST_PIECES, _MOST_PLACES = 60_000, 3_000
-#: Pieces farther than this share of the range are not counted as seen.
+#: Greatest distance of a covered piece, share of the range.
 _REACH = 0.5
-#: Least share of a view in which there is something: of a camera, of a scanner, and of what is
-#: beside a scanner.
+#: Least share of a view with a surface: of a camera, of a scanner, and of directions beside a
+#: scanner.
 _LEAST_HIT, _LEAST_AROUND, _LEAST_BESIDE = 0.45, 0.25, 0.25
-#: Median depth of a camera's view, as a share of its range, at least.
+#: Least median depth of a camera's view, share of the range.
 _LEAST_DEPTH = 1.0 / 11.0
-#: Places that see something in this share of all directions tell which side of a mesh is its front.
+#: Least share of directions with a surface from a place that votes on the front of a mesh.
 _INDOORS = 0.6
-#: Share of what is hit that may be seen from behind: by a camera's view of a mesh; by a scanner in
-#: it, which sees both sides of partitions, but from behind the walls next to nothing else; and in a
-#: cloud, whose sides are estimated.
+#: Greatest share of the surface that is seen from behind: in a camera's view of a mesh; in a
+#: scanner's, which sees both sides of partitions; and in a cloud, whose sides are estimated.
 _MOST_BACK, _MOST_BACK_AROUND, _MOST_BACK_GUESSED = 0.1, 0.5, 0.3
-#: Cosine between up and the normal of a wall, at most.
+#: Greatest cosine between up and the normal of a wall.
 _WALL = 0.7
-#: A cloud's piece has one side where the other has at most this share of the votes.
+#: Greatest share of votes for the back of a cloud's one-sided piece.
 _ONE_SIDED = 0.1
-#: Directions of a camera's views from one place: turns of a whole, and pitches, degrees.
+#: Directions of a camera's views from one place: number of yaws, and pitches in degrees.
 _TURNS, _PITCHES = 8, (-25.0, 10.0)
-#: What a view adds that is the first, or the second, to see something; later ones add nothing.
+#: Gain of the first, the second and further views of an element.
 _WORTH = np.array([1.0, 0.5, 0.0])
-#: Choosing ends once the best view adds less than this share of the first one's gain: of a camera,
-#: and of a scanner, which sees all around and needs fewer.
+#: Share of the first view's gain at which the selection ends: of a camera, and of a scanner, which
+#: sees all around and needs fewer views.
 _LEAST_GAIN, _LEAST_GAIN_AROUND = 0.01, 0.03
-#: Views that are none of the map: one for so many of its views, and at least and at most so many.
+#: Number of the map's views per test view; minimum and maximum number of test views.
 _VIEWS_A_TEST, _LEAST_TESTS, _MOST_TESTS = 4, 20, 60
 
 
@@ -61,12 +60,12 @@ class ViewPlan:
 
     Parameters
     ----------
-    poses : (V, 4, 4) T_map_sensor, in the coordinates of the surface without its offset; those
-        that cover most come first
-    held_out : (H, 4, 4) poses of views that are none of the map, to measure it with
-    floor : height of the lowest floor along `up`, metres; None where no floor was found
-    candidates : how many views there were to choose from
-    covered : share of what a sensor sees in the free space that the chosen views see as well
+    poses : (V, 4, 4) T_map_sensor, in the coordinates of the surface without its offset, in the
+        order of selection
+    held_out : (H, 4, 4) poses of test views that are not in the map
+    floor : height of the lowest floor along `up`, metres; None without a floor
+    candidates : number of candidate views
+    covered : share of the surface visible from free space that the selected views show
     """
 
     poses: Floats
@@ -77,23 +76,20 @@ class ViewPlan:
 
 
 def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewPlan:
-    """Choose poses in the free space of a surface whose views cover it.
-
-    Parameters
-    ----------
-    surface : see ReferenceSurface
-    parameters : of the sensor
+    """Select poses in the free space of a surface whose views cover it.
 
     Returns
     -------
-    plan : the same one for the same surface; without poses where there is no free space
+    plan : deterministic; without poses if there is no free space
     """
     if not len(surface.points if surface.triangles is None else surface.triangles):
         return ViewPlan(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), None, 0, 0.0)
     p, axes = parameters, level_axes(surface.up)
     pieces = surfels(surface, p.cell, _MOST_PIECES)
     level = replace(
-        pieces, points=_turned(pieces.points, axes), normals=_turned(pieces.normals, axes)
+        pieces,
+        points=pieces.points @ axes.T.astype(np.float32),
+        normals=pieces.normals @ axes.T.astype(np.float32),
     )
     turns = np.eye(3)[None] if p.camera is None else camera_turns()
     floors = find_floors(level, 2.0 * p.spacing, has_tables=p.camera is not None)
@@ -102,19 +98,14 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
         spacing *= max(math.sqrt(len(places) / _MOST_PLACES), 1.05)
         places = candidate_places(floors, level, p, spacing)
     lookout = Lookout(
-        level,
-        _REACH * p.farthest,
-        p.farthest,
-        _LEAST_DEPTH * p.farthest,
-        turns,
-        p.camera,
+        level, _REACH * p.farthest, p.farthest, _LEAST_DEPTH * p.farthest, turns, p.camera,
         p.elevation,
-    )
+    )  # fmt: skip
     seen = [(place, lookout.look(place)) for place in places]
-    free = [(place, one) for place, one in seen if _is_free(one, p, one_sided=level.one_sided)]
-    free = _in_front(free, level, lookout, p)
-    views = [(k, d) for k, (_, one) in enumerate(free) for d in _worth_seeing(one, p)]
-    sights = [one for _, one in free]
+    free = [(place, sight) for place, sight in seen if _is_free(sight, p, level.one_sided)]
+    free = _select_front(free, level, lookout, p)
+    sights = [sight for _, sight in free]
+    views = [(k, d) for k, sight in enumerate(sights) for d in _useful_views(sight, p)]
     least = _LEAST_GAIN if p.camera else _LEAST_GAIN_AROUND
     chosen, covered = _cover(sights, views, lookout.universe, p.most_views, least)
     left = sorted(set(range(len(views))) - set(chosen))
@@ -122,11 +113,11 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
     spread = np.linspace(0, len(left) - 1, tests).astype(int)
 
     def poses(indices: Sequence[int]) -> Floats:
-        found = np.tile(np.eye(4), (len(indices), 1, 1))
-        for row, index in enumerate(indices):
+        transforms = np.tile(np.eye(4), (len(indices), 1, 1))
+        for T, index in zip(transforms, indices, strict=True):
             k, d = views[index]
-            found[row, :3, :3], found[row, :3, 3] = axes.T @ turns[d], axes.T @ free[k][0]
-        return found
+            T[:3, :3], T[:3, 3] = axes.T @ turns[d], axes.T @ free[k][0]
+        return transforms
 
     return ViewPlan(
         poses(chosen), poses([left[k] for k in spread]), floors.lowest, len(views), covered
@@ -134,7 +125,7 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
 
 
 def level_axes(up: Floats) -> Floats:
-    """Return (3, 3), rows: two level directions, and up."""
+    """Return two level directions, and up, as rows (3, 3)."""
     level = np.zeros(3)
     level[int(np.argmin(np.abs(up)))] = 1.0
     first = np.cross(level, up)
@@ -143,66 +134,60 @@ def level_axes(up: Floats) -> Floats:
 
 
 def camera_turns() -> Floats:
-    """Return (D, 3, 3) R_level_camera of the views from one place."""
-    found = []
+    """Return R_level_camera of the views from one place, (D, 3, 3)."""
+    turns = []
     for yaw in np.arange(_TURNS) * (2.0 * math.pi / _TURNS):
         for pitch in np.radians(_PITCHES):
             flat = np.array([math.cos(yaw), math.sin(yaw), 0.0])
             ahead = math.cos(pitch) * flat + math.sin(pitch) * np.array([0.0, 0.0, 1.0])
             right = np.cross(flat, (0.0, 0.0, 1.0))
-            found.append(np.stack([right, np.cross(ahead, right), ahead], axis=1))
-    return np.array(found)
+            turns.append(np.stack([right, np.cross(ahead, right), ahead], axis=1))
+    return np.array(turns)
 
 
-def _turned(vectors: NDArray[np.float32], axes: Floats) -> NDArray[np.float32]:
-    turned: NDArray[np.float32] = vectors @ axes.T.astype(np.float32)
-    return turned
-
-
-def _is_free(one: Sight, p: ViewParameters, *, one_sided: bool) -> bool:
-    """Whether a place has room for the sensor, and something beside it: not above a ceiling."""
-    if one.nearest < p.clearance:
+def _is_free(sight: Sight, p: ViewParameters, one_sided: bool) -> bool:
+    """Return whether a place has room for the sensor, and surface beside it (no ceiling below)."""
+    if sight.nearest < p.clearance:
         return False
     if p.camera is None:
-        return bool(one.hit[0] >= _LEAST_AROUND) and one.beside >= _LEAST_BESIDE
-    return one_sided or one.beside >= _LEAST_BESIDE
+        return bool(sight.hit[0] >= _LEAST_AROUND) and sight.beside >= _LEAST_BESIDE
+    return one_sided or sight.beside >= _LEAST_BESIDE
 
 
-def _in_front(
+def _select_front(
     free: list[tuple[Floats, Sight]], pieces: Surfels, lookout: Lookout, p: ViewParameters
 ) -> list[tuple[Floats, Sight]]:
-    """Leave out places, or views, behind surfaces that have one side."""
+    """Remove places, or flip views, behind one-sided surfaces."""
     if pieces.one_sided:
-        # a mesh whose triangles are turned inside out shows its back wherever there is room
-        shares = np.array([one.back.mean() for _, one in free if one.hit.mean() > _INDOORS])
+        # a mesh that is inside out shows its back in all free space
+        shares = np.array([sight.back.mean() for _, sight in free if sight.hit.mean() > _INDOORS])
         if len(shares) and (shares > 1.0 - _MOST_BACK).sum() > (shares < _MOST_BACK).sum():
-            free = [(place, replace(one, back=1.0 - one.back)) for place, one in free]
+            free = [(place, replace(sight, back=1.0 - sight.back)) for place, sight in free]
         if p.camera is None:
-            free = [(place, one) for place, one in free if one.back[0] <= _MOST_BACK_AROUND]
+            free = [(place, sight) for place, sight in free if sight.back[0] <= _MOST_BACK_AROUND]
         return free
-    # level surfaces are seen from above wherever one stands; walls tell where one is
+    # only walls distinguish the sides of a surface: floors are always seen from above
     is_wall = (lookout.normals != 0).any(axis=1) & (np.abs(lookout.normals[:, 2]) < _WALL)
     votes = np.zeros((len(lookout.points), 2))
-    for _, one in free:
-        piece, side = one.elements // (SIDES * OCTAVES), (one.masks & BEHIND) > 0
-        np.add.at(votes, (piece, side.astype(int)), one.beside**2)
-    kept = []
-    for place, one in free:
-        piece, side = one.elements // (SIDES * OCTAVES), ((one.masks & BEHIND) > 0).astype(int)
+    for _, sight in free:
+        piece, side = sight.elements // (SIDES * OCTAVES), (sight.masks & BEHIND) > 0
+        np.add.at(votes, (piece, side.astype(int)), sight.beside**2)
+    in_front = []
+    for place, sight in free:
+        piece, side = sight.elements // (SIDES * OCTAVES), ((sight.masks & BEHIND) > 0).astype(int)
         behind = votes[piece, side] < _ONE_SIDED * votes[piece, 1 - side]
         walls = is_wall[piece]
         if not walls.any() or behind[walls].mean() <= _MOST_BACK_GUESSED:
-            kept.append((place, one))
-    return kept
+            in_front.append((place, sight))
+    return in_front
 
 
-def _worth_seeing(one: Sight, p: ViewParameters) -> list[int]:
-    """Which views from a place show enough of the surface, far enough away, from its front."""
+def _useful_views(sight: Sight, p: ViewParameters) -> list[int]:
+    """Return the views that show enough of the surface, far enough away, from its front."""
     if p.camera is None:
         return [0]
-    shown = (one.hit >= _LEAST_HIT) & (one.close <= 0.5)
-    shown &= one.back <= _MOST_BACK
-    return [int(d) for d in np.flatnonzero(shown)]
+    useful = (sight.hit >= _LEAST_HIT) & (sight.close <= 0.5) & (sight.back <= _MOST_BACK)
+    return [int(d) for d in np.flatnonzero(useful)]
 
 
 @kernel
@@ -210,7 +195,7 @@ def _gain(
     elements: NDArray[np.int32], masks: NDArray[np.uint32], bit: int, counts: NDArray[np.uint8],
     worth: Floats,
 ) -> float:  # fmt: skip
-    """What a view adds to the elements that were seen so often."""
+    """Return the gain of a view, by the number of views of each element so far."""
     gain, of_view = 0.0, np.uint32(1) << np.uint32(bit)
     for i in range(len(elements)):
         if masks[i] & of_view:
@@ -234,17 +219,17 @@ def _cover(
     sights: Sequence[Sight], views: Sequence[tuple[int, int]], universe: int, most: int,
     least_gain: float,
 ) -> tuple[list[int], float]:  # fmt: skip
-    """Choose views, greedily, until none adds much; their indices, and the share that is covered.
+    """Select views greedily until none adds much; return their indices and the covered share.
 
-    Gains only fall as views are chosen, so that most need not be worked out anew each time.
+    Gains only fall during the selection, so most need not be recomputed.
 
     Parameters
     ----------
-    sights : from each place
-    views : place and direction of each
-    universe : how many elements there are
-    most : views that are chosen
-    least_gain : choosing ends once a view adds less than this share of the first one's gain
+    sights : sight of each place
+    views : place and direction of each view
+    universe : number of elements
+    most : maximum number of views
+    least_gain : share of the first view's gain at which the selection ends
     """
     counts = np.zeros(universe, np.uint8)
 

@@ -1,9 +1,9 @@
-"""Depth buffers of a pinhole camera: triangles and discs, of which the nearest is seen.
+"""Draw triangles and discs to the depth buffer of a pinhole camera.
 
-    triangles or discs, camera (6,)  --draw_triangles, draw_discs-->  depth (H, W), item (H, W)
+    triangles or discs, camera (4,)  --draw_triangles, draw_discs-->  depth (H, W), item (H, W)
 
-A ray through a pixel is d = ((u - cx) / fx, (v - cy) / fy, 1), so that what it meets at t d has the
-depth t. Whoever draws sorts things into blocks, and names the blocks that are in view.
+A ray through a pixel is d = ((u - cx) / fx, (v - cy) / fy, 1), so the point t d has depth t.
+Callers sort items into blocks, and pass the blocks in view.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 
-#: Nearer to the plane of the camera nothing is drawn, metres.
+#: Least depth that is drawn, metres.
 NEAREST = 1e-3
-#: Radius of the largest disc that is drawn, pixels.
+#: Greatest radius of a disc, pixels.
 _WIDEST_PX = 64.0
-#: A disc of a smaller radius is one pixel.
+#: Radius below which a disc is one pixel.
 _SMALLEST_PX = 0.7
-#: Such a pixel shows the plane of the disc, where that is at most so many widths of a pixel nearer
-#: or farther than the disc's centre.
+#: Greatest distance of the plane of such a disc from its centre along the ray, in widths of a pixel
+#: beyond the radius; else the pixel shows the centre.
 _GRAZING = 3.0
 
 
 def pinhole(camera: Intrinsics) -> Floats:
-    """A camera as these kernels take it: fx, fy, cx, cy."""
+    """Return a camera as an array for these kernels: fx, fy, cx, cy."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 @kernel
 def _edge(ax: float, ay: float, az: float, bx: float, by: float, bz: float, out: Floats) -> None:
-    """The normal a x b of the plane through the eye and an edge from a to b."""
+    """Write the normal a x b of the plane through the eye and an edge from a to b."""
     out[0], out[1], out[2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
@@ -43,18 +43,18 @@ def draw_triangles(
 ) -> None:  # fmt: skip
     """Draw the triangles of some blocks.
 
-    Edges are planes through the eye, so nothing needs clipping; those of two neighbours are the
-    same numbers, so that no ray passes between them.
+    Edges are planes through the eye, so no clipping is needed; neighbours share the same numbers,
+    so no ray passes between them.
 
     Parameters
     ----------
     points : (N, 3)
     triangles : (M, 3), counterclockwise seen from the front
-    starts, ends : (B,) of each block in view
+    starts, ends : (B,) range of each block in view
     T : (4, 4) T_camera_points
-    camera : of `pinhole`
-    depth : (H, W) of the nearest triangle so far, metres; inf for none
-    back : (H, W) uint8, 1 where that is seen from behind
+    camera : result of `pinhole`
+    depth : (H, W) depth of the nearest triangle so far, metres; inf for none
+    back : (H, W) uint8, 1 if that triangle is seen from behind
     """
     height, width = depth.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
@@ -113,10 +113,10 @@ def draw_discs(
     Parameters
     ----------
     points : (N, 3) centres
-    normals : (N, 3), towards either side; a disc without one, 0, faces the camera
+    normals : (N, 3), towards either side; a disc with normal 0 faces the camera
     radii : (N,) metres
-    starts, ends, T, camera, depth : as of `draw_triangles`
-    item : (H, W) index of the disc that is seen; -1 for none
+    starts, ends, T, camera, depth : arguments of `draw_triangles`
+    item : (H, W) index of the visible disc; -1 for none
     """
     height, width = depth.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]

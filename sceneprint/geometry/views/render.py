@@ -1,8 +1,8 @@
-"""A surface as a sensor at a pose sees it: what is nearer hides what is behind; holes stay missing.
+"""Render a surface from the pose of a sensor, with occlusion and holes.
 
     surface, pose  --Renderer.view-->  depth (H, W) of a camera, or points (K, 3) of a scanner
 
-A scanner looks through the six faces of a cube about it.
+A scanner is rendered through the six faces of a cube around it.
 """
 
 from __future__ import annotations
@@ -15,23 +15,28 @@ from numpy.typing import NDArray
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.views.parameters import ViewParameters
 from sceneprint.geometry.views.raster import draw_discs, draw_triangles, pinhole
-from sceneprint.geometry.views.samples import balls_of, blocks_of, on_surface, thinned
+from sceneprint.geometry.views.samples import (
+    average_cells,
+    bounding_balls,
+    project_to_planes,
+    sort_into_blocks,
+)
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
 
-#: Radius of the disc that stands for a point, as a share of how far points are apart.
+#: Radius of a point's disc, share of the spacing of points.
 _OVERLAP = 0.7
-#: And of the disc that stands for a point on no plane, as of a wire or a leaf.
+#: The same for a point on no plane, as of a wire or a leaf.
 _LONELY = 0.3
-#: Neighbours that a normal is of are in cells so many times as wide as points are apart.
+#: Width of the cells for the neighbours of a normal, in spacings of points.
 _NEIGHBOURHOOD = 3.0
-#: Side of a block, as a share of the sensor's range.
+#: Side of a block, share of the sensor's range.
 _BLOCK = 1.0 / 20.0
-#: Of a view, the side of the surface that fewer pixels show than this share is not shown.
+#: Share of a view's pixels below which a side of the surface is hidden.
 LEAST_SIDE = 0.3
 
 
 def cube_faces(size: int) -> tuple[Intrinsics, Floats]:
-    """Return the camera of a face of a cube about the eye, and R_sensor_face (6, 3, 3).
+    """Return the camera of a face of a cube around the eye, and R_sensor_face (6, 3, 3).
 
     Parameters
     ----------
@@ -48,7 +53,7 @@ def cube_faces(size: int) -> tuple[Intrinsics, Floats]:
 
 
 def rays_of(camera: Intrinsics) -> Floats32:
-    """Return (H, W, 3) rays through the centres of the pixels, of depth 1."""
+    """Return rays through the centres of the pixels, of depth 1, (H, W, 3)."""
     rays = np.ones((camera.height, camera.width, 3), np.float32)
     rays[..., 0] = (np.arange(camera.width) - camera.cx) / camera.fx
     rays[..., 1] = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
@@ -56,46 +61,46 @@ def rays_of(camera: Intrinsics) -> Floats32:
 
 
 class Renderer:
-    """A surface made ready to be looked at.
+    """A surface prepared for rendering.
 
     Parameters
     ----------
     surface : see ReferenceSurface
-    parameters : of the sensor
+    parameters : parameters of the sensor
     """
 
     def __init__(self, surface: ReferenceSurface, parameters: ViewParameters) -> None:
         self._p = p = parameters
-        # kernels take arrays that may be written for others than those that may not
+        # writable, because numba compiles kernels again for read-only arrays
         points = np.require(surface.points, np.float32, ["C", "W"])
         side = p.farthest * _BLOCK
         if surface.triangles is None:
-            points = thinned(points, p.grain)
-            points, normals, spacing = on_surface(points, _NEIGHBOURHOOD * p.grain)
+            points = average_cells(points, p.grain)
+            points, normals, spacing = project_to_planes(points, _NEIGHBOURHOOD * p.grain)
             share = np.where((normals != 0).any(axis=1), _OVERLAP, _LONELY)
             radii = (share * np.maximum(spacing, p.grain)).astype(np.float32)
-            order, self._blocks = blocks_of(points, side, radii)
+            order, self._blocks = sort_into_blocks(points, side, radii)
             self._points, self._normals, self._radii = points[order], normals[order], radii[order]
             self._triangles: Ints32 | None = None
         else:
             triangles = np.require(surface.triangles, np.int32, ["C", "W"])
             middles = np.empty((len(triangles), 3), np.float32)
             reach = np.empty(len(triangles), np.float32)
-            balls_of(points, triangles, middles, reach)
-            order, self._blocks = blocks_of(middles, side, reach)
+            bounding_balls(points, triangles, middles, reach)
+            order, self._blocks = sort_into_blocks(middles, side, reach)
             self._points, self._triangles = points, triangles[order]
         if p.camera is None:
             self._camera, self._faces = cube_faces(max(math.ceil(2.0 / p.step), 8))
         else:
             self._camera, self._faces = p.camera, np.eye(3)[None]
         self._rays = rays_of(self._camera)
-        # of a scanner: how far along each ray, and which of them look where it does
+        # lengths of the rays, and the rays within a scanner's elevation
         self._lengths = np.linalg.norm(self._rays, axis=2)
         up = np.einsum("hwi,fi->fhw", self._rays, self._faces[:, 2]) / self._lengths
         self._wanted = (p.camera is not None) | (np.abs(up) <= math.sin(p.elevation))
 
     def view(self, T_map_sensor: Floats) -> Floats32:
-        """Return what the sensor sees at a pose.
+        """Render the surface at a pose.
 
         Parameters
         ----------
@@ -103,12 +108,11 @@ class Renderer:
 
         Returns
         -------
-        depth : (H, W) float32, metres along the optical axis, 0 where missing; of a camera
+        depth : (H, W) float32, metres along the optical axis, 0 if missing; of a camera
         points : (K, 3) float32, metres, in the sensor's axes; of a scanner
         """
         drawn = [self._face(T_map_sensor, R) for R in self._faces]
-        depth = np.stack([one for one, _ in drawn])
-        back = np.stack([one for _, one in drawn])
+        depth, back = (np.stack(images) for images in zip(*drawn, strict=True))
         ranges = depth * self._lengths if self._p.camera is None else depth
         seen = (ranges >= self._p.nearest) & (ranges <= self._p.farthest) & self._wanted
         share = float(back[seen].mean()) if seen.any() else 0.0
@@ -120,13 +124,13 @@ class Renderer:
             shown: Floats32 = np.where(seen[0], depth[0], np.float32(0.0))
             return shown
         points = [
-            (self._rays[mask] * one[mask][:, None]) @ R.T.astype(np.float32)
-            for one, mask, R in zip(depth, seen, self._faces, strict=True)
+            (self._rays[mask] * image[mask][:, None]) @ R.T.astype(np.float32)
+            for image, mask, R in zip(depth, seen, self._faces, strict=True)
         ]
         return np.concatenate(points)
 
     def _face(self, T_map_sensor: Floats, R: Floats) -> tuple[Floats32, NDArray[np.bool_]]:
-        """Depth of one image, inf where nothing is seen, and what is seen from behind."""
+        """Return the depth of one image, inf if empty, and a mask of pixels seen from behind."""
         turn = np.eye(4)
         turn[:3, :3] = R
         T, camera = inverse(T_map_sensor @ turn), pinhole(self._camera)

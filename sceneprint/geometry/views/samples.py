@@ -1,9 +1,9 @@
-"""A surface as points with normals, one in each cell of a grid.
+"""Sample a surface as points with normals, one per cell of a grid.
 
-points (N, 3)  --thinned-->  points (n, 3)
-points (n, 3)  --on_surface-->  points (n, 3), normals (n, 3), spacing (n,)
+points (N, 3)  --average_cells-->  points (n, 3)
+points (n, 3)  --project_to_planes-->  points (n, 3), normals (n, 3), spacing (n,)
 surface, cell  --surfels-->  Surfels
-points (n, 3)  --blocks_of-->  order (n,), Blocks
+points (n, 3)  --sort_into_blocks-->  order (n,), Blocks
 """
 
 from __future__ import annotations
@@ -17,18 +17,17 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.surface.voxels import least_axis
 from sceneprint.types import Floats, Floats32, Ints32, Ints64, ReferenceSurface
 
-#: Cells along an axis, at most: three numbers of cells are one key.
+#: Maximum number of cells per axis: three indices fit one key.
 _MOST_CELLS = 1 << 20
-#: A point's neighbours lie on a plane where the least of their variances is at most this share of
-#: the middle one.
+#: Greatest ratio of the least to the middle variance of neighbours on a plane.
 _FLAT = 0.15
-#: Samples of the triangles of a mesh, at most about twice as many. Of a mesh of more triangles,
-#: those that one sample is enough for are not all sampled.
+#: Half the maximum number of samples of a mesh. If it has more triangles, only some of those with
+#: one sample are sampled.
 _MOST_SAMPLES = 2_000_000
 
 
 def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
-    """Return the number of each point's cell, and how many cells there are along each axis.
+    """Return the key of each point's cell, and the number of cells along each axis.
 
     Parameters
     ----------
@@ -50,12 +49,12 @@ def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
 
 
 def fitting_cell(points: Floats32, cell: float) -> float:
-    """Return the side of a cell, so large that cells can be numbered."""
+    """Return the side of a cell, enlarged until the cells can be numbered."""
     return max(cell, float(np.ptp(points, axis=0).max(initial=0.0)) / (_MOST_CELLS - 4))
 
 
-def thinned(points: Floats32, cell: float) -> Floats32:
-    """Return the mean of the points in each cell, (n, 3); those of a cell of one are as they were.
+def average_cells(points: Floats32, cell: float) -> Floats32:
+    """Return the mean of the points in each cell, (n, 3); a single point stays unchanged.
 
     Parameters
     ----------
@@ -79,8 +78,9 @@ def _fit(
     points: Floats32, order: Ints64, starts: Ints64, keys: Ints64, shape: Ints64, flat: float,
     normals: Floats32, heights: Floats, crowds: Floats,
 ) -> None:  # fmt: skip
-    """The plane of each cell, by the points of it and of the cells around it: normal and height,
-    normal . x; and their mean number in a cell.
+    """Fit the plane of each cell to the points in and around it.
+
+    Writes the normal, the height normal . x, and the mean number of points per cell.
     """
     m, values, axis = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for cell in range(len(keys)):
@@ -115,22 +115,22 @@ def _fit(
                 heights[cell] += axis[a] * (points[at, a] + first[a] / n)
 
 
-def on_surface(points: Floats32, cell: float) -> tuple[Floats32, Floats32, Floats32]:
-    """Return the points of a cloud moved onto the plane of their neighbours, and its normal.
+def project_to_planes(points: Floats32, cell: float) -> tuple[Floats32, Floats32, Floats32]:
+    """Project the points of a cloud onto the planes of their neighbours.
 
-    Walls of a map are as thick as its poses drift, and a sensor would see their nearest points: it
-    is the middle that is right.
+    Drift makes the walls of a map thick, and a sensor would see their nearest points: the middle is
+    right.
 
     Parameters
     ----------
     points : (N, 3), one or more
-    cell : neighbours are the points in this cell and those around it, metres
+    cell : side of a cell, metres; the cell's points and those around it are neighbours
 
     Returns
     -------
-    moved : (N, 3); those whose neighbours lie on no plane stay where they are
-    normals : (N, 3), towards either side; 0 where the neighbours lie on no plane
-    spacing : (N,) metres, as if those neighbours were spread evenly on a plane
+    moved : (N, 3); points whose neighbours lie on no plane stay in place
+    normals : (N, 3), towards either side; 0 if the neighbours lie on no plane
+    spacing : (N,) metres, as if the neighbours were spread evenly on a plane
     """
     cell = fitting_cell(points, cell)
     keys, shape = cell_keys(points, cell)
@@ -141,12 +141,12 @@ def on_surface(points: Floats32, cell: float) -> tuple[Floats32, Floats32, Float
     heights = np.zeros(len(starts))
     ends = np.append(starts, len(keys))
     _fit(points, order, ends, ordered[starts], shape, _FLAT, normals, heights, crowds)
-    of = np.searchsorted(ordered[starts], keys)
+    index = np.searchsorted(ordered[starts], keys)
     spacing = (cell / np.sqrt(crowds)).astype(np.float32)
-    towards = normals[of]
-    off = np.einsum("ij,ij->i", points.astype(np.float64), towards) - heights[of]
+    towards = normals[index]
+    off = np.einsum("ij,ij->i", points.astype(np.float64), towards) - heights[index]
     moved = (points - off[:, None] * towards).astype(np.float32)
-    return moved, towards, spacing[of]
+    return moved, towards, spacing[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +156,10 @@ class Surfels:
     Parameters
     ----------
     points : (S, 3) float32, metres
-    normals : (S, 3) float32, unit length; towards the front of a mesh, either side of a cloud; 0
-        where unknown
+    normals : (S, 3) float32, unit length; towards the front of a mesh, either side of a cloud; 0 if
+        unknown
     cell : side of a cell, metres
-    one_sided : whether normals tell the front
+    one_sided : whether normals point to the front
     """
 
     points: Floats32
@@ -169,17 +169,17 @@ class Surfels:
 
 
 def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
-    """Return pieces of a surface, one for each cell and each side that faces another way.
+    """Return pieces of a surface, one per cell and main direction of the normal.
 
     Parameters
     ----------
     surface : see ReferenceSurface
     cell : side of a cell, metres; it grows until there are few enough
-    most : of them
+    most : maximum number of pieces
     """
     if surface.triangles is None:
-        points = thinned(surface.points, cell / 6)
-        points, normals, _ = on_surface(points, cell / 2)
+        points = average_cells(surface.points, cell / 6)
+        points, normals, _ = project_to_planes(points, cell / 2)
     else:
         points, normals = _samples(surface.points, surface.triangles, cell / 2)
     cell = fitting_cell(points, cell)
@@ -196,7 +196,7 @@ def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
 
 @kernel
 def _count_samples(points: Floats32, triangles: Ints32, step: float, every: int) -> float:
-    """How many samples `_sample` takes, or more."""
+    """Return an upper bound of the number of samples of `_sample`."""
     total = 0.0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
@@ -213,7 +213,7 @@ def _sample(
     points: Floats32, triangles: Ints32, step: float, every: int, places: Floats32,
     normals: Floats32,
 ) -> int:  # fmt: skip
-    """Points on a grid over each triangle, at least its centre, and its normal."""
+    """Write points on a grid over each triangle, at least its centre, and its normal."""
     n = 0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
@@ -239,7 +239,7 @@ def _sample(
 
 
 def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32, Floats32]:
-    """Points on the triangles of a mesh about `step` apart, farther where they were too many."""
+    """Return points on the triangles of a mesh about `step` apart, farther if they are many."""
     points = np.require(points, np.float32, ["C", "W"])
     triangles = np.require(triangles, np.int32, ["C", "W"])
     every = max(len(triangles) // _MOST_SAMPLES, 1)
@@ -252,8 +252,8 @@ def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32
 
 
 @kernel
-def balls_of(points: Floats32, triangles: Ints32, middles: Floats32, reach: Floats32) -> None:
-    """The mean of the corners of each triangle, and how far from it they are, at most."""
+def bounding_balls(points: Floats32, triangles: Ints32, middles: Floats32, reach: Floats32) -> None:
+    """Write the mean of the corners of each triangle, and their greatest distance from it."""
     for m in range(len(triangles)):
         for axis in range(3):
             total = 0.0
@@ -271,13 +271,13 @@ def balls_of(points: Floats32, triangles: Ints32, middles: Floats32, reach: Floa
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Things in order of where they are, so that most that are out of view are passed over.
+    """Items sorted by position, so that most that are out of view can be skipped.
 
     Parameters
     ----------
-    starts, ends : (B,) of each block among the things
+    starts, ends : (B,) range of each block among the items
     centres : (B, 3) metres
-    radii : (B,) metres, of a ball that holds the block
+    radii : (B,) metres, of a ball that contains the block
     """
 
     starts: Ints64
@@ -288,14 +288,14 @@ class Blocks:
     def in_view(
         self, T: Floats, camera: Floats, shape: tuple[int, ...], farthest: float
     ) -> tuple[Ints64, Ints64]:
-        """Return where the blocks that a camera may see start and end.
+        """Return starts and ends of the blocks that a camera may see.
 
         Parameters
         ----------
         T : (4, 4) T_camera_points
         camera : fx, fy, cx, cy
         shape : height and width of its image
-        farthest : metres of depth
+        farthest : greatest depth, metres
         """
         x, y, z = (self.centres @ T[:3, :3].T + T[:3, 3]).T
         r = self.radii
@@ -304,19 +304,19 @@ class Blocks:
             (x, camera[0], camera[2], shape[1]), (y, camera[1], camera[3], shape[0]),
         ):  # fmt: skip
             for slope, sign in ((-(middle + 0.5) / focal, 1.0), ((size - middle) / focal, -1.0)):
-                # outside where it is farther than its radius beyond a side of the view
+                # outside if it is farther than its radius beyond a side of the view
                 seen &= sign * (along - slope * z) > -r * math.sqrt(1.0 + slope * slope)
         return self.starts[seen], self.ends[seen]
 
 
-def blocks_of(points: Floats32, side: float, extents: Floats32) -> tuple[Ints64, Blocks]:
-    """Return things in order of their blocks, and the blocks.
+def sort_into_blocks(points: Floats32, side: float, extents: Floats32) -> tuple[Ints64, Blocks]:
+    """Sort items into blocks; return their order and the blocks.
 
     Parameters
     ----------
-    points : (N, 3) their middles
-    side : of a block, metres
-    extents : (N,) how far each reaches from its middle, metres
+    points : (N, 3) centres of the items
+    side : side of a block, metres
+    extents : (N,) greatest distance of each from its centre, metres
     """
     side = fitting_cell(points, side)
     keys, _ = cell_keys(points, side)
