@@ -18,7 +18,7 @@ from sceneprint.pipeline import (
     open_signer,
     prepare,
     retrieve,
-    searched,
+    unguided_validations,
 )
 from sceneprint.places import QueryFrame
 from sceneprint.types import Floats, Geometry

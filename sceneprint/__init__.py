@@ -10,7 +10,7 @@
 
     answer = sceneprint.Client("http://robot-server:8008").query("warehouse", path)  # all at once
 
-Names are loaded when first used, so that importing the package costs nothing.
+Modules are imported when their names are first used.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ __all__ = [
 
 __version__ = _version("sceneprint")
 
-_HOME = {
+_MODULES = {
     "Cloud": "types",
     "DepthFrame": "types",
     "Geometry": "types",
@@ -112,9 +112,9 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name == "Client":
         return import_module("sceneprint_client").Client
-    if name not in _HOME:
+    if name not in _MODULES:
         raise AttributeError(f"module 'sceneprint' has no attribute {name!r}")
-    return getattr(import_module(f"sceneprint.{_HOME[name]}"), name)
+    return getattr(import_module(f"sceneprint.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -1,16 +1,16 @@
-"""Everything sceneprint raises on purpose: what a client may meet, and what stays inside.
+"""Define the exceptions of sceneprint: those that clients see, and internal ones.
 
     SceneprintError, and all of sceneprint_client.errors
-      x DamagedIndex            a cache file of the index that is missing or damaged
-      x DecoderFailure          an upload that crashes its decoder, or exceeds its limits
+      x DamagedIndex            a cache file of the index is missing or damaged
+      x DecoderFailure          an upload crashes its decoder, or exceeds its limits
       x BusyIndex               another process is building this index
       x StoreError
-        - LostLease             the job has been given to another worker
-        - BundleError           a bundle cannot be written, or not be restored there
-          - DamagedBundle       its bytes are not those that were written
+        - LostLease             another worker has the job
+        - BundleError           a bundle cannot be written, or cannot be restored there
+          - DamagedBundle       its bytes are not the original ones
       x TrainingError           too little data, or parameters that cannot be fitted
 
-They are the same classes: `except sceneprint.errors.UnknownMap` catches what a client raises.
+The classes are shared: `except sceneprint.errors.UnknownMap` catches exceptions of the client.
 """
 
 from sceneprint_client.errors import (
@@ -148,8 +148,9 @@ class DamagedIndex(SceneprintError):
 
 
 class DecoderFailure(SceneprintError):
-    """A decoder crashed of an upload, took too long, or needed too much memory. Its text goes on
-    from "it": who catches it says of what.
+    """A decoder crashed, took too long, or needed too much memory.
+
+    Its message continues a sentence from "it": the caller names the upload.
     """
 
 
@@ -158,7 +159,7 @@ class BusyIndex(SceneprintError):
 
 
 class LostLease(StoreError):
-    """The job's lease ran out, and it has been given to another worker."""
+    """The job's lease expired, and another worker has the job."""
 
 
 class BundleError(StoreError):
@@ -166,7 +167,7 @@ class BundleError(StoreError):
 
 
 class DamagedBundle(BundleError):
-    """The bytes of a bundle are not those that were written."""
+    """The bytes of a bundle are not the original ones."""
 
 
 class TrainingError(SceneprintError):

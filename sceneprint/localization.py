@@ -3,9 +3,9 @@
 matches, poses, MapViews  --localize-->  PoseEstimate
 
 Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
-judged on the frames of the map that would see the same surfaces. The evidence for each of them
-gives its confidence: the probability that it is right. The best one is `found` where its confidence
-reaches the one that the query asks for. All others together have no more than the rest.
+judged on the frames of the map that would see the same surfaces. The evidence for each gives its
+confidence, the probability that it is right. The best pose is `found` if its confidence reaches
+that of the query; all others together have at most the remainder.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from sceneprint.geometry.validation.map_verification import (
     view_separations,
 )
 from sceneprint.geometry.validation.validation import PairValidation
-from sceneprint.pipeline import PairMatch, searched
+from sceneprint.pipeline import PairMatch, unguided_validations
 from sceneprint.places import (
     LocalizationParameters,
     Place,
     PosePrior,
     QueryFrame,
     ViewsOf,
-    judged_places,
-    parameters_of,
+    judge_places,
+    model_parameters,
 )
 from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]
-#: What decided: strong matches that vote for the pose; the map's frames, where no match is strong;
-#: or what the robot believed before, where the map bears that out as well as any other pose.
+#: Evidence that decided: strong matches that vote for the pose; the map's frames, if no match is
+#: strong; or the robot's prior, if the map supports it as well as any other pose.
 Verifier = Literal["matches", "map", "prior"]
 
 
@@ -59,9 +59,9 @@ class AlternativePose:
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    support : matches from different viewpoints that vote for it
-    confidence : probability that it is right; None where the map was not asked
-    evidence : what that was computed from; None where the map was not asked
+    support : number of viewpoints of matches that vote for it
+    confidence : probability that it is right; None without a map
+    evidence : evidence for the confidence; None without a map
     """
 
     T: Floats
@@ -72,22 +72,22 @@ class AlternativePose:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """Where a query was taken, and how sure that is.
+    """The estimated pose of a query, and its confidence.
 
     Parameters
     ----------
     status : found, ambiguous, or not_found
-    reason : a short sentence
-    parent : frame in which the poses are given
-    average : T_parent_query with the spread of the votes and how many agree; None unless found
-    covariance : (6, 6) of it, as `place_covariance` orders it; None where a vote has none
-    strength : of the matches that vote for it; None unless found
-    verified_by : what decided; None unless found
-    alternatives : the poses that are worth a look, best first; the answer alone where it is found
-    votes : accepted matches that have a pose in the parent frame
+    reason : short sentence
+    parent : parent frame of the poses
+    average : T_parent_query with the spread and number of agreeing votes; None unless found
+    covariance : (6, 6) of it, ordered as in `place_covariance`; None if a vote has none
+    strength : strength of the matches that vote for it; None unless found
+    verified_by : evidence that decided; None unless found
+    alternatives : plausible poses, best first; the answer alone if found
+    votes : number of accepted matches with a pose in the parent frame
     members : rows of the matches that vote for the answer
-    guided : how many of these were guided by the others
-    places : all that were judged
+    guided : number of these that were guided by the others
+    places : all judged places
     """
 
     status: LocalizationStatus
@@ -105,12 +105,12 @@ class PoseEstimate:
 
     @property
     def confidence(self) -> float | None:
-        """Probability that the best pose is right; None where the map was not asked."""
+        """Return the probability that the best pose is right; None without a map."""
         return self.alternatives[0].confidence if self.alternatives else None
 
     @property
     def evidence(self) -> PlaceEvidence | None:
-        """What speaks for and against the best pose; None where the map was not asked."""
+        """Return the evidence for and against the best pose; None without a map."""
         return self.alternatives[0].evidence if self.alternatives else None
 
 
@@ -123,24 +123,24 @@ def localize(
     p: LocalizationParameters | None = None,
     overlap_p: OverlapParameters | None = None,
 ) -> PoseEstimate | None:
-    """Return where a query was taken, by its matches and the frames of the map.
+    """Estimate where a query was taken, by its matches and the frames of the map.
 
     Parameters
     ----------
-    frames : of the query, one or more
+    frames : one or more frames of the query
     poses : T_parent_sensor (4, 4) of every row of the database, or by the rows of the matches
-    parents : parent frame of every row; default: one for all. Poses are compared within one
-        parent frame only: that of the prior, or that of most of the matches
+    parents : parent frame of every row; default: one for all. Poses are compared within one parent
+        frame only: that of the prior, or that of most matches
     views_of : see ViewsOf; None: pairs alone decide
-    prior : what the robot believed before
-    p : default: those of the model that made the artifacts
+    prior : the robot's prior
+    p : default: parameters of the artifacts' model
 
     Returns
     -------
-    estimate : or None where nothing suggests a pose
+    estimate : or None if nothing suggests a pose
     """
-    p = p or parameters_of(frames)
-    parent, prior, places = judged_places(
+    p = p or model_parameters(frames)
+    parent, prior, places = judge_places(
         frames, poses, parents, views_of, prior, p, overlap_p or OverlapParameters()
     )
     if not places:
@@ -151,48 +151,48 @@ def localize(
 
 
 class QueryDatabase(Protocol):
-    """The frames that one query searches: in the store of a service, or those of an evaluation."""
+    """The frames that one query searches: in the store of a service, or in an evaluation."""
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         """Return where the last of some frames was taken, by their matches; see `localize`."""
 
     def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
-        """Return the matches of a frame's candidates, none of them guided.
+        """Return the matches of a frame's candidates, without guided ones.
 
         Parameters
         ----------
-        frame : number of the frame
+        frame : index of the frame
         known : validations of candidates, by row, that are not repeated
 
         Returns
         -------
-        matches : see `associate`; None where time is up
+        matches : see `associate`; None if the time is over
         """
 
     def posed(self, rows: Sequence[int]) -> Mapping[int, PosedFrame]:
         """Return those of some rows that have a pose."""
 
     def compare(self, rows: Sequence[int]) -> Sequence[PairMatch]:
-        """Return the matches of the last frame with some rows, none of them guided."""
+        """Return the matches of the last frame with some rows, without guided ones."""
 
 
 def decide(
     frames: Sequence[QueryFrame], ranking: Ranking, database: QueryDatabase,
     p: LocalizationParameters,
 ) -> PoseEstimate | None:  # fmt: skip
-    """Return where the last frame of a query was taken, after validating what may change that.
+    """Estimate where the last frame of a query was taken, after the validations that may change it.
 
-    Guided matches are no votes: where no pose is found with them, their frames are searched. And no
-    pose is found before frames elsewhere that look alike were compared; see `rival_rows`.
+    Guided matches are no votes: if no pose is found with them, their frames are searched. Before a
+    pose is found, similar frames elsewhere are compared; see `rival_rows`.
 
     Parameters
     ----------
-    frames : of the query, with the matches of their candidates
+    frames : frames of the query, with the matches of their candidates
     ranking : R of the last frame
 
     Returns
     -------
-    estimate : or None where nothing suggests a pose
+    estimate : or None if nothing suggests a pose
     """
     of_candidates = [frame.matches for frame in frames]
     elsewhere: Sequence[PairMatch] = ()
@@ -200,7 +200,7 @@ def decide(
     def located() -> PoseEstimate | None:
         every = [*of_candidates[:-1], [*of_candidates[-1], *elsewhere]]
         return database.locate(
-            [replace(one, matches=own) for one, own in zip(frames, every, strict=True)]
+            [replace(frame, matches=own) for frame, own in zip(frames, every, strict=True)]
         )
 
     def settled() -> PoseEstimate | None:
@@ -209,7 +209,7 @@ def decide(
             return estimate
         again = [
             None if known is None else database.search(number, known)
-            for number, known in enumerate(map(searched, of_candidates))
+            for number, known in enumerate(map(unguided_validations, of_candidates))
         ]
         if not any(again):
             return estimate
@@ -235,16 +235,16 @@ def views_of_rows(
     ahead: Sequence[bool] | None = None,
     rendered: Sequence[bool] | None = None,
 ) -> ViewsOf:
-    """Return a function that gives `localize` the map's frames, where all poses are in memory.
+    """Return a function that opens the map's frames for `localize`, if all poses are in memory.
 
     Parameters
     ----------
-    matches : of the query: poses are first compared on their rows
+    matches : matches of the query: poses are first compared on their rows
     poses : T_parent_sensor (4, 4) of every row
-    open_geometry : artifact of a row, or None
+    open_geometry : returns the artifact of a row, or None
     parents : parent frame of every row; default: one for all
-    ahead : of every row, whether its sensor looks along z; default: all do
-    rendered : of every row, whether it is a view rendered from a surface; default: none is
+    ahead : whether the sensor of each row looks along z; default: all do
+    rendered : whether each row is a view rendered from a surface; default: none is
     """
 
     def views_of(parent: str, at: Floats) -> MapViews:  # noqa: ARG001
@@ -280,15 +280,15 @@ def rival_rows(
     query_ahead: bool,
     p: LocalizationParameters | None = None,
 ) -> list[int]:
-    """Return frames that look like the query, but show another place than the estimate.
+    """Return frames similar to the query that show another place than the estimate.
 
-    Where two rooms are equal and were mapped from the same viewpoints, each signature is in the
-    database twice, and C has one of the two: all of C may be of the wrong room. So no pose is found
-    before frames of another place, with signatures as near as those that vote, were validated too.
+    If two equal rooms were mapped from the same viewpoints, each signature is in the database
+    twice, and all of C may be of the wrong room. So frames of another place with signatures as near
+    as those that vote are validated before a pose is found.
 
     Parameters
     ----------
-    estimate : of `localize`
+    estimate : result of `localize`
     ranking : R
     tried : rows that were validated
     posed : describes those of some rows that have a pose
@@ -296,7 +296,7 @@ def rival_rows(
 
     Returns
     -------
-    rows : the first of R, `p.rivals` at most; none where nothing is found, or the prior decided
+    rows : the first of R, at most `p.rivals`; none if nothing is found, or the prior decided
     """
     p = p or LocalizationParameters()
     if estimate is None or estimate.average is None or estimate.verified_by == "prior":
@@ -309,17 +309,17 @@ def rival_rows(
         return []
     near = ranking.distances <= p.rival_distance * ranking.distances[voting[-1]]
     untried = [order[i] for i in np.flatnonzero(near) if order[i] not in tried]
-    known = {n: one for n, one in posed(untried).items() if one.parent == estimate.parent}
-    rows = [row for row in untried if row in known]
+    frames = {n: frame for n, frame in posed(untried).items() if frame.parent == estimate.parent}
+    rows = [row for row in untried if row in frames]
     if not rows:
         return []
-    poses = np.stack([known[row].T for row in rows])
-    ahead = np.array([known[row].ahead for row in rows])
+    poses = np.stack([frames[row].T for row in rows])
+    ahead = np.array([frames[row].ahead for row in rows])
     apart = view_separations(poses, ahead, estimate.average.T, query_ahead, p.map)
     return [row for row, far in zip(rows, apart >= 1.0, strict=True) if far][: p.rivals]
 
 
-def unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
+def mark_unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
     """Return an estimate as ambiguous, because similar frames elsewhere were not compared."""
     if estimate.average is None:
         return estimate
@@ -335,12 +335,12 @@ def _estimate_of(
     parent: str, places: Sequence[Place], prior: PosePrior | None, p: LocalizationParameters, *,
     blind: bool = False,
 ) -> PoseEstimate:  # fmt: skip
-    """Return the verdict on places.
+    """Return the estimate for judged places.
 
     Parameters
     ----------
-    parent, prior, places : of `judged_places`; one place or more
-    blind : whether nothing is known of free space
+    parent, prior, places : results of `judge_places`; one place or more
+    blind : whether free space is unknown
     """
     if all(place.evidence is None for place in places):
         return _estimate_by_votes(parent, places, blind, p)
@@ -357,9 +357,8 @@ def _estimate_of(
             return _found(parent, place, places, "prior", confidence, p)
     worth = [i for i in order if judged[i] >= p.worth][: p.views]
     alternatives = tuple(
-        AlternativePose(one.T, one.support, judged[i], one.evidence)
+        AlternativePose(places[i].T, places[i].support, judged[i], places[i].evidence)
         for i in worth
-        for one in (places[i],)
     )
     reason = weakest_evidence(_known(best.evidence), p.judgement)
     votes = sum(len(place.accepted) for place in places)
@@ -373,35 +372,34 @@ def _known(evidence: PlaceEvidence | None) -> PlaceEvidence:
 
 
 def _confidences(places: Sequence[Place], p: LocalizationParameters) -> list[float]:
-    """Return the confidence of each place; 0 of those that need votes and have none."""
+    """Return the confidence of each place; 0 for places that need votes and have none."""
     judged = compute_confidences([_known(place.evidence) for place in places], p.judgement)
     return [
-        0.0 if p.voted_only and not place.votes else one
-        for place, one in zip(places, judged, strict=True)
+        0.0 if p.voted_only and not place.votes else confidence
+        for place, confidence in zip(places, judged, strict=True)
     ]
 
 
-#: Viewpoints of candidates that a prior is worth: it suggests a pose by itself.
+#: Number of suggesting viewpoints for which a prior counts.
 _SUGGESTED_BY_PRIOR = 2
 
 
 def _confirmed_by_prior(
     places: Sequence[Place], prior: PosePrior, p: LocalizationParameters
 ) -> tuple[Place, float] | None:
-    """Return the place that the prior decides for, and its confidence; None where it does not.
+    """Return the place that the prior selects, and its confidence; None if it selects none.
 
-    Places that the prior does not expect are no rivals of those that it does, provided that they
-    fit the map no better.
+    Unexpected places are no rivals of expected ones that fit the map as well.
     """
     inside = [place for place in places if prior.expects(place.T)]
     most = max(place.score for place in places)
     within = []
     for place in inside:
-        others = [one for one in inside if one is not place]
-        rival = max((one.score for one in others), default=0.0)
+        others = [other for other in inside if other is not place]
+        rival = max((other.score for other in others), default=0.0)
         evidence = replace(
             _known(place.evidence), rival=rival / place.score if place.score > 0 else 1.0,
-            rival_weight=max((one.weight for one in others), default=0.0),
+            rival_weight=max((other.weight for other in others), default=0.0),
             suggested=max(_known(place.evidence).suggested, _SUGGESTED_BY_PRIOR),
         )  # fmt: skip
         within.append(replace(place, evidence=evidence))
@@ -417,7 +415,7 @@ def _confirmed_by_prior(
 def _estimate_by_votes(
     parent: str, places: Sequence[Place], blind: bool, p: LocalizationParameters
 ) -> PoseEstimate:
-    """Return the verdict on places by their votes alone, where the map is not asked."""
+    """Return the estimate for places by their votes alone, without a map."""
     order = sorted(places, key=lambda place: (not place.accepted, -place.weight))
     best, heaviest = order[0], max((place.weight for place in order[1:]), default=0.0)
     against = None
@@ -430,7 +428,7 @@ def _estimate_by_votes(
     if against is None:
         return _found(parent, best, places, "matches", None, p)
     alternatives = tuple(
-        AlternativePose(one.T, one.support, None, None) for one in order[: p.views]
+        AlternativePose(place.T, place.support, None, None) for place in order[: p.views]
     )
     votes = sum(len(place.accepted) for place in places)
     return PoseEstimate("ambiguous", against, parent, None, None, None, None, alternatives, votes)
@@ -440,7 +438,7 @@ def _found(
     parent: str, place: Place, places: Sequence[Place], verified_by: Verifier,
     confidence: float | None, p: LocalizationParameters,
 ) -> PoseEstimate:  # fmt: skip
-    """Return the answer that a query was taken at a place."""
+    """Return the estimate that a query was taken at a place."""
     accepted = place.accepted
     votes = accepted[: p.views]
     covariances = [vote.covariance for vote in votes if vote.covariance is not None]
@@ -449,7 +447,7 @@ def _found(
     if votes and len(covariances) == len(votes):
         poses = np.stack([vote.T for vote in votes])
         covariance = place_covariance(average, poses, np.stack(covariances))
-    total = sum(len(one.accepted) for one in places)
+    total = sum(len(each.accepted) for each in places)
     guided = sum(vote.match.validation.guided for vote in accepted)
     reason = _found_reason(average, len(accepted), guided, total, place.support, verified_by)
     strength: Strength = "strong" if place.strong else "weak"
@@ -464,7 +462,7 @@ def _found_reason(
     average: PoseAverage, agreeing: int, guided: int, accepted: int, support: int,
     verified_by: Verifier,
 ) -> str:  # fmt: skip
-    """Return a sentence on what the answer rests on."""
+    """Return a sentence on the evidence for the answer."""
     if verified_by == "map":
         return "the map's frames confirm this pose, and no other comes near"
     if verified_by == "prior":

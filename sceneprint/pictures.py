@@ -1,4 +1,4 @@
-"""Frames as small pictures: depth, normals or patches.
+"""Draw frames as small pictures: depth, normals or patches.
 
 Surface, labels  --depth_view | normals_view | patches_view-->  colours  --picture-->  PNG
 Surfaces, transform  --overlay_picture-->  PNG
@@ -27,12 +27,12 @@ from sceneprint.types import (
 )
 from sceneprint_client.api.results import WIDTHS
 
-#: Colour where nothing is known: dark grey, which no normal and no depth has.
+#: Colour of unknown pixels: dark grey, which no normal and no depth has.
 UNKNOWN = 40
 
 
 def normal_colours(normals: Floats32, valid: NDArray[np.bool_]) -> Bytes:
-    """The paper's colour map (Fig. 1): red, green, blue in proportion to x, y, z.
+    """Return the colours of normals as in the paper's Fig. 1: red, green, blue for x, y, z.
 
     Parameters
     ----------
@@ -47,11 +47,9 @@ def normal_colours(normals: Floats32, valid: NDArray[np.bool_]) -> Bytes:
     return np.where(valid[..., None], colours, np.uint8(UNKNOWN))
 
 
-# A frame as a small picture, by view.
-
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-#: Pixels along the longer side of a view from above, by the number of points.
+#: Least and greatest number of pixels along the longer side of a view from above.
 _LEAST, _MOST = 16, 320
 _OPTICAL = "x right, y down, z forward"
 _AXES = "the x, y and z of its own axes"
@@ -63,10 +61,10 @@ class Vista:
 
     Parameters
     ----------
-    pixels : (h, w) int32, index of the point that a pixel shows; -1 for none
+    pixels : (h, w) int32, index of the point of each pixel; -1 for none
     distances : (N,) float64, metres, of each point
-    what : those are: "depth" along a camera's axis, "range" from a viewpoint, or "height"
-    axes : of the normals, in words
+    what : kind of distances: "depth" along a camera's axis, "range" from a viewpoint, or "height"
+    axes : description of the axes of normals
     """
 
     pixels: Ints32
@@ -75,19 +73,20 @@ class Vista:
     axes: str
 
     def of(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
-        """(h, w, ...) values of the points that are shown; whatever where none is."""
+        """Return the values (h, w, ...) of the shown points; arbitrary if a pixel shows none."""
         chosen: NDArray[Scalar] = values[self.pixels]
         return chosen
 
     @property
     def shown(self) -> NDArray[np.bool_]:
-        """(h, w): whether a pixel shows a point."""
+        """Return whether each pixel shows a point, (h, w)."""
         return self.pixels >= 0
 
 
 def vista_of(surface: Surface) -> Vista:
-    """How to draw a surface: as its camera saw it, as one looks about its viewpoint, or, of points
-    in no order, from the side of their least extent, which is above in a building.
+    """Return the image of a surface: from its camera, or around its viewpoint.
+
+    Unordered points are seen from the side of their least extent, which is above in a building.
 
     Parameters
     ----------
@@ -99,25 +98,25 @@ def vista_of(surface: Surface) -> Vista:
     if isinstance(surface.camera, Intrinsics):
         return Vista(pixels, points[:, 2], "depth", _OPTICAL)
     if isinstance(surface.camera, Sphere):
-        # azimuth counts to the left of who has the pole above; an optical frame's y points down
-        turned = pixels[::-1] if surface.camera.pole == 1 else pixels[:, ::-1]
-        return Vista(turned, np.linalg.norm(points, axis=1), "range", _AXES)
+        # azimuth rises to the left if the pole is up; an optical frame's y points down
+        flipped = pixels[::-1] if surface.camera.pole == 1 else pixels[:, ::-1]
+        return Vista(flipped, np.linalg.norm(points, axis=1), "range", _AXES)
     return _from_above(points, surface.valid.ravel())
 
 
-def onto(vista: Vista, surface: Surface, points: Floats32, labels: Ints32) -> Ints32:
-    """Labels of points in no order, as the pixels of another picture of the same show them.
+def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Ints32) -> Ints32:
+    """Return the labels of unordered points at the pixels of a picture of the same surface.
 
     Parameters
     ----------
-    vista : of `surface`
-    surface : what is drawn
+    vista : vista of `surface`
+    surface : the drawn surface
     points : (N, 3) metres, in its coordinates
-    labels : (N,) of each point, -1 for none
+    labels : (N,) label of each point, -1 for none
 
     Returns
     -------
-    labels : (h, w) of the nearest point to what a pixel shows; -1 for none
+    labels : (h, w) label of the point nearest to that of each pixel; -1 for none
     """
     from scipy.spatial import KDTree
 
@@ -128,13 +127,13 @@ def onto(vista: Vista, surface: Surface, points: Floats32, labels: Ints32) -> In
 
 
 def _from_above(points: Floats, valid: NDArray[np.bool_]) -> Vista:
-    """Of all points that lie on a pixel the highest is shown."""
+    """Return a view from above, with the highest point at each pixel."""
     seen = np.flatnonzero(valid)
     if not seen.size:
         return Vista(np.full((1, 1), -1, np.int32), np.zeros(len(points)), "height", _AXES)
     centred = points - points[seen].mean(axis=0)
     _, axes = np.linalg.eigh(centred[seen].T @ centred[seen])
-    for i in (0, 2):  # of the two senses the one towards which the axis nearest to it points
+    for i in (0, 2):  # the sense of the nearest coordinate axis
         axes[:, i] *= np.sign(axes[np.argmax(np.abs(axes[:, i])), i])
     above, right = axes[:, 0], axes[:, 2]
     heights = centred @ above
@@ -150,12 +149,12 @@ def _from_above(points: Floats, valid: NDArray[np.bool_]) -> Vista:
     return Vista(pixels, heights, "height", _AXES)
 
 
-#: Most rows: a picture that would be higher is made narrower.
+#: Maximum number of rows; higher pictures are scaled down.
 MOST_ROWS = 2560
 
-#: Percentiles of depth that are called near and far: a stray sample must not darken all others.
+#: Percentiles of near and far depth: a stray sample must not darken all others.
 _RANGE = (1.0, 99.0)
-#: The colour map viridis at equal steps: between them it is straight to 6 of 255.
+#: The colour map viridis at equal steps; linear interpolation errs by at most 6 of 255.
 _VIRIDIS = np.array(
     [
         (68, 1, 84), (72, 24, 106), (71, 45, 123), (66, 64, 134), (59, 82, 139), (51, 99, 141),
@@ -165,9 +164,9 @@ _VIRIDIS = np.array(
     ],
     np.float64,
 )  # fmt: skip
-#: Colours to choose from beyond one for each patch, so that the last ones have a choice too.
+#: Number of spare colours, so that the last patches can select too.
 _SPARE = 64
-#: Oklab to linear sRGB: to the cone responses' cube roots, then to the primaries.
+#: Oklab to linear sRGB: to the cube roots of cone responses, then to the primaries.
 _TO_CONES = np.array(
     [(1, 0.3963377774, 0.2158037573), (1, -0.1055613458, -0.0638541728),
      (1, -0.0894841775, -1.2914855480)]
@@ -179,8 +178,9 @@ _TO_PRIMARIES = np.array(
 
 
 def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
-    """Depth by a colour map of equal steps to the eye: near is yellow, far is violet. Of a cloud
-    its range, or seen from above its height: high is yellow.
+    """Return depth in a perceptually uniform colour map: near is yellow, far is violet.
+
+    For clouds it shows the range, or from above the height: high is yellow.
 
     Parameters
     ----------
@@ -188,8 +188,8 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
     Returns
     -------
-    colours : (h', w', 3) uint8, as `vista_of` has the pixels; dark grey where nothing is known
-    meaning : `near_m` and `far_m`, the depths or ranges of the ends of the colour map; of heights
+    colours : (h', w', 3) uint8, pixels of `vista_of`; dark grey if unknown
+    meaning : `near_m` and `far_m`, the depths or ranges at the ends of the colour map; for heights
         `low_m` and `high_m`, from their mean
     """
     vista = vista_of(surface)
@@ -209,7 +209,7 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
 
 def viridis(shares: Floats) -> Bytes:
-    """Colours (..., 3) of shares: violet at 0 and below, yellow at 1 and above."""
+    """Return colours (..., 3) of shares: violet at 0 and below, yellow at 1 and above."""
     place = np.clip(shares, 0.0, 1.0) * (len(_VIRIDIS) - 1)
     steps = np.arange(len(_VIRIDIS))
     mixed = np.stack([np.interp(place, steps, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
@@ -217,7 +217,7 @@ def viridis(shares: Floats) -> Bytes:
 
 
 def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
-    """Unit normals in the sensor's axes: red, green, blue are 127.5 (1 + x, y, z).
+    """Return unit normals in the sensor's axes: red, green, blue are 127.5 (1 + x, y, z).
 
     Parameters
     ----------
@@ -225,8 +225,8 @@ def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
     Returns
     -------
-    colours : (h', w', 3) uint8, as `vista_of` has the pixels; dark grey where nothing is known
-    meaning : in words
+    colours : (h', w', 3) uint8, pixels of `vista_of`; dark grey if unknown
+    meaning : description
     """
     vista = vista_of(surface)
     frame = "optical frame" if vista.what == "depth" else "sensor's frame"
@@ -239,7 +239,7 @@ def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
 
 def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
-    """Patches, each in a colour of its own that is unlike those of its neighbours.
+    """Return patches, each in a colour that differs from those of its neighbours.
 
     Parameters
     ----------
@@ -247,8 +247,8 @@ def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
 
     Returns
     -------
-    colours : (h, w, 3) uint8; dark grey where there is no patch. The same for the same labels
-    meaning : in words
+    colours : (h, w, 3) uint8, deterministic; dark grey without a patch
+    meaning : description
     """
     count = int(labels.max(initial=-1)) + 1
     palette = np.concatenate([_colours_of(labels, count), np.full((1, 3), UNKNOWN, np.uint8)])
@@ -257,17 +257,17 @@ def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
 
 
 def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
-    """Colours as a PNG of a width; pixels are repeated or left out, never mixed.
+    """Return colours as a PNG of a width; pixels are repeated or omitted, never mixed.
 
     Parameters
     ----------
     colours : (h, w, 3) uint8
-    width : columns; fewer where there would be more than MOST_ROWS rows
-    text : kept in the file's tEXt chunks
+    width : columns; fewer if there would be more than MOST_ROWS rows
+    text : texts for the file's tEXt chunks
 
     Raises
     ------
-    ValueError : a width beyond WIDTHS.
+    ValueError : the width is beyond WIDTHS
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
@@ -275,7 +275,7 @@ def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
     if not WIDTHS[0] <= width <= WIDTHS[1]:
         raise ValueError(f"width {width}: from {WIDTHS[0]} to {WIDTHS[1]}")
     scale = min(width / colours.shape[1], MOST_ROWS / colours.shape[0])
-    rows, columns = (_chosen(n, max(round(n * scale), 1)) for n in colours.shape[:2])
+    rows, columns = (_sample_indices(n, max(round(n * scale), 1)) for n in colours.shape[:2])
     info = PngInfo()
     for name, value in text.items():
         info.add_text(name, value)
@@ -284,11 +284,9 @@ def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
     return buffer.getvalue()
 
 
-# Two frames, laid on each other by a transform.
-
-#: Colours of the query and of the match, red, green, blue; the same as on the dashboard.
+#: Colours of the query and of the match, red, green, blue, as on the dashboard.
 QUERY_COLOUR, MATCH_COLOUR = (217, 119, 43), (43, 108, 176)
-#: Pixels along the longer side of a panel, and the points that give a pixel its full colour.
+#: Pixels along the longer side of a panel, and points per pixel of full colour.
 _PANEL, _FULL = 480, 1.5
 
 
@@ -303,17 +301,17 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
     """
     from PIL import Image, ImageDraw
 
-    # from above: x to the right and z up the picture, where the match's camera looks
-    of_query, of_match = (one.points[one.valid].astype(np.float64) for one in (query, match))
-    aligned = transform_points(T_match_query, of_query)
-    everything = np.concatenate([of_match, of_query, aligned])[:, [0, 2]]
-    low, high = np.percentile(everything, (1, 99), axis=0)  # a few stray points lie far out
+    # from above: x to the right, and z, the match camera's axis, upwards
+    ours, theirs = (surface.points[surface.valid].astype(np.float64) for surface in (query, match))
+    aligned = transform_points(T_match_query, ours)
+    everything = np.concatenate([theirs, ours, aligned])[:, [0, 2]]
+    low, high = np.percentile(everything, (1, 99), axis=0)  # without stray points
     scale = (_PANEL - 1) / (high - low).max()
     columns, rows = np.ceil((high - low) * scale).astype(int) + 1
     panels = []
-    for points in (of_query, aligned):
+    for points in (ours, aligned):
         panel = np.ones((rows, columns, 3))
-        for drawn, colour in ((of_match, MATCH_COLOUR), (points, QUERY_COLOUR)):
+        for drawn, colour in ((theirs, MATCH_COLOUR), (points, QUERY_COLOUR)):
             x, y = np.rint((drawn[:, [0, 2]] - low) * scale).astype(int).T
             inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
             counts = np.zeros((rows, columns))
@@ -333,13 +331,13 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
     return buffer.getvalue()
 
 
-def _chosen(n: int, wanted: int) -> NDArray[np.intp]:
-    """Which of `n` pixels lie under the centres of so many."""
+def _sample_indices(n: int, wanted: int) -> NDArray[np.intp]:
+    """Return the indices of `wanted` of `n` pixels, those under the centres."""
     return ((np.arange(wanted) + 0.5) * n / wanted).astype(np.intp)
 
 
 def _colours_of(labels: Ints32, count: int) -> Bytes:
-    """A colour for each patch: of those left, the one most unlike its neighbours' so far."""
+    """Return a colour per patch: the free colour most unlike those of its neighbours so far."""
     lab = _palette(count + _SPARE)
     squares = (lab**2).sum(axis=1)[:, None]
     neighbours = _neighbours(labels, count)
@@ -354,11 +352,11 @@ def _colours_of(labels: Ints32, count: int) -> Bytes:
         else:
             chosen[patch] = np.argmax(free)
         free[chosen[patch]] = False
-    return _displayed(lab[chosen])
+    return _to_srgb(lab[chosen])
 
 
 def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
-    """Patches that share an edge of pixels with each patch."""
+    """Return the patches that share an edge of pixels with each patch."""
     across = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
     down = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
     pairs = np.concatenate([across, down])
@@ -369,17 +367,17 @@ def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
 
 
 def _palette(count: int) -> Floats:
-    """So many colours (count, 3) in Oklab, spread evenly over hues and lightnesses."""
+    """Return colours (count, 3) in Oklab, spread evenly over hues and lightnesses."""
     n = np.arange(1, count + 1)
-    # the plastic number's powers: no two points of the square come near (Roberts 2018)
+    # powers of the plastic number spread points evenly over the square (Roberts 2018)
     plastic = 1.32471795724474602596
     lightness = 0.48 + 0.4 * ((0.5 + n / plastic) % 1.0)
     hue = 2.0 * math.pi * ((0.5 + n / plastic**2) % 1.0)
     return np.stack([lightness, 0.11 * np.cos(hue), 0.11 * np.sin(hue)], axis=1)
 
 
-def _displayed(lab: Floats) -> Bytes:
-    """Oklab (n, 3) as sRGB."""
+def _to_srgb(lab: Floats) -> Bytes:
+    """Convert Oklab (n, 3) to sRGB."""
     linear = np.clip(((lab @ _TO_CONES.T) ** 3) @ _TO_PRIMARIES.T, 0.0, 1.0)
     curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     colours: Bytes = np.rint(255.0 * curved).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The paper's Fig. 1 as functions, one line a stage.
+"""Run the stages of the paper's Fig. 1.
 
 frame --prepare--> signature, geometry
 signature, database --retrieve--> R --diversify--> C --associate--> C_vld --localize--> pose
@@ -77,27 +77,22 @@ __all__ = [
 
 
 def sign(frame: AnyFrame, signer: Signer) -> Signature:
-    """The stored signature of a frame: Sec. III-A, III-B, III-F; whitened where its model says so.
-
-    Parameters
-    ----------
-    frame : depth, or a cloud, in metres
-    signer : see `open_signer`
+    """Return the stored signature of a frame: Sec. III-A, III-B, III-F; whitened if its model is.
 
     Raises
     ------
-    UselessFrame : nothing within the sensor's range, or no two patches to relate.
+    UselessFrame : no samples lie within the sensor's range, or no two patches are within reach
     """
     p = signer.model.parameters
     return encode(hierarchy_of(see(frame, p), p, frame.name), signer, frame.name)
 
 
 def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
-    """Signature and geometry artifact of a frame, of one look at its surface.
+    """Return the signature and the geometry artifact of a frame, from one pass over its surface.
 
     Raises
     ------
-    UselessFrame : see `sign`.
+    UselessFrame : see `sign`
     """
     p = signer.model.parameters
     seen = see(frame, p)
@@ -108,15 +103,15 @@ def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
 
 
 def geometry_of(seen: Surface, model: Model) -> Geometry:
-    """The geometry artifact of a surface: what validation needs of it, Sec. III-E.
+    """Return the geometry artifact of a surface, for validation: Sec. III-E.
 
     Parameters
     ----------
-    seen : of `sceneprint.signing.see`
-    model : whose parameters and compression are used
+    seen : result of `sceneprint.signing.see`
+    model : model with parameters and compression
     """
     p = model.parameters
-    _NUMBERS[model.id] = p.validation, model.answer
+    _PARAMETERS[model.id] = p.validation, model.answer
     shown = seen
     if isinstance(seen, Voxels):
         shown = _scan(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
@@ -126,22 +121,22 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
 
 
 def _scan(cloud: Cloud, p: CloudParameters) -> Surface:
-    """The range image of a cloud; where it sees all around, with points spread over it."""
+    """Return the range image of a cloud; if it sees all around, with points spread over it."""
     shown = range_image(cloud, p)
     if not (isinstance(shown.camera, Sphere) and shown.camera.sees_around):
         return shown
     points = spread_points(cloud, shown, p)
-    # far surface is seen thinly, so that cubes are far narrower than if points lay evenly
+    # distant surfaces have few points, so cubes must be narrower than for even points
     even = math.sqrt(float(points.areas.sum(dtype=float)) / SPREAD_POINTS)
     return replace(shown, spread=thin_points(points, SPREAD_POINTS, even / 12))
 
 
 def distance(a: Signature, b: Signature) -> int:
-    """Distance of two stored signatures in their model's metric: -s(X, Y) of Sec. III-C.
+    """Return the distance of two stored signatures in their model's metric: -s(X, Y) of Sec. III-C.
 
     Raises
     ------
-    ModelMismatch : they are of two models.
+    ModelMismatch : the signatures are of two models
     """
     _same_model(a, b)
     return int(distances(a.vector, b.vector[None], a.metric)[0])
@@ -150,25 +145,24 @@ def distance(a: Signature, b: Signature) -> int:
 def retrieve(
     query: Signature, database: Sequence[Signature], model: Model, size: int | None = None
 ) -> Ranking:
-    """R: the database frames most similar to the query, Sec. III-C.
+    """Return R, the database frames most similar to the query: Sec. III-C.
 
     Parameters
     ----------
     database : N signatures
-    model : of all of them
-    size : how many; default: by the density of the map, see `ranking_size`
+    model : model of all signatures
+    size : size of R; default: by the size of the map, see `ranking_size`
 
     Raises
     ------
-    ModelMismatch : signatures of several models, or of another than `model`.
+    ModelMismatch : the signatures are of several models, or not of `model`
     """
     _same_model(query, model)
-    for one in database:
-        _same_model(query, one)
+    for signature in database:
+        _same_model(query, signature)
     size = ranking_size(len(database)) if size is None else size
-    stored = _stacked(database) if len(database) else np.empty((0, len(query.vector)), np.uint8)
-    found = distances(query.vector, stored, model.metric)
-    return rank(found, size, model.unrelated_distance)
+    stored = _stack(database) if len(database) else np.empty((0, len(query.vector)), np.uint8)
+    return rank(distances(query.vector, stored, model.metric), size, model.unrelated_distance)
 
 
 def diversify(
@@ -177,14 +171,13 @@ def diversify(
     k: int = 10,
     p: DiversityParameters | None = None,
 ) -> Selection:
-    """C: `k` of R that are near the query and unlike each other, Sec. III-D.
+    """Return C, `k` of R that are near the query and differ from each other: Sec. III-D.
 
     Parameters
     ----------
     ranking : R
-    database : that R is of
-    k : how many to select
-    p : see DiversityParameters
+    database : database of R
+    k : size of C
 
     Returns
     -------
@@ -192,7 +185,7 @@ def diversify(
     """
     ranked = [database[i] for i in ranking.indices]
     metric: Metric = ranked[0].metric if ranked else "l2"
-    among = pairwise_distances(_stacked(ranked), metric)
+    among = pairwise_distances(_stack(ranked), metric)
     return select(ranking.distances, among, k, p)
 
 
@@ -207,25 +200,25 @@ def validate(
     ups: Ups = NO_UPS,
     other_axes: bool = False,
 ) -> PairValidation:
-    """Whether two frames see one place, and the transform between them: Sec. III-E.
+    """Decide whether two frames see one place, and estimate their transform: Sec. III-E.
 
     Parameters
     ----------
     query, match : geometry artifacts of one model
-    seed : of the random choices; the answer echoes it
-    p : default: those of the model that made them, `model.parameters.validation`
+    seed : seed of the random choices; the result repeats it
+    p : default: `model.parameters.validation` of the artifacts' model
     mode : "full", or "paper" for the paper's test alone
-    matching : "histograms", or "sequence" for correspondences as the paper finds them: slower
-    ups : (3,) unit vectors, up in the query's and in the match's coordinates where they are known
-    other_axes : whether the scanners may have stood otherwise than upright; of scans
+    matching : "histograms", or "sequence" for the paper's matching, which is slower
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates if known
+    other_axes : whether scanners may not have stood upright
 
     Raises
     ------
-    ModelMismatch : the artifacts are of two models; or of one that this process has not used,
-        and `p` was not given.
+    ModelMismatch : the artifacts are of two models, or of a model that this process has not used
+        and `p` is missing
     """
     _same_model(query, match)
-    p = p or _numbers_of(query)
+    p = p or _validation_parameters(query)
     return validate_geometry(query, match, seed, p, mode, matching, ups=ups, other_axes=other_axes)
 
 
@@ -239,63 +232,62 @@ def validate_guided(
 
     Raises
     ------
-    ModelMismatch : see `validate`.
+    ModelMismatch : see `validate`
     """
     _same_model(query, match)
-    return check_predicted(query, match, T_match_query, seed, p or _numbers_of(query), ups)
+    return check_predicted(
+        query, match, T_match_query, seed, p or _validation_parameters(query), ups
+    )
 
 
 def validate_without_up(
     query: Geometry, match: Geometry, seed: int, p: ValidationParameters | None, ups: Ups
 ) -> PairValidation | None:
-    """Ask the surfaces alone, of a query that found nothing with `up`: Sec. III-E.
+    """Validate by the surfaces alone, if a query found nothing with `up`: Sec. III-E.
 
     See `sceneprint.geometry.validation.validation.validate_without_up`.
 
     Raises
     ------
-    ModelMismatch : see `validate`.
+    ModelMismatch : see `validate`
     """
     _same_model(query, match)
-    return check_up(query, match, seed, p or _numbers_of(query), ups)
+    return check_up(query, match, seed, p or _validation_parameters(query), ups)
 
 
-#: Of models that this process has used, by id: an artifact names its model, and holds no more.
-_NUMBERS: dict[str, tuple[ValidationParameters, AnswerParameters]] = {}
+#: Parameters of the models that this process has used, by id: an artifact stores only the id.
+_PARAMETERS: dict[str, tuple[ValidationParameters, AnswerParameters]] = {}
 
 
-def _numbers_of(geometry: Geometry) -> ValidationParameters:
-    """Return what the model of an artifact validates with: rooms and halls differ."""
+def _validation_parameters(geometry: Geometry) -> ValidationParameters:
+    """Return the validation parameters of an artifact's model."""
     _learn_presets(geometry.model_id)
-    if geometry.model_id not in _NUMBERS:
+    if geometry.model_id not in _PARAMETERS:
         raise ModelMismatch(
             f"The artifacts are of model {geometry.model_id[:12]}, which ships with no preset and "
-            "has not been used by this process. Give `p`, its `model.parameters.validation`."
+            "has not been used by this process. Pass `p`, its `model.parameters.validation`."
         )
-    return _NUMBERS[geometry.model_id][0]
+    return _PARAMETERS[geometry.model_id][0]
 
 
-def answer_numbers(geometry: Geometry) -> AnswerParameters:
-    """Return what the model of an artifact judges poses with.
-
-    Those of the default preset, where this process has not used the model.
-    """
+def answer_parameters(geometry: Geometry) -> AnswerParameters:
+    """Return the answer parameters of an artifact's model; defaults if it was not used here."""
     _learn_presets(geometry.model_id)
-    known = _NUMBERS.get(geometry.model_id)
-    return AnswerParameters() if known is None else known[1]
+    parameters = _PARAMETERS.get(geometry.model_id)
+    return AnswerParameters() if parameters is None else parameters[1]
 
 
 def _learn_presets(model_id: str) -> None:
-    """Note the numbers of the presets, unless those of a model are known."""
-    if model_id not in _NUMBERS:
+    """Store the parameters of the presets, unless those of the model are known."""
+    if model_id not in _PARAMETERS:
         for model in map(read_model, PRESETS):
-            _NUMBERS[model.id] = model.parameters.validation, model.answer
+            _PARAMETERS[model.id] = model.parameters.validation, model.answer
 
 
-def _stacked(signatures: Sequence[Signature]) -> Bytes:
+def _stack(signatures: Sequence[Signature]) -> Bytes:
     if not len(signatures):
         return np.empty((0, 0), np.uint8)
-    return np.stack([one.vector for one in signatures])
+    return np.stack([signature.vector for signature in signatures])
 
 
 def _same_model(a: Signature | Geometry, b: Signature | Geometry | Model) -> None:
@@ -307,12 +299,10 @@ def _same_model(a: Signature | Geometry, b: Signature | Geometry | Model) -> Non
         )
 
 
-# What is made of a ranking's candidates: matches in the order to believe them.
-
-#: Accepted matches that the pose of a query rests on: confidences are learnt with as many.
+#: Default number of accepted matches per query; confidences are learnt with it.
 VERDICT_MATCHES = 5
 
-#: Gives the parent frame and T_parent_sensor (4, 4) of a row of the database, if it has a pose.
+#: Returns the parent frame and T_parent_sensor (4, 4) of a row of the database, or None.
 PoseOf = Callable[[int], tuple[str, Floats] | None]
 
 
@@ -323,7 +313,7 @@ class PairMatch:
     Parameters
     ----------
     index : row of the database
-    distance, similarity : of the signatures
+    distance, similarity : distance and similarity of the signatures
     """
 
     index: int
@@ -350,42 +340,41 @@ def associate(
     known: Mapping[int, PairValidation] | None = None,
     retry: bool = True,
 ) -> list[PairMatch]:
-    """Candidates validated in the order of R until `k` are accepted: Sec. III-E.
+    """Validate candidates in the order of R until `k` are accepted: Sec. III-E.
 
-    Where two strong matches from different viewpoints agree on the query's pose, the transforms of
-    later candidates follow from the map's poses: these are refined and checked, and searched for
-    only where the check fails.
+    Once two strong matches from different viewpoints agree on the query's pose, the map's poses
+    predict the transforms of later candidates: these are refined and checked, and searched only if
+    the check fails.
 
     Parameters
     ----------
     query : geometry artifact
     ranking : R
-    among : positions in R to try, rising: C, or the first of R
-    open_geometry : artifact of a row of the database; a row without one is passed over
-    k : accepted ones after which to stop, at least 1
-    seed, p, mode, matching : see `validate`, by default with the numbers of the model
-    go_on : asked before each; where it says no, the rest is left
-    up : (3,) unit vector in the query's sensor, where it is known
-    up_of : the same of a row of the database
-    pose_of : parent frame and T_parent_sensor (4, 4) of a row, None where it has no pose; default:
-        none has, and every transform is searched for
-    known : validations by row that are taken as they are
-    retry : whether the first few are tried in other ways where nothing is accepted
+    among : ascending positions in R to try: C, or the first of R
+    open_geometry : returns the artifact of a row; None skips the row
+    k : number of accepted matches after which to stop, at least 1
+    seed, p, mode, matching : arguments of `validate`
+    go_on : called before each candidate; False ends the search
+    up : (3,) unit vector in the query's sensor, or None
+    up_of : the same for a row of the database
+    pose_of : parent frame and T_parent_sensor (4, 4) of a row, or None; default: no row has a pose,
+        and every transform is searched
+    known : validations by row that are not repeated
+    retry : whether to retry the first few in other ways if nothing is accepted
 
     Returns
     -------
-    matches : all that were tried, of scans the first few once more for other axes where nothing
-        was accepted, and once more without `up` where that was known: C_vld first, strong before
-        weak, then by expected error (of scans all around, the nearest first); then those that were
-        not accepted, first those that fit but tilt against `up`
+    matches : all tried candidates: C_vld first (`rank_accepted`), then those that are not accepted,
+        first those that fit but tilt against `up`. If nothing is accepted, the first few are
+        validated again without `up`, and scans with other axes.
 
     Raises
     ------
-    ModelMismatch : artifacts of two models.
-    ValueError : k below 1.
+    ModelMismatch : the artifacts are of two models
+    ValueError : k is below 1
     """
     if k < 1:
-        raise ValueError(f"k = {k}: ask for 1 match or more")
+        raise ValueError(f"k = {k}: request 1 match or more")
     tried: list[PairMatch] = []
     accepted = 0
     for position in among:
@@ -399,19 +388,17 @@ def associate(
         ups = up, up_of(index)
         T = None
         if mode == "full" and validation is None:
-            T = _predicted(tried, index, pose_of, answer_numbers(query).map)
+            T = _predicted(tried, index, pose_of, answer_parameters(query).map)
         if T is not None:
             validation = validate_guided(query, geometry, T, seed, p, ups)
         if validation is None:
             validation = validate(query, geometry, seed, p, mode, matching, ups=ups)
         tried.append(
             PairMatch(
-                index,
-                int(ranking.distances[position]),
-                float(ranking.similarities[position]),
+                index, int(ranking.distances[position]), float(ranking.similarities[position]),
                 validation,
             )
-        )
+        )  # fmt: skip
         accepted += validation.status == "accepted"
         if accepted == k:
             break
@@ -426,37 +413,38 @@ def associate(
     return [tried[i] for i in [*first, *rest]]
 
 
-def searched(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
-    """Validations that were searched for, by row; None where nothing was guided."""
+def unguided_validations(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
+    """Return the validations that were searched, by row; None if no match was guided."""
     if not any(match.validation.guided for match in matches):
         return None
     return {m.index: m.validation for m in matches if not m.validation.guided}
 
 
-#: Strong matches from different viewpoints that must agree on a pose before others follow from it.
+#: Number of strong matches from different viewpoints that can guide others.
 _GUIDES = 2
 
 
 def _predicted(
     tried: Sequence[PairMatch], index: int, pose_of: PoseOf, p: MapParameters
 ) -> Floats | None:
-    """T_match_query of a candidate by its pose and the matches before; None where these leave it
-    open: too few are strong, or one of them, accepted or ambiguous, is for another pose.
+    """Return T_match_query of a candidate by its pose and the matches before.
+
+    None if too few of these are strong, or an accepted or ambiguous one supports another pose.
     """
     own = pose_of(index)
     if own is None:
         return None
     voting, strong, viewpoints = [], [], []
     for match in tried:
-        v, known = match.validation, pose_of(match.index)
-        if v.guided or v.T_match_query is None or known is None or known[0] != own[0]:
+        v, posed = match.validation, pose_of(match.index)
+        if v.guided or v.T_match_query is None or posed is None or posed[0] != own[0]:
             continue
-        T = known[1] @ v.T_match_query
+        T = posed[1] @ v.T_match_query
         if v.status != "rejected":
             voting.append(T)
         if v.strength == "strong":
             strong.append(T)
-            viewpoints.append(known[1])
+            viewpoints.append(posed[1])
     if len(strong) < _GUIDES:
         return None
     different = distinct_viewpoints(np.stack(viewpoints), p)
@@ -468,7 +456,7 @@ def _predicted(
     return inverse(own[1]) @ T_parent_query
 
 
-#: Candidates that are tried again for a scanner that did not stand upright, or for a wrong `up`.
+#: Number of candidates that are retried for a scanner that did not stand upright, or a wrong `up`.
 _TILTED_TRIES = 3
 
 
@@ -476,9 +464,9 @@ def _retry_tilted(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Validate the first candidates as scans of a scanner on its side or upside down.
+    """Validate the first candidates as scans of a scanner on its side or upside down, in place.
 
-    What is accepted now replaces what was tried before, in place.
+    Only accepted results replace earlier ones.
     """
     for place, before in enumerate(tried[:_TILTED_TRIES]):
         geometry = open_geometry(before.index)
@@ -499,12 +487,12 @@ def _retry_without_up(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Ask the surfaces of the first candidates alone whether `up` may be wrong, in place."""
+    """Validate the first candidates by surfaces alone, because `up` may be wrong, in place."""
     for place, before in enumerate(tried[:_TILTED_TRIES]):
         geometry, ups = open_geometry(before.index), before.validation.ups
         if geometry is None or not go_on():
             return
-        if not _both_known(ups) and not are_scans(query, geometry):  # it took no part
+        if not _both_known(ups) and not are_scans(query, geometry):  # `up` had no effect
             continue
         validation = validate_without_up(query, geometry, seed, p, ups)
         if validation is not None:

@@ -1,9 +1,9 @@
-"""The places where a query may have been taken, and what speaks for and against each.
+"""Judge the places where a query may have been taken by matches, map and prior.
 
-matches, poses, MapViews  --judged_places-->  Place, ...
+matches, poses, MapViews  --judge_places-->  Place, ...
 
 Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
-judged on the frames of the map that would see the same surfaces.
+compared on the frames of the map that would see the same surfaces.
 """
 
 from __future__ import annotations
@@ -32,31 +32,31 @@ from sceneprint.geometry.validation.map_verification import (
 )
 from sceneprint.geometry.validation.validation import rank_accepted
 from sceneprint.models.model import AnswerParameters
-from sceneprint.pipeline import PairMatch, answer_numbers
+from sceneprint.pipeline import PairMatch, answer_parameters
 from sceneprint.types import Floats, Geometry
 
 
 @dataclass(frozen=True)
 class LocalizationParameters:
-    """The numbers of the answer; docs/trust.md says how they were chosen."""
+    """Parameters of the answer; docs/trust.md describes how they were tuned."""
 
-    confidence: float = 0.99  #: least of a pose that is found
-    worth: float = 0.05  #: least confidence of an alternative that is worth a look
-    views: int = 5  #: votes that are averaged, and alternatives, at most
+    confidence: float = 0.99  #: least confidence of a pose that is found
+    worth: float = 0.05  #: least confidence of an alternative
+    views: int = 5  #: maximum number of averaged votes, and of alternatives
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
-    outweigh: float = 2.0  #: times as much weight as any other place, where no map is asked
+    outweigh: float = 2.0  #: least ratio of the weights of the best two places, without a map
     voted_only: bool = False  #: whether a pose needs the vote of a match
-    prior_odds: float = 20.0  #: times those of a pose that a prior expects, by its evidence
-    prior_share: float = 0.9  #: least score of a pose that a prior decides for, beside the best
-    most_noise: float = 0.2  #: violations of the map's own that are believed
-    rivals: int = 2  #: frames elsewhere that are compared before a pose is found, at most
-    rival_distance: float = 1.2  #: times that of the farthest match for the pose, at most
+    prior_odds: float = 20.0  #: factor of the odds of a pose that a prior expects
+    prior_share: float = 0.9  #: least score of a pose that a prior selects, as a share of the best
+    most_noise: float = 0.2  #: greatest noise of the map that excuses violations
+    rivals: int = 2  #: maximum number of frames elsewhere to compare before a pose is found
+    rival_distance: float = 1.2  #: their greatest distance, as a multiple of the farthest vote's
     map: MapParameters = field(default_factory=MapParameters)
     judgement: ConfidenceModel = field(default_factory=ConfidenceModel)
 
     @classmethod
     def of(cls, answer: AnswerParameters) -> LocalizationParameters:
-        """Return those of a model."""
+        """Return the parameters of a model."""
         return cls(map=answer.map, judgement=answer.confidence)
 
 
@@ -67,8 +67,8 @@ class QueryFrame:
     Parameters
     ----------
     geometry : artifact of the frame
-    matches : of `associate`, accepted or not
-    T : (4, 4) T_query_sensor, by odometry; the identity for the frame that is to be placed
+    matches : results of `associate`, accepted or not
+    T : (4, 4) T_query_sensor, by odometry; the identity for the frame to localize
     """
 
     geometry: Geometry
@@ -78,11 +78,11 @@ class QueryFrame:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The pose that a robot believes to have before the query.
+    """The pose that a robot expects before the query.
 
     Parameters
     ----------
-    parent : frame in which it is given
+    parent : parent frame of the pose
     T : (4, 4) T_parent_query
     covariance : (6, 6) of errors (x, y, z, rx, ry, rz) in the parent's axes: metres, radians
     """
@@ -92,21 +92,21 @@ class PosePrior:
     covariance: Floats
 
     def reaches(self, pose: Floats, p: MapParameters) -> bool:
-        """Return whether a frame at T_parent_sensor (4, 4) may see what the robot sees.
+        """Return whether a frame at T_parent_sensor (4, 4) may see the robot's surroundings.
 
-        They stand at most `p.same_surfaces` apart, and three deviations of the prior.
+        They are within `p.same_surfaces` plus three deviations of the prior.
         """
         deviation = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
         apart = float(np.linalg.norm(pose[:3, 3] - self.T[:3, 3]))
         return apart <= p.same_surfaces + 3 * deviation
 
     def expects(self, T: Floats) -> bool:
-        """Return whether a pose T_parent_query (4, 4) lies where it has 99.9 % of its mass."""
-        off = pose_error(self.T, T)
-        return float(off @ np.linalg.solve(self.covariance, off)) <= _CHI_SQUARE_6
+        """Return whether a pose T_parent_query (4, 4) lies within 99.9 % of its mass."""
+        error = pose_error(self.T, T)
+        return float(error @ np.linalg.solve(self.covariance, error)) <= _CHI_SQUARE_6
 
 
-#: 99.9 % of a chi-square of six degrees of freedom.
+#: 99.9 % quantile of the chi-square distribution with six degrees of freedom.
 _CHI_SQUARE_6 = 22.458
 
 
@@ -132,10 +132,10 @@ class Place:
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    votes : of matches, those to believe most first
-    support : different viewpoints of the matches that vote
-    weight : of these votes, 1 for a strong match, less for a weak or an ambiguous one
-    evidence : for its pose; None where the map was not asked
+    votes : votes of matches, most reliable first
+    support : number of viewpoints of the voting matches
+    weight : weight of these votes, 1 for a strong match, less for a weak or an ambiguous one
+    evidence : evidence for its pose; None without a map
     """
 
     T: Floats
@@ -146,32 +146,32 @@ class Place:
 
     @property
     def accepted(self) -> list[_Vote]:
-        """The votes of accepted matches."""
+        """Return the votes of accepted matches."""
         return [vote for vote in self.votes if vote.accepted]
 
     @property
     def strong(self) -> bool:
-        """Whether a strong match votes for it."""
+        """Return whether a strong match votes for it."""
         return any(vote.match.validation.strength == "strong" for vote in self.votes)
 
     @property
     def score(self) -> float:
-        """How well the map bears it out."""
+        """Return its score on the map, 0 without a map."""
         return 0.0 if self.evidence is None else self.evidence.score
 
 
-#: Gives the frames of a parent frame that may see what a query at poses (n, 4, 4) sees.
+#: Returns the frames of a parent frame that may see the surroundings of poses (n, 4, 4).
 ViewsOf = Callable[[str, Floats], MapViews]
 
 _NONE = np.empty((0, 4, 4))
 
 
-def parameters_of(frames: Sequence[QueryFrame]) -> LocalizationParameters:
-    """Return the numbers of the model that made the artifacts of a query; see `answer_numbers`."""
-    return LocalizationParameters.of(answer_numbers(frames[0].geometry))
+def model_parameters(frames: Sequence[QueryFrame]) -> LocalizationParameters:
+    """Return the parameters of the query's model; see `answer_parameters`."""
+    return LocalizationParameters.of(answer_parameters(frames[0].geometry))
 
 
-def judged_places(
+def judge_places(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
     parents: Sequence[str] | Mapping[int, str] | None, views_of: ViewsOf | None,
     prior: PosePrior | None, p: LocalizationParameters, overlap_p: OverlapParameters,
@@ -180,18 +180,18 @@ def judged_places(
 
     Parameters
     ----------
-    frames, poses, parents, views_of, prior, p, overlap_p : see `localize`
+    frames, poses, parents, views_of, prior, p, overlap_p : arguments of `localize`
 
     Returns
     -------
-    parent : frame in which poses are compared
-    prior : the parameter, or None where it is of another parent frame
-    places : those with votes first, then by score
+    parent : parent frame in which poses are compared
+    prior : the argument, or None if it is of another parent frame
+    places : places with votes first, then by score
     """
     parent = _parent(frames, parents)
     if prior is not None and prior.parent != parent:
         if _accepts(frames, parents, parent) and not _accepts(frames, parents, prior.parent):
-            prior = None  # what it says of one parent frame tells nothing of another
+            prior = None  # it has no meaning in another parent frame
         else:
             parent = prior.parent
     own = [
@@ -200,11 +200,11 @@ def judged_places(
         ])
         for frame in frames
     ]  # fmt: skip
-    suggested = _suggested(own, poses)
+    suggested = _suggest_poses(own, poses)
     votes = _votes(own, poses, p)
     if views_of is None or (not len(suggested.T) and prior is None):
-        return parent, prior, [_place(group, None, p) for group in _grouped(votes, [], p)]
-    ready = [map_frame(one.geometry, one.T, p.map, overlap_p) for one in frames]
+        return parent, prior, [_place(group, None, p) for group in _group_votes(votes, [], p)]
+    ready = [map_frame(frame.geometry, frame.T, p.map, overlap_p) for frame in frames]
     starts = _NONE if prior is None else prior_starts(prior.T, prior.covariance, p.map)
     views = views_of(parent, np.concatenate([starts[:1], suggested.T]))
     near = refine_starts(ready, starts, views, p.map, overlap_p)
@@ -213,7 +213,7 @@ def judged_places(
 
 
 def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None) -> str:
-    """Return the parent frame with most strong matches; ties go to most accepted, then to most."""
+    """Return the parent frame with most strong matches, then most accepted, then most tried."""
     counts: dict[str, tuple[int, int, int]] = {}
     for frame in frames:
         for match in frame.matches:
@@ -223,14 +223,14 @@ def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, 
             counts[name] = (
                 strong + (v.strength == "strong"), accepted + (v.status == "accepted"), tried + 1
             )  # fmt: skip
-    # the first of equals: dicts keep the order in which parents came
+    # the first of equals, by the order of insertion
     return max(counts, key=counts.__getitem__, default="")
 
 
 def _accepts(
     frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None, parent: str
 ) -> bool:
-    """Return whether a match of a parent frame is accepted."""
+    """Return whether a match in a parent frame is accepted."""
     return any(
         match.validation.status == "accepted"
         and ("" if parents is None else parents[match.index]) == parent
@@ -241,13 +241,13 @@ def _accepts(
 
 @dataclass(frozen=True, eq=False)
 class _Suggestions:
-    """Every pose that a candidate suggests: of each candidate the best first, then the next best.
+    """Poses that candidates suggest: the best of each candidate first, then the next best.
 
     Parameters
     ----------
     T : (n, 4, 4) T_parent_query
-    viewpoints : (n, 4, 4) T_parent_sensor of each one's candidate
-    similarities : (n,) of the signatures of the candidate and the query
+    viewpoints : (n, 4, 4) T_parent_sensor of the candidate
+    similarities : (n,) similarities of the candidate's and the query's signatures
     """
 
     T: Floats
@@ -255,7 +255,7 @@ class _Suggestions:
     similarities: Floats
 
 
-def _suggested(
+def _suggest_poses(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats]
 ) -> _Suggestions:
     """Return the poses that candidates suggest."""
@@ -305,23 +305,20 @@ def _votes(
     return votes
 
 
-def _grouped(
+def _group_votes(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
 ) -> list[list[_Vote]]:
-    """Group votes by place: of the scored poses, in their order, then by themselves."""
+    """Group votes by place: those of the scored poses, in their order, then their own."""
     groups: list[list[_Vote]] = [[] for _ in scored]
     others: list[list[_Vote]] = []
     for vote in votes:
-        at = next((k for k, one in enumerate(scored) if one.is_of(vote.T, p.map)), None)
-        if at is not None:
-            groups[at].append(vote)
-            continue
-        for group in others:
-            if same_place(group[0].T, vote.T, p.map):
-                group.append(vote)
-                break
-        else:
-            others.append([vote])
+        group = next(
+            (own for own, pose in zip(groups, scored, strict=True) if pose.is_of(vote.T, p.map)),
+            next((own for own in others if same_place(own[0].T, vote.T, p.map)), None),
+        )
+        if group is None:
+            others.append(group := [])
+        group.append(vote)
     return groups + others
 
 
@@ -329,10 +326,10 @@ def _places(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: _Suggestions,
     views: MapViews, p: LocalizationParameters,
 ) -> list[Place]:  # fmt: skip
-    """Return the places of votes and scored poses, with the evidence for each."""
-    groups = _grouped(votes, scored, p)
+    """Return the places of votes and scored poses, with their evidence."""
+    groups = _group_votes(votes, scored, p)
     weights = [_weight(group, p)[1] for group in groups]
-    scores = [one.score for one in scored]
+    scores = [pose.score for pose in scored]
     places = []
     for k, group in enumerate(groups):
         pose = scored[k] if k < len(scored) else None
@@ -357,9 +354,9 @@ def _place(
 
 
 def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
-    """Return how many viewpoints vote, and the weight of their first votes.
+    """Return the number of voting viewpoints, and the weight of their first votes.
 
-    Neither a copy of a view nor a guided match is a vote of its own.
+    Neither a copy of a view nor a guided match counts as a vote.
     """
     voting = [vote for vote in group if not vote.match.validation.guided]
     viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
@@ -371,15 +368,15 @@ def _evidence(
     group: Sequence[_Vote], pose: ScoredPose | None, suggested: _Suggestions,
     views: MapViews, rival: float, rival_weight: float, p: LocalizationParameters,
 ) -> PlaceEvidence:  # fmt: skip
-    """Return the evidence for a place: of its votes and of its pose on the map.
+    """Return the evidence for a place, from its votes and its pose on the map.
 
     Parameters
     ----------
-    group : votes
-    pose : None where none at the place was scored
-    suggested : see `_suggested`
+    group : votes for the place
+    pose : scored pose; None if there is none
+    suggested : result of `_suggest_poses`
     views : the map's frames
-    rival, rival_weight : best score, and largest weight, of another place
+    rival, rival_weight : best score, and greatest weight, of another place
     """
     weight = _weight(group, p)[1]
     strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]

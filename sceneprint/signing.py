@@ -1,4 +1,4 @@
-"""Sec. III-A and III-B put together: a frame to its signature, and what of it others use.
+"""Compute the signature of a frame (Sec. III-A and III-B).
 
 Frame  --describe-->  Hierarchy  --encode-->  Signature
 """
@@ -55,11 +55,11 @@ class Signature:
 
     Parameters
     ----------
-    vector : (d,) uint8, whitened; or (25 G H,), psi itself, of a model without a whitening
-    model_id : of the model that made it; signatures of two models are never compared
-    n_patches : patches of each level that it is made of, finest first
-    n_pairs : ordered pairs of each of these levels
-    metric : by which vectors of that model are compared
+    vector : (d,) uint8, whitened; or (25 G H,), psi itself, for a model without a whitening
+    model_id : id of its model; signatures of two models are never compared
+    n_patches : number of patches of each level in it, finest first
+    n_pairs : number of ordered pairs of each of these levels
+    metric : metric of the model's vectors
     """
 
     vector: Bytes
@@ -71,13 +71,7 @@ class Signature:
 
 @dataclass(frozen=True, eq=False)
 class Signer:
-    """A model made ready to sign: with its pair table opened.
-
-    Parameters
-    ----------
-    model : see Model
-    table : of this model
-    """
+    """A model with its pair table, ready to sign."""
 
     model: Model
     table: PairTable
@@ -92,18 +86,18 @@ def open_signer(
 ) -> Signer:
     """Open a preset, a model file or a model, and its pair table.
 
-    The first call on a machine builds the table (seconds) and caches it; later ones map it.
+    The first call on a machine builds the table (seconds) and caches it; later calls map it.
 
     Parameters
     ----------
     model : "depth", "lidar", "paper", the path of a model file, or a model
     cache_dir : folder of derived files; default: the user's cache folder
-    progress : called with bins done and their total while the table is being built
-    cached : False for a model that will not be seen again: nothing is read or written
+    progress : receives finished bins and their total while the table is built
+    cached : whether to use the cache; False for a model that is used once
 
     Raises
     ------
-    UnreadableModel : see `read_model`.
+    UnreadableModel : see `read_model`
     """
     read = model if isinstance(model, Model) else read_model(model)
     if not cached:
@@ -112,19 +106,15 @@ def open_signer(
 
 
 def see(frame: AnyFrame, p: ModelParameters) -> Surface:
-    """Points and normals of what a frame shows: the input of Sec. III.
-
-    Parameters
-    ----------
-    frame : depth, or a cloud, in metres
+    """Return points and normals of a frame's surface: the input of Sec. III.
 
     Returns
     -------
-    surface : an ordered map of a depth image; the Voxels of a cloud
+    surface : an ordered map for a depth image; Voxels for a cloud
 
     Raises
     ------
-    UselessFrame : nothing within the sensor's range.
+    UselessFrame : no samples lie within the sensor's range
     """
     if isinstance(frame, Cloud):
         return voxels(frame, p.cloud)
@@ -133,21 +123,21 @@ def see(frame: AnyFrame, p: ModelParameters) -> Surface:
 
 
 def describe(frame: AnyFrame, p: ModelParameters) -> Hierarchy:
-    """The segmentation hierarchy of a frame; see `see` and `hierarchy_of`."""
+    """Return the segmentation hierarchy of a frame; see `see` and `hierarchy_of`."""
     return hierarchy_of(see(frame, p), p, frame.name)
 
 
 def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy:
-    """The segmentation hierarchy of a surface: Sec. III-F.
+    """Return the segmentation hierarchy of a surface: Sec. III-F.
 
     Parameters
     ----------
-    seen : of `see`
-    name : of the frame, for errors
+    seen : result of `see`
+    name : name of the frame, for errors
 
     Raises
     ------
-    UselessFrame : the samples lie on no surface.
+    UselessFrame : the samples lie on no surface
     """
     if isinstance(seen, Voxels):
         finest = supervoxels(seen, p.cloud.seed_px, p.cloud.maximum_patches, p.segmentation)
@@ -164,12 +154,12 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
 
 
 def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
-    """The patches of one size that correspondences are sought among: Sec. III-E.
+    """Return the patches of one size for correspondences: Sec. III-E.
 
     Parameters
     ----------
-    seen : of `see`
-    p : of the model
+    seen : result of `see`
+    p : parameters of the model
     """
     if isinstance(seen, Voxels):
         spacing, most = p.cloud.validation_seed_px, p.cloud.maximum_validation_patches
@@ -178,17 +168,17 @@ def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
 
 
 def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
-    """Stored signature of a hierarchy of patches: Sec. III-A and III-B.
+    """Return the stored signature of a hierarchy of patches: Sec. III-A and III-B.
 
     Parameters
     ----------
-    patches : all levels that the model's signature is made of
+    patches : hierarchy with all levels of the model's signature
     signer : see `open_signer`
-    name : of the frame, for errors
+    name : name of the frame, for errors
 
     Raises
     ------
-    UselessFrame : the finest of these levels has no pair of patches within reach.
+    UselessFrame : the finest of these levels has no pair of patches within reach
     """
     model, whitening = signer.model, signer.model.whitening
     used = [patches.levels[level] for level in model.levels]
@@ -204,7 +194,7 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
 
 
 def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
-    """Pair statistics of one level through the 4-D table."""
+    """Return the pair statistics of one level through the 4-D table."""
     p = signer.model.parameters
     weights = patch_weights(level, p.weights)
     counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
@@ -212,7 +202,7 @@ def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
 
 
 def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
-    """Pair statistics of one level, pair by pair: slow, the oracle of the table."""
+    """Return the pair statistics of one level, pair by pair: slow, the oracle of the table."""
     p = model.parameters.properties
     pairs = neighbour_pairs(level, p)
     weights = patch_weights(level, model.parameters.weights)[pairs].prod(axis=1)
@@ -221,18 +211,18 @@ def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
 
 
 def float_signature(levels: list[LevelStatistics], model: Model, name: str = "") -> Floats:
-    """psi before quantisation: Eq. (2) of each level, rooted, normalised, end to end.
+    """Return psi before quantisation: Eq. (2) of each level, rooted, normalised, end to end.
 
-    A coarse level without pairs says nothing, and its part of psi is zero.
+    The part of a coarse level without pairs is zero.
 
     Parameters
     ----------
     levels : one or more, finest first
-    name : of the frame, for errors
+    name : name of the frame, for errors
 
     Raises
     ------
-    UselessFrame : the finest level has no pairs.
+    UselessFrame : the finest level has no pairs
     """
     if levels[0].n_pairs == 0:
         radius = model.parameters.properties.radius

@@ -1,7 +1,7 @@
-"""The records that travel between the parts: frames, and what is made of them.
+"""Define the records that modules exchange: frames, and the results of their processing.
 
-Inside sceneprint lengths are metres, angles radians, times seconds; any other unit is
-in the name. Camera frames are optical: x right, y down, z forward.
+Lengths are metres, angles radians, times seconds; other units are in the name. Camera frames are
+optical: x right, y down, z forward. Clouds keep their sensor's axes.
 """
 
 from __future__ import annotations
@@ -34,9 +34,6 @@ __all__ = [
     "Sphere",
     "Surface",
 ]
-# How a sensor looks: pixels to directions.
-#
-# Camera frames are optical: x right, y down, z forward. Clouds keep their sensor's axes.
 
 
 @dataclass(frozen=True)
@@ -45,19 +42,19 @@ class Sphere:
 
     With (a, b, c) the sensor's axes in cyclic order such that c is the pole, a direction has
     azimuth = atan2(b, a) and elevation = asin(c); column = (azimuth - left) / step, where azimuth
-    counts on from that of column 0, and row = (top - elevation) / step. Centres at integers.
+    counts from that of column 0, and row = (top - elevation) / step. Pixel centres are at integers.
 
     Parameters
     ----------
     width, height : size of the image, pixels
-    step : from pixel to pixel either way, radians
+    step : angle between pixels either way, radians
     left : azimuth of column 0, radians
     top : elevation of row 0, radians
-    pole : 0, 1 or 2: the axis that elevation is measured towards
+    pole : 0, 1 or 2: the axis of elevation
 
     Raises
     ------
-    InvalidIntrinsics : no image, one of too many pixels, or one that covers more than a sphere.
+    InvalidIntrinsics : the image is empty, has too many pixels, or covers more than a sphere
     """
 
     width: int
@@ -76,7 +73,7 @@ class Sphere:
                 f"A range image of {self.width} x {self.height} exceeds the limit of "
                 f"{MAXIMUM_SAMPLES} samples. Sign the cloud with a coarser model."
             )
-        # half a pixel more than a turn, or than half of one, is rounding
+        # half a pixel more than the sphere is rounding
         if not (0 < (self.width - 1) * self.step < 2 * math.pi) or not (
             0 <= (self.height - 1) * self.step <= math.pi + self.step
         ):
@@ -84,16 +81,16 @@ class Sphere:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the last column is a neighbour of the first."""
+        """Return whether the last column adjoins the first."""
         return self.width * self.step > 2 * math.pi - self.step / 2
 
     @property
     def sees_around(self) -> bool:
-        """Whether three quarters of a turn or more are seen, whichever way the sensor is turned."""
+        """Return whether the image covers at least three quarters of a turn."""
         return self.width * self.step > 1.5 * math.pi
 
 
-#: Either kind of looking.
+#: Camera of a surface.
 Camera = Intrinsics | Sphere
 
 
@@ -110,10 +107,10 @@ class DepthFrame:
 
     Parameters
     ----------
-    depth : (H, W) float32, metres along the optical axis (z); 0 where missing
+    depth : (H, W) float32, metres along the optical axis (z); 0 if missing
     intrinsics : the camera, without distortion
-    name : what to call the frame in lines and errors
-    pose : (4, 4) T_parent_sensor, or None where unknown; never read by the geometry
+    name : name of the frame in messages
+    pose : (4, 4) T_parent_sensor, or None if unknown; ignored by the geometry
     """
 
     depth: Floats32
@@ -129,11 +126,11 @@ class Cloud:
     Parameters
     ----------
     points : (N, 3) float32, metres, in the sensor's axes, the viewpoint at the origin; all finite
-    has_viewpoint : False for points that were not seen from one place, as those fused of many
-        views: nothing is known of free space then
-    name : what to call the frame in lines and errors
-    pose : (4, 4) T_parent_sensor, or None where unknown; never read by the geometry
-    note : what was done to the points on the way, for people; empty where nothing was
+    has_viewpoint : False for points that were not seen from one place, such as fused ones: free
+        space is unknown then
+    name : name of the frame in messages
+    pose : (4, 4) T_parent_sensor, or None if unknown; ignored by the geometry
+    note : changes to the points before, for display; may be empty
     """
 
     points: Floats32
@@ -145,15 +142,15 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSurface:
-    """A surface that comes whole as a map: a point cloud, or a triangle mesh.
+    """A surface that was imported as a map: a point cloud, or a triangle mesh.
 
     Parameters
     ----------
     points : (N, 3) float32, metres, relative to `offset`; all finite
-    triangles : (M, 3) int32 indices into `points`, counterclockwise seen from the front; None for
-        a cloud
-    offset : (3,) float64, metres; points + offset are the coordinates of the file. Zero unless
-        the origin is more than a kilometre away
+    triangles : (M, 3) int32 indices into `points`, counterclockwise seen from the front; None for a
+        cloud
+    offset : (3,) float64, metres; points + offset are the coordinates of the file. Zero unless the
+        origin is more than a kilometre away
     up : (3,) float64, unit vector against gravity
     """
 
@@ -169,19 +166,19 @@ AnyFrame = DepthFrame | Cloud
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What the sensor saw, as an ordered map of points and normals.
+    """The observed surface, as an ordered map of points and normals.
 
-    Points that are in no order, as those of a cloud, are a map of one row without a camera.
+    Unordered points, as those of a cloud, are a map of one row without a camera.
 
     Parameters
     ----------
-    points : (h, w, 3) float32, metres, sensor frame; NaN-free, 0 where not valid
-    normals : (h, w, 3) float32, unit length, towards the sensor; 0 where not valid
+    points : (h, w, 3) float32, metres, sensor frame; NaN-free, 0 if not valid
+    normals : (h, w, 3) float32, unit length, towards the sensor; 0 if not valid
     valid : (h, w) bool
-    areas : (h, w) float32, square metres of surface seen by each pixel; 0 where not valid
-    camera : of this (reduced) map; None for points in no order
-    spread : of a scan, points in no order as well, spread evenly over what it shows: of
-        `range_image.spread_points`; else None
+    areas : (h, w) float32, square metres of surface per pixel; 0 if not valid
+    camera : camera of this (reduced) map; None for unordered points
+    spread : for a scan, unordered points spread evenly over its surface
+        (`range_image.spread_points`); else None
     """
 
     points: Floats32
@@ -193,7 +190,7 @@ class Surface:
 
     @property
     def fitted(self) -> Surface:
-        """What another frame is laid on finely: the points of a scan, else the map itself."""
+        """Return the target of fine alignment: the spread points of a scan, else the map itself."""
         return self if self.spread is None else self.spread
 
 
@@ -207,7 +204,7 @@ class Patches:
     normals : (P, 3) float64, unit length, towards the sensor: n of Eq. (1)
     areas : (P,) float64, square metres
     sizes : (P,) int32, pixels of the surface map
-    coherences : (P,) float64 in (0, 1], length of the mean of the pixels' normals; 1 where flat
+    coherences : (P,) float64 in (0, 1], length of the mean of the pixels' normals; 1 if flat
     """
 
     means: Floats
@@ -236,14 +233,14 @@ class Hierarchy:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What validation needs of a frame, and all it needs: the geometry artifact.
+    """The geometry artifact: everything that validation needs of a frame.
 
     Parameters
     ----------
     surface : (h, w) points and normals
     patches : P patches of one metric size, for correspondences
     descriptors : (P, d) uint8, macro-scale surroundings of each patch; compared by distance
-    model_id : of the model that made it; artifacts of two models are never compared
+    model_id : id of its model; artifacts of two models are never compared
     """
 
     surface: Surface
@@ -252,17 +249,17 @@ class Geometry:
     model_id: str
 
 
-#: Kinds of camera; of what saw points that are in no order nothing is known.
+#: Kinds of camera; unordered points have NOWHERE.
 PINHOLE, SPHERE, NOWHERE = 0, 1, 2
 
 
 def camera_of(camera: Camera | None, nearest: float) -> Floats:
-    """A camera as kernels take it: (7,), its kind, `nearest`, and five numbers of that kind.
+    """Return a camera as an array for kernels, (7,): its kind, `nearest`, and five numbers.
 
     Parameters
     ----------
-    camera : None for points in no order
-    nearest : points this near are not looked up, metres of depth
+    camera : None for unordered points
+    nearest : least depth of a point that is looked up, metres
     """
     if isinstance(camera, Intrinsics):
         return np.array([PINHOLE, nearest, camera.fx, camera.fy, camera.cx, camera.cy, 0.0])
@@ -275,5 +272,5 @@ def camera_of(camera: Camera | None, nearest: float) -> Floats:
 
 
 def kind_of(camera: Camera | None) -> int:
-    """The kind of a camera, as the first of `camera_of`."""
+    """Return the kind of a camera, the first number of `camera_of`."""
     return int(camera_of(camera, 0.0)[0])

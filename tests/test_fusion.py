@@ -11,7 +11,7 @@ from sceneprint.errors import InvalidRequest, UselessFrame
 from sceneprint.fusion import (
     FusionParameters,
     fuse,
-    within,
+    prepare_view,
 )
 from sceneprint.geometry.surface.coverage import (
     TriangleMesh,
@@ -101,12 +101,12 @@ def test_out_of_range_is_not_fused(around: list[DepthFrame]) -> None:
     with pytest.raises(UselessFrame, match=r"between 0\.3 and 1 m"):
         fuse(around[:1], FusionParameters(farthest_m=1.0))
     holes = replace(around[0], depth=np.where(np.eye(120, 160) > 0, np.nan, around[0].depth))
-    kept = within(holes, FusionParameters())
+    kept = prepare_view(holes, FusionParameters())
     assert (kept.depth[np.eye(120, 160) > 0] == 0).all()
 
 
 def test_a_thinned_view_keeps_its_rays(around: list[DepthFrame]) -> None:
-    thin = within(around[0], FusionParameters(most_samples=5000))
+    thin = prepare_view(around[0], FusionParameters(most_samples=5000))
     assert thin.depth.shape == (60, 80)
     for x, y in ((0, 0), (17, 40), (79, 59)):
         assert thin.depth[y, x] == around[0].depth[2 * y, 2 * x]

@@ -12,7 +12,7 @@ from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.geometry.validation.validation import ValidationParameters, validate_guided
 from sceneprint.localization import localize
-from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, searched
+from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, unguided_validations
 from sceneprint.places import QueryFrame
 from sceneprint.types import Floats, Geometry
 from sceneprint_lab.synth import SynthRoom
@@ -138,7 +138,7 @@ def test_guided_matches_can_be_searched_for_after_all(walk: Room) -> None:
     geometries, poses = walk
     rows = [1, 2, 3]
     matches = asked_of(walk, rows, dict(enumerate(poses)))
-    known = searched(matches)
+    known = unguided_validations(matches)
     assert known is not None
     assert sorted(known) == [1, 2]
     ranking = Ranking(np.array(rows, np.intp), np.zeros(3, np.int64), np.zeros(3))
@@ -149,7 +149,7 @@ def test_guided_matches_can_be_searched_for_after_all(walk: Room) -> None:
     assert by_row[1] is known[1]
     assert by_row[2] is known[2]
     assert by_row[3].search == "correspondences"
-    assert searched(again) is None
+    assert unguided_validations(again) is None
     alone = associate(geometries[0], ranking, range(3), geometries.__getitem__, 3)
     of_alone = {match.index: match.validation.T_match_query for match in alone}
     np.testing.assert_array_equal(by_row[3].T_match_query, of_alone[3])  # type: ignore[arg-type]

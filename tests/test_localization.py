@@ -34,8 +34,8 @@ from sceneprint.localization import (
     PosedFrame,
     PoseEstimate,
     localize,
+    mark_unconfirmed,
     rival_rows,
-    unconfirmed,
     views_of_rows,
 )
 from sceneprint.pipeline import PairMatch, Signer, associate, open_signer, prepare, retrieve
@@ -923,9 +923,9 @@ def test_what_was_not_compared_is_ambiguous(blank: Geometry) -> None:
     sure = by_pairs(blank, seen_at(4.0, [0, 1]))
     assert sure is not None
     assert sure.average is not None
-    told = unconfirmed(sure)
+    told = mark_unconfirmed(sure)
     assert (told.status, told.average, told.strength, told.members) == ("ambiguous", None, None, ())
     [pose] = told.alternatives
     np.testing.assert_allclose(pose.T, shifted(4.0), atol=1e-12)
     assert pose.support == 2
-    assert unconfirmed(told) is told
+    assert mark_unconfirmed(told) is told

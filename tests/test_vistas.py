@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sceneprint.pictures import depth_view, normals_view, onto, vista_of
+from sceneprint.pictures import depth_view, normals_view, project_labels, vista_of
 from sceneprint.types import Floats, Intrinsics, Sphere, Surface
 
 
@@ -96,4 +96,4 @@ def test_labels_of_points_lie_where_the_points_are() -> None:
     points = seen.points.reshape(-1, 3)
     order = np.random.default_rng(5).permutation(12)
     labels = np.arange(12, dtype=np.int32)[order]
-    assert np.array_equal(onto(vista, seen, points[order] * 1.01, labels), vista.pixels)
+    assert np.array_equal(project_labels(vista, seen, points[order] * 1.01, labels), vista.pixels)

@@ -42,7 +42,7 @@ from sceneprint.geometry.signature.segmentation import HierarchyParameters, patc
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
 from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.models import Model, ModelParameters, read_model
-from sceneprint.models.model import AnswerParameters, scaled
+from sceneprint.models.model import AnswerParameters, scale_lengths
 from sceneprint.signing import (
     Signer,
     float_signature,
@@ -129,7 +129,7 @@ def _lidar() -> ModelParameters:
     not grow with range, so nothing is weighted down for being far; what grows, linearly, is the
     distance from sample to sample.
     """
-    p = scaled(ModelParameters(), _FACTOR)
+    p = scale_lengths(ModelParameters(), _FACTOR)
     noise = _SCAN_NOISE
     cloud = replace(
         p.cloud,
@@ -181,7 +181,7 @@ def preset_answer(preset: str) -> AnswerParameters:
     confidence = read_model(preset).answer.confidence
     if preset != "lidar":
         return AnswerParameters(confidence=confidence)
-    lengths = scaled(MapParameters(), _FACTOR)
+    lengths = scale_lengths(MapParameters(), _FACTOR)
     refinement = replace(lengths.refinement, **_SCAN_NOISE)
     return AnswerParameters(replace(lengths, refinement=refinement), confidence)
 

@@ -47,7 +47,7 @@ def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = Fal
     compile_kernels(settings.cache_dir, ("signing",), _print)
     chosen = options.model or options.preset or ("paper" if psi else PRESETS[0])
     model = read_model(chosen)
-    signer = _open_signer(model.of_psi if psi else model, str(chosen), settings)
+    signer = _open_signer(model.without_whitening if psi else model, str(chosen), settings)
     with suppress(FrameError):  # a model of another range may see nothing there
         sign(_wall(), signer)  # so that the first frame's time is that of signing, not of loading
     return signer

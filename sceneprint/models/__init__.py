@@ -1,4 +1,4 @@
-"""Models: what they consist of, their files, and their tables on disk."""
+"""Define models, read and write their files, and build their pair tables."""
 
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters
 from sceneprint.models.model_file import (

@@ -1,9 +1,9 @@
-"""A model: all that decides what signatures and artifacts look like, named by its content.
+"""Define a model: everything that determines signatures and artifacts, identified by its content.
 
-Parameters of a larger or smaller world are its own with every length times one factor (`scaled`).
-A cloud times s, under parameters scaled by s, signs the same, and validates to the same transforms
-with translations times s. Depth images do not, quite: the gate of their plane fit
-(`NormalParameters.plane_gate`) is a share of 1/z and 1/metres at once.
+`scale_lengths` gives the parameters of a larger or smaller world. A cloud times s, under parameters
+scaled by s, has the same signature, and validates to the same transforms with translations times s.
+Depth images differ slightly: the gate of their plane fit (`NormalParameters.plane_gate`) is a share
+of 1/z and 1/metres at once.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
-#: Of the file and of what the numbers in it mean, for models with a whitening and for those that
-#: store psi. They are part of a model's id. Raise one when code changes its signatures.
+#: Versions of the file and of its semantics, for models with and without a whitening. They are part
+#: of a model's id. Raise one if code changes its signatures.
 SCHEMA_VERSION, PSI_SCHEMA_VERSION = 3, 2
 
-#: Groups of which a file, and an id, hold only the numbers that differ from their defaults. A new
-#: number in them leaves the ids of existing models as they are, so their defaults never change.
+#: Groups whose default parameters are omitted from files and ids. So new parameters keep the ids of
+#: existing models, but defaults must never change.
 SPARSE = ("cloud", "validation")
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ModelParameters:
-    """The numbers of every stage, in the order of the paper."""
+    """Parameters of every stage, in the order of the paper."""
 
     depth: DepthParameters = field(default_factory=DepthParameters)
     normals: NormalParameters = field(default_factory=NormalParameters)
@@ -77,7 +77,7 @@ class ModelParameters:
 
 @dataclass(frozen=True)
 class AnswerParameters:
-    """The numbers by which poses are judged on a map; signatures and artifacts do without them."""
+    """Parameters that judge poses on a map; signatures and artifacts do not depend on them."""
 
     map: MapParameters = field(default_factory=MapParameters)
     confidence: ConfidenceModel = field(default_factory=ConfidenceModel)
@@ -87,19 +87,18 @@ class AnswerParameters:
 class Model:
     """Projection, mixture, quantiser, compression, whitening, and the parameters of each stage.
 
-    Signatures are whitened, a few hundred bytes compared by L2; or, of a model without a
-    whitening, psi itself, compared by L1 as in Sec. III-C.
+    Signatures are whitened, a few hundred bytes compared by L2. Without a whitening, they are psi
+    itself, compared by L1 as in Sec. III-C.
 
     Parameters
     ----------
-    name : what people call it; not part of its identity
+    name : display name; not part of the id
     quantiser_step : one unit of a byte of psi
-    psi_unrelated_distance : the median L1 distance of psi of unrelated training frames, in units
-        of a byte
-    provenance : what the model was trained on and with; not part of its identity
-    whitening : see Whitening; None where psi itself is stored
-    answer : see AnswerParameters; not part of its identity, so that a better judgement of poses
-        needs no frame to be signed again
+    psi_unrelated_distance : median L1 distance of psi of unrelated training frames, in units of a
+        byte
+    provenance : data and settings of the training; not part of the id
+    whitening : see Whitening; None if signatures are psi itself
+    answer : see AnswerParameters; not part of the id, so that it can change without new signatures
     """
 
     name: str
@@ -115,26 +114,26 @@ class Model:
 
     @property
     def metric(self) -> Metric:
-        """How stored signatures are compared."""
+        """Return the metric of stored signatures."""
         return "l1" if self.whitening is None else "l2"
 
     @property
     def unrelated_distance(self) -> float:
-        """d0: the median distance of unrelated training frames; similarity = 1 - d / d0."""
+        """Return d0, the median distance of unrelated training frames; similarity = 1 - d / d0."""
         if self.whitening is None:
             return self.psi_unrelated_distance
         return self.whitening.unrelated_distance
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """Levels of the hierarchy that signatures are made of, rising; 0 is the finest."""
+        """Return the ascending levels of the hierarchy in a signature; 0 is the finest."""
         if self.whitening is None:
             return tuple(range(self.parameters.hierarchy.n_levels))
         return self.whitening.levels
 
     @property
     def tensors(self) -> dict[str, NDArray[np.float64] | Floats32 | Ints8]:
-        """The learnt arrays by the names they have in the file."""
+        """Return the learnt arrays by their names in the file."""
         arrays = {
             "projection.mean": self.projection.mean,
             "projection.matrix": self.projection.matrix,
@@ -151,7 +150,7 @@ class Model:
             bytes_["whitening.basis"] = self.whitening.basis
             arrays["whitening.scales"] = self.whitening.scales
             arrays["whitening.offsets"] = self.whitening.offsets
-        # safetensors writes memory as it lies: a Fortran-ordered matrix would come back garbled
+        # C order, because safetensors writes raw memory
         return {
             **{name: np.ascontiguousarray(array, "<f8") for name, array in arrays.items()},
             **{name: np.ascontiguousarray(array, "<f4") for name, array in small.items()},
@@ -160,24 +159,24 @@ class Model:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Everything but the arrays that changes a signature, an artifact or their meaning."""
-        told = {
+        """Return everything but the arrays that affects signatures, artifacts or their meaning."""
+        header = {
             "schema_version": PSI_SCHEMA_VERSION,
             "parameters": to_mapping(self.parameters),
             "quantiser_step": self.quantiser_step,
             "unrelated_distance": self.psi_unrelated_distance,
         }
         if self.whitening is None:
-            return told
-        own = {
+            return header
+        whitening = {
             "levels": list(self.whitening.levels),
             "unrelated_distance": self.whitening.unrelated_distance,
         }
-        return told | {"schema_version": SCHEMA_VERSION, "whitening": own}
+        return header | {"schema_version": SCHEMA_VERSION, "whitening": whitening}
 
     @cached_property
     def id(self) -> str:
-        """SHA-256 over header and arrays, as 64 hexadecimal digits."""
+        """Return the SHA-256 of header and arrays, as 64 hexadecimal digits."""
         digest = hashlib.sha256(json.dumps(self.header, sort_keys=True).encode())
         for name, tensor in sorted(self.tensors.items()):
             digest.update(f"{name} {tensor.shape} ".encode())
@@ -186,29 +185,29 @@ class Model:
 
     @property
     def label(self) -> str:
-        """Name and the first twelve digits of the id, for people."""
+        """Return the name and the first twelve digits of the id, for display."""
         return f"{self.name}-{self.id[:12]}"
 
     @property
     def level_length(self) -> int:
-        """Components of one level's Fisher vector: 25 G."""
+        """Return the length of one level's Fisher vector, 25 G."""
         return int(2 * self.mixture.means.shape[1] + 1) * len(self.mixture)
 
     @property
     def signature_bytes(self) -> int:
-        """Bytes of a stored signature: d of the whitening, or 25 G H of psi."""
+        """Return the bytes of a stored signature: d of the whitening, or 25 G H of psi."""
         if self.whitening is None:
             return self.level_length * len(self.levels)
         return self.whitening.dimension
 
     @property
-    def of_psi(self) -> Model:
-        """The same model without its whitening: signatures are psi of all levels."""
+    def without_whitening(self) -> Model:
+        """Return the model without its whitening: its signatures are psi of all levels."""
         return replace(self, whitening=None)
 
 
 def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
-    """The numbers of every stage as JSON; of the `SPARSE` groups what differs from the default."""
+    """Return all parameters as JSON; of `SPARSE` groups only those that differ from the default."""
     whole = {
         name: group for name, group in asdict(parameters).items() if name not in SPARSE
     }  # in the order of the stages
@@ -220,86 +219,86 @@ def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
     return whole
 
 
-def parameters_of(values: Any) -> ModelParameters:
-    """What `to_mapping` made, read back.
+def parse_parameters(values: Any) -> ModelParameters:
+    """Read the result of `to_mapping`.
 
     Raises
     ------
-    UnreadableModel : fields are missing, unknown or no numbers.
+    UnreadableModel : a field is missing, unknown or no number
     """
     if not isinstance(values, dict):
         raise UnreadableModel(f"The model's parameters are {values!r}. Fetch or train it again.")
-    given = {name: value for name, value in values.items() if name not in SPARSE}
+    dense = {name: value for name, value in values.items() if name not in SPARSE}
     default = ModelParameters()
     groups = {
-        name: changed(getattr(default, name), values.get(name, {}), f"parameters.{name}")
+        name: apply_changes(getattr(default, name), values.get(name, {}), f"parameters.{name}")
         for name in SPARSE
     }
-    return from_mapping(ModelParameters, given, "parameters", **groups)
+    return from_mapping(ModelParameters, dense, "parameters", **groups)
 
 
 def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
-    """A parameter record from parsed JSON, nothing missing, nothing unknown.
+    """Return a parameter record from parsed JSON with exactly its fields.
 
     Parameters
     ----------
-    kind : of the record
+    kind : class of the record
     values : parsed JSON
-    where : it stood, for errors
-    groups : fields that are known already, and not in `values`
+    where : path of the record, for errors
+    groups : fields that are not in `values`
 
     Raises
     ------
-    UnreadableModel : the fields are not those of `kind`.
+    UnreadableModel : the fields are not those of `kind`
     """
     hints = get_type_hints(kind)
     names = {field.name for field in fields(kind)} - set(groups)  # type: ignore[arg-type]
     if not isinstance(values, dict) or set(values) != names:
-        given = sorted(values) if isinstance(values, dict) else values
+        actual = sorted(values) if isinstance(values, dict) else values
         raise UnreadableModel(
-            f"The model's {where} should have the fields {sorted(names)}, not {given}. "
-            "It was made by another version of sceneprint: train it again, or use that version."
+            f"The model's {where} should have the fields {sorted(names)}, not {actual}. "
+            "Another version of sceneprint wrote it: train it again, or use that version."
         )
-    made: dict[str, Any] = {}
-    for name, value in values.items():
-        if is_dataclass(hints[name]):
-            made[name] = from_mapping(hints[name], value, f"{where}.{name}")
-        else:
-            made[name] = _number(hints[name], value, f"{where}.{name}")
-    return kind(**made, **groups)
+    parsed = {
+        name: from_mapping(hints[name], value, f"{where}.{name}")
+        if is_dataclass(hints[name])
+        else _number(hints[name], value, f"{where}.{name}")
+        for name, value in values.items()
+    }
+    return kind(**parsed, **groups)
 
 
 def differences(record: Any, default: Any = None) -> dict[str, Any]:
-    """Return the numbers of a record that differ from those of another, group by group.
+    """Return the values of a record that differ from those of another, group by group.
 
     Parameters
     ----------
     record : a frozen record of numbers and of other records
-    default : of the same kind; None: that of its kind
+    default : record of the same class; None: its defaults
     """
     default = type(record)() if default is None else default
     different: dict[str, Any] = {}
-    for one in fields(record):
-        value, usual = getattr(record, one.name), getattr(default, one.name)
+    for each in fields(record):
+        value, usual = getattr(record, each.name), getattr(default, each.name)
         if is_dataclass(value):
             value, usual = differences(value, usual), {}
         if value != usual:
-            different[one.name] = value
+            different[each.name] = value
     return different
 
 
-def changed(default: T, values: Any, where: str) -> T:
-    """Return a record as the default is, but for some values.
+def apply_changes(default: T, values: Any, where: str) -> T:
+    """Return a record with some values of a default replaced.
 
     Parameters
     ----------
     default : a frozen record
-    values : parsed JSON, as of `differences`
-    where : it stood, for errors
+    values : parsed JSON, result of `differences`
+    where : path of the record, for errors
 
     Raises
     ------
-    UnreadableModel : a field is unknown, or no number.
+    UnreadableModel : a field is unknown, or no number
     """
     hints = get_type_hints(type(default))
     unknown = sorted(set(values) - set(hints)) if isinstance(values, dict) else values
@@ -308,17 +307,17 @@ def changed(default: T, values: Any, where: str) -> T:
             f"The model's {where} has {unknown}, which this version of sceneprint does not know. "
             "Use the version that wrote it, or a later one."
         )
-    made = {
-        name: changed(getattr(default, name), value, f"{where}.{name}")
+    parsed = {
+        name: apply_changes(getattr(default, name), value, f"{where}.{name}")
         if is_dataclass(hints[name])
         else _number(hints[name], value, f"{where}.{name}")
         for name, value in values.items()
     }
-    return replace(default, **made)  # type: ignore[type-var]
+    return replace(default, **parsed)  # type: ignore[type-var]
 
 
 def _number(kind: Any, value: Any, where: str) -> Any:
-    """A number or truth value of the kind a field has."""
+    """Return a number or truth value, converted to the type of its field."""
     if isinstance(value, bool) is not (kind is bool) or not isinstance(value, bool | int | float):
         raise UnreadableModel(
             f"The model's {where} is {value!r}, not a number: the file is damaged. "
@@ -327,9 +326,7 @@ def _number(kind: Any, value: Any, where: str) -> Any:
     return kind(value)
 
 
-# Parameters of a larger or smaller world.
-
-#: Numbers that are not bare: the power of a metre in each.
+#: Power of a metre in the unit of each parameter that has a length.
 POWERS: dict[type, dict[str, int]] = {
     DepthParameters: {"minimum_depth": 1, "maximum_depth": 1},
     CloudParameters: {
@@ -388,20 +385,20 @@ POWERS: dict[type, dict[str, int]] = {
 }
 
 
-def scaled(parameters: T, factor: float) -> T:
-    """A record of parameters with every length in it, and in its groups, times a factor.
+def scale_lengths(parameters: T, factor: float) -> T:
+    """Return a record of parameters with every length in it, and in its groups, times a factor.
 
     Parameters
     ----------
     parameters : a frozen record, such as ModelParameters
-    factor : above 0; areas take its square
+    factor : above 0; other powers of a length are scaled accordingly
     """
     powers = POWERS.get(type(parameters), {})
-    changed: dict[str, Any] = {}
-    for one in fields(parameters):  # type: ignore[arg-type]
-        value = getattr(parameters, one.name)
+    changes: dict[str, Any] = {}
+    for each in fields(parameters):  # type: ignore[arg-type]
+        value = getattr(parameters, each.name)
         if is_dataclass(value):
-            changed[one.name] = scaled(value, factor)
-        elif one.name in powers:
-            changed[one.name] = value * factor ** powers[one.name]
-    return replace(parameters, **changed)  # type: ignore[type-var]
+            changes[each.name] = scale_lengths(value, factor)
+        elif each.name in powers:
+            changes[each.name] = value * factor ** powers[each.name]
+    return replace(parameters, **changes)  # type: ignore[type-var]

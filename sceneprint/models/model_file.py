@@ -1,7 +1,7 @@
-"""Models on disk: their files, and the pair tables computed from them.
+"""Read and write model files, and cache the pair tables computed from them.
 
-A model's file is safetensors with a JSON header; no pickle, nothing executed. Its pair table is
-built once per machine, then memory-mapped by every process.
+A model's file is safetensors with a JSON header, without pickle or code. Its pair table is built
+once per machine, then memory-mapped by every process.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from sceneprint.models.model import (
     AnswerParameters,
     Model,
     ModelParameters,
-    changed,
+    apply_changes,
     differences,
-    parameters_of,
+    parse_parameters,
 )
 from sceneprint.types import Floats32
 from sceneprint_client.api.maps import PRESETS
 
-#: Most components: the pair table names them in 16 bits.
+#: Maximum number of components: the pair table stores 16-bit indices.
 MAXIMUM_COMPONENTS = 2**15 - 1
-#: Least and most of what decides how much memory and time a frame takes.
+#: Bounds of the numbers that determine the memory and time per frame.
 BOUNDS = {
     "bins of the table": (1, 4_000_000),
     "levels": (1, 16),
@@ -84,35 +84,35 @@ BOUNDS = {
 }
 
 
-#: Most bytes of a whitened signature.
+#: Maximum length of a whitened signature, bytes.
 MAXIMUM_DIMENSION = 1024
 
 
 def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -> None:
-    """See that a whitening is of levels that there are, and short.
+    """Check that the levels of a whitening exist, and that its signatures are short.
 
     Raises
     ------
-    ValueError : it is not.
+    ValueError : a check fails
     """
     known = [level for level in range(n_levels) if level in levels]
     if not known or list(levels) != known or any(isinstance(level, bool) for level in levels):
-        raise ValueError(f"a whitening of levels {list(levels)} of {n_levels}")
+        raise ValueError(f"a whitening cannot have levels {list(levels)} of {n_levels}")
     if not 1 <= dimension <= MAXIMUM_DIMENSION:
         raise ValueError(f"{dimension} bytes of a signature are not from 1 to {MAXIMUM_DIMENSION}")
 
 
 def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> None:
-    """See that no frame can take unbounded memory or time with these parameters.
+    """Check that no frame can take unbounded memory or time with these parameters.
 
     Parameters
     ----------
-    p : as read from a file
+    p : parameters from a file
     n_compressed : bytes of a descriptor
 
     Raises
     ------
-    ValueError : a number is out of its bounds.
+    ValueError : a number is out of bounds
     """
     if n_components > MAXIMUM_COMPONENTS:
         raise ValueError(f"{n_components} components are more than {MAXIMUM_COMPONENTS}")
@@ -166,7 +166,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
 
 
 def _check_cloud(p: CloudParameters) -> None:
-    """See that voxels and pixels have a size, and the range has points."""
+    """Check that voxels and pixels have a size, and that the range is not empty."""
     if not 1e-4 <= p.minimum_range < p.maximum_range <= 1e6:
         raise ValueError("the range of a cloud should begin above 0 and before it ends")
     if not (p.voxel_size > 0 and min(p.voxel_angle, p.image_angle) >= 1e-4):
@@ -175,16 +175,16 @@ def _check_cloud(p: CloudParameters) -> None:
         raise ValueError("voxels and pixels of a cloud should be small, and not flat")
     if not min(p.seed_px, p.validation_seed_px) >= 1:
         raise ValueError("seeds of a cloud should be as far apart as voxels")
-    if not 0 < p.range_gate <= 1:  # of 1, neighbours are as far as e times the range
+    if not 0 < p.range_gate <= 1:  # 1 allows neighbours at e times the range
         raise ValueError("neighbours in a cloud should be in some range of each other")
 
 
-#: A model of the most components fits; a larger file is refused unread.
+#: Maximum size of a file: a model with the most components fits.
 MAXIMUM_BYTES = 16 << 20
 
 
 def write_model(model: Model) -> bytes:
-    """A model as the bytes of its file."""
+    """Return a model as the bytes of its file."""
     from safetensors.numpy import save
 
     header = model.header | {
@@ -197,28 +197,19 @@ def write_model(model: Model) -> bytes:
 
 
 def save_model(model: Model, path: Path) -> None:
-    """Write a model to a file, whole or not at all.
-
-    Parameters
-    ----------
-    path : of the file; its folder must exist
-    """
+    """Write a model to a file atomically; its folder must exist."""
     data = write_model(model)
-    parse_model(data, str(path))  # what cannot be read back is not written
+    parse_model(data, str(path))  # refuse to write an unreadable file
     write_whole(path, data)
 
 
 def read_model(model: str | Path) -> Model:
     """Read a preset by its name, or a model file by its path.
 
-    Parameters
-    ----------
-    model : one of PRESETS, or a path
-
     Raises
     ------
-    UnreadableModel : no such preset or file, not a model, another schema, or content that
-        does not give the id in its header.
+    UnreadableModel : the preset or file does not exist, is no model, has another schema, or its
+        content does not match the id in its header
     """
     if str(model) in PRESETS:
         source = resources.files("sceneprint") / "presets" / f"{model}.safetensors"
@@ -244,11 +235,11 @@ def parse_model(data: bytes, name: str) -> Model:
 
     Parameters
     ----------
-    name : of the file, for errors
+    name : name of the file, for errors
 
     Raises
     ------
-    UnreadableModel : see `read_model`.
+    UnreadableModel : see `read_model`
     """
     from safetensors.numpy import load
 
@@ -257,7 +248,7 @@ def parse_model(data: bytes, name: str) -> Model:
         metadata = json.loads(data[8 : 8 + length])["__metadata__"]
         header: dict[str, Any] = dict(json.loads(metadata["sceneprint"]))
         tensors = load(data)
-    except Exception as error:  # safetensors raises its own, json and Python theirs
+    except Exception as error:  # exceptions of safetensors, json and Python
         raise UnreadableModel(
             f"{name}: not a model file ({type(error).__name__}: {error}). "
             "Give the path of a file that `sceneprint train` wrote."
@@ -269,7 +260,7 @@ def parse_model(data: bytes, name: str) -> Model:
             "of sceneprint reads. Train it again, or use the version that wrote it."
         )
     try:
-        model, given = _assemble(header, tensors), str(header["id"])
+        model, expected = _assemble(header, tensors), str(header["id"])
     except UnreadableModel as error:
         raise UnreadableModel(f"{name}: {error}") from error
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -277,10 +268,10 @@ def parse_model(data: bytes, name: str) -> Model:
             f"{name}: a part of the model is missing or misshapen ({error}). "
             "Fetch or train it again."
         ) from error
-    if model.id != given:
+    if model.id != expected:
         raise UnreadableModel(
             f"{name}: its content gives the id {model.id[:12]}, its header says "
-            f"{given[:12]}: the file was damaged. Fetch or train it again."
+            f"{expected[:12]}: the file was damaged. Fetch or train it again."
         )
     return model
 
@@ -294,7 +285,7 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         "mixture.means": (g, FEATURE_DIMENSION),
         "mixture.variances": (g, FEATURE_DIMENSION),
     }
-    parameters = parameters_of(header["parameters"])
+    parameters = parse_parameters(header["parameters"])
     check_bounds(parameters, g, len(tensors["compression.matrix"]))
     bins = parameters.surroundings.dimension
     shapes["compression.mean"] = (bins,)
@@ -331,8 +322,8 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
 
 
 def _answer(values: Any) -> AnswerParameters:
-    """Return the numbers of the answer, read back; UnreadableModel or ValueError."""
-    answer = changed(AnswerParameters(), values, "answer")
+    """Parse the parameters of the answer; UnreadableModel or ValueError if they are invalid."""
+    answer = apply_changes(AnswerParameters(), values, "answer")
     refinement, views = answer.map.refinement, answer.map
     counts = {
         "iterations of a refinement": refinement.iterations,
@@ -347,21 +338,21 @@ def _answer(values: Any) -> AnswerParameters:
 
 
 def _check_counts(counts: dict[str, int]) -> None:
-    """See that numbers are within their BOUNDS; ValueError where one is not."""
-    for what, count in counts.items():
-        least, most = BOUNDS[what]
+    """Check that numbers are within their BOUNDS; ValueError if one is not."""
+    for name, count in counts.items():
+        least, most = BOUNDS[name]
         if not least <= count <= most:
-            raise ValueError(f"{what}: {count} is not from {least} to {most}")
+            raise ValueError(f"{name}: {count} is not from {least} to {most}")
 
 
 def _whitening(
     header: dict[str, Any], tensors: dict[str, np.ndarray], level_length: int, n_levels: int
 ) -> Whitening | None:
-    """The whitening of a file; None of a model that has none."""
+    """Return the whitening of a file; None if it has none."""
     if "whitening" not in header:
         return None
-    told, basis = header["whitening"], tensors["whitening.basis"]
-    levels, d0 = tuple(told["levels"]), float(told["unrelated_distance"])
+    values, basis = header["whitening"], tensors["whitening.basis"]
+    levels, d0 = tuple(values["levels"]), float(values["unrelated_distance"])
     check_whitening(levels, n_levels, len(basis))
     shapes = {
         "basis": ("int8", (len(basis), level_length * len(levels))),
@@ -378,52 +369,50 @@ def _whitening(
     return Whitening(levels, basis, scales, offsets, d0)
 
 
-# Pair tables on disk.
-
-#: Layout of the cached file; a change makes new files beside the old.
+#: Version of the layout of the cached file, and part of its name.
 CACHE_VERSION = 1
 #: Bytes before the bins; a multiple of a cache line, so that the bins stay aligned.
 HEAD = 64
-#: Bins evaluated between two reports of progress.
+#: Number of bins between two reports of progress.
 CHUNK = 16_384
 
-#: Called with the number of bins done and their total.
+#: Receives the number of finished bins and their total.
 Progress = Callable[[int, int], None]
 
 
 def default_cache_dir() -> Path:
-    """Where derived files go unless told otherwise: the user's cache folder."""
+    """Return the default folder of derived files: the user's cache folder."""
     return Path(platformdirs.user_cache_dir("sceneprint", appauthor=False))
 
 
 def open_table(
     model: Model, cache_dir: Path | None = None, progress: Progress | None = None
 ) -> PairTable:
-    """The table of a model, from the cache where it is there.
+    """Return the table of a model, from the cache if possible.
 
-    Two processes that build it at once each publish a whole file, of the same bytes. Where
-    the cache folder cannot be written, the table is held in memory.
+    Processes that build it at once each publish a whole file with the same bytes. If the cache
+    folder is not writable, the table stays in memory.
 
     Parameters
     ----------
-    cache_dir : folder of derived files; created where missing
-    progress : called while the table is being built
+    cache_dir : folder of derived files; created if missing
+    progress : receives the progress of building the table
     """
     folder = default_cache_dir() if cache_dir is None else cache_dir
     path = folder / f"table-v{CACHE_VERSION}-{model.id}.bin"
-    cached = _mapped(path, model)
+    cached = _map_table(path, model)
     if cached is not None:
         return cached
-    packed = _build(model, progress)
+    table = build_table(model, progress)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, _head(packed) + packed.tobytes())
-    except OSError:  # read-only or full: a cache is a convenience
-        return PairTable(packed)
-    return _mapped(path, model) or PairTable(packed)
+        write_whole(path, _head(table.packed) + table.packed.tobytes())
+    except OSError:  # read-only or full: the cache is optional
+        return table
+    return _map_table(path, model) or table
 
 
-def _mapped(path: Path, model: Model) -> PairTable | None:
+def _map_table(path: Path, model: Model) -> PairTable | None:
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)
@@ -433,33 +422,29 @@ def _mapped(path: Path, model: Model) -> PairTable | None:
         packed = np.memmap(path, np.float32, "r", offset=HEAD, shape=shape)
     except (OSError, ValueError):
         return None
-    # an ndarray of the same memory: a memmap would make every slice of it cost more
+    # an ndarray of the same memory, because slices of a memmap are slow
     return PairTable(np.asarray(packed)) if head == _head(packed) else None
 
 
 def _head(packed: Floats32) -> bytes:
-    """First bytes of the file: what it is, and a checksum of the rest (20 ms to verify)."""
+    """Return the first bytes of the file: kind, version, and a checksum (20 ms to verify)."""
     checksum = zlib.crc32(packed.view(np.uint8).data)
     return f"sceneprint table {CACHE_VERSION} {checksum:08x}".encode().ljust(HEAD)
 
 
 def build_table(model: Model, progress: Progress | None = None) -> PairTable:
-    """The table of a model, evaluated in memory.
+    """Return the table of a model, computed in memory.
 
     Parameters
     ----------
-    progress : called with bins done and their total
+    progress : receives the progress
     """
-    return PairTable(_build(model, progress))
-
-
-def _build(model: Model, progress: Progress | None) -> Floats32:
     p, n = model.parameters, model.parameters.table.n_bins
     packed = np.empty((n, WIDTH), np.float32)
     for first in range(0, n, CHUNK):
         last = min(first + CHUNK, n)
-        done = compute_bins(first, last, p.table, p.properties, model.projection, model.mixture)
-        packed[first:last] = done.packed
+        part = compute_bins(first, last, p.table, p.properties, model.projection, model.mixture)
+        packed[first:last] = part.packed
         if progress is not None:
             progress(last, n)
-    return packed
+    return PairTable(packed)

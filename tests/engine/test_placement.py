@@ -28,7 +28,7 @@ from sceneprint.localization import (
 )
 from sceneprint.models import read_model
 from sceneprint.pipeline import PairMatch, Signature, Signer, associate, diversify, retrieve
-from sceneprint.places import QueryFrame, parameters_of
+from sceneprint.places import QueryFrame, model_parameters
 from sceneprint.store.maps import placed_frames
 from sceneprint.types import Geometry, Patches
 from sceneprint_client.api import Counts, Localization, Prior, Query
@@ -114,7 +114,7 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
     poses, rooms = [uploads[i].pose for i in others], [uploads[i].room for i in others]
     views_of = views_of_rows(matches, poses, geometries.__getitem__, rooms)
     frames = [QueryFrame(seen, matches)]
-    own_p = replace(parameters_of(frames), voted_only=True)
+    own_p = replace(model_parameters(frames), voted_only=True)
     by_library = localize(frames, poses, rooms, views_of, p=own_p)
     assert by_library is not None
     assert by_library.verified_by in (None, "map")

@@ -241,7 +241,7 @@ def test_principal_components_equal_those_of_the_svd() -> None:
 def test_components_that_cannot_be_learnt() -> None:
     rows = np.ones((13, 12), np.float32)
     for count, dimension in ((12, 3), (13, 0), (13, 13), (0, 1)):
-        with pytest.raises(ValueError, match=f"{dimension} components of"):
+        with pytest.raises(ValueError, match=f"determine {dimension} components"):
             fit_compression(rows[:count], dimension)
     assert fit_compression(rows, 12).matrix.shape == (12, 12)
 

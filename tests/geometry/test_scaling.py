@@ -11,7 +11,7 @@ import pytest
 
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.models import ModelParameters
-from sceneprint.models.model import POWERS, scaled
+from sceneprint.models.model import POWERS, scale_lengths
 from sceneprint.pipeline import Signer, prepare, validate
 from sceneprint.types import Cloud
 
@@ -77,7 +77,7 @@ def test_every_number_is_a_length_or_bare() -> None:
 
 
 def test_scaled_by_hand() -> None:
-    p = scaled(ModelParameters(), 4.0)
+    p = scale_lengths(ModelParameters(), 4.0)
     assert p.properties.radius == 12.0
     assert p.cloud.noise_gate == CloudParameters().noise_gate / 4
     assert p.validation.alignment.consensus.normal_weight == pytest.approx(0.05 * 16)
@@ -86,7 +86,7 @@ def test_scaled_by_hand() -> None:
         == ModelParameters().validation.rivals.first.first_gate * 4
     )
     assert p.hierarchy == ModelParameters().hierarchy
-    assert scaled(p, 0.25) == ModelParameters()
+    assert scale_lengths(p, 0.25) == ModelParameters()
 
 
 def test_a_larger_world_signs_and_validates_the_same(
@@ -101,7 +101,9 @@ def test_a_larger_world_signs_and_validates_the_same(
     there = (cloud_scenes.in_room(cloud_scenes.directions(30_000, 2, 80))[0] - step) @ R.T
     made = []
     for factor in (1.0, 8.0):
-        larger = replace(small_signer, model=replace(model, parameters=scaled(small, factor)))
+        larger = replace(
+            small_signer, model=replace(model, parameters=scale_lengths(small, factor))
+        )
         made.append(
             [prepare(Cloud((one * factor).astype(np.float32)), larger) for one in (here, there)]
         )
@@ -109,7 +111,7 @@ def test_a_larger_world_signs_and_validates_the_same(
         assert a.n_patches == b.n_patches
         np.testing.assert_allclose(a.vector.astype(int), b.vector.astype(int), atol=1)
     first = validate(made[0][0][1], made[0][1][1], 3, small.validation)
-    second = validate(made[1][0][1], made[1][1][1], 3, scaled(small.validation, 8.0))
+    second = validate(made[1][0][1], made[1][1][1], 3, scale_lengths(small.validation, 8.0))
     assert first.T_match_query is not None
     assert second.T_match_query is not None
     assert (first.status, first.strength) == (second.status, second.strength)

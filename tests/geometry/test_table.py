@@ -143,7 +143,7 @@ def test_no_rotation_changes_a_count(scenes: ModuleType) -> None:
 def test_bins_finer_than_the_look_up_are_refused() -> None:
     # 4096 cells of hints over the radius: 5000 bins would put two edges into one of them
     fine = TableLayout(distance_bins=5000, angle_bins=1, dihedral_bins=4, distance_exponent=1.0)
-    with pytest.raises(ValueError, match="finer than the look-up allows"):
+    with pytest.raises(ValueError, match="narrower than the cells"):
         count_pairs(np.zeros((2, 3)), np.ones((2, 3)), np.ones(2), fine, P)
 
 

@@ -278,7 +278,7 @@ def test_too_few_patches(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None
             assert (v.status, v.T_match_query, v.seed) == ("rejected", None, 3)
             assert f"{n} patches" in v.reason
     for n in (10, 11):
-        assert "patches, and" not in sane(validate(few(query, n), match)).reason
+        assert "validation needs" not in sane(validate(few(query, n), match)).reason
 
 
 def test_patches_that_agree_on_nothing(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
@@ -462,7 +462,7 @@ def test_wrong_calls(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
     query, match, _ = pairs[0]
     with pytest.raises(ValueError, match="mode 'other' is neither 'full' nor 'paper'"):
         validate(query, match, mode="other")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="descriptors of 128 and 127 bytes"):
+    with pytest.raises(ValueError, match="descriptors have 128 and 127 bytes"):
         validate(query, replace(match, descriptors=match.descriptors[:, :127]))
     with pytest.raises(ModelMismatch, match="Frames of two models cannot be compared"):
         pipeline.validate(query, replace(match, model_id="0" * 64))

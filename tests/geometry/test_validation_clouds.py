@@ -28,7 +28,7 @@ from sceneprint.geometry.validation.acceptance import (
 )
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters, validate
 from sceneprint.models import Model, read_model
-from sceneprint.models.model import scaled
+from sceneprint.models.model import scale_lengths
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import Cloud, DepthFrame, Floats, Floats32, Geometry, Sphere
@@ -256,7 +256,7 @@ def test_an_empty_square_room_without_a_viewpoint_is_ambiguous(made: Make) -> No
 def test_everything_five_times_as_large(
     rooms: list[tuple[Room, list[View]]], made: Make, model: Model
 ) -> None:
-    p = scaled(model.parameters, 5.0)
+    p = scale_lengths(model.parameters, 5.0)
     large = replace(model, parameters=p)
     _, views = rooms[1]
     query, match = (

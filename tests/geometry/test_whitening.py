@@ -114,10 +114,10 @@ def test_the_mean_itself_and_a_zero(psi: Floats, fit: Whitening) -> None:
 
 
 def test_what_is_refused(psi: Floats, fit: Whitening) -> None:
-    with pytest.raises(ValueError, match=r"psi \(299,\), where the basis is \(32, 300\)"):
+    with pytest.raises(ValueError, match=r"psi \(299,\) does not fit the basis \(32, 300\)"):
         whiten(psi[0, :299], fit)
     units = psi_units(psi)
-    with pytest.raises(ValueError, match="200 axes of 200 frames"):
+    with pytest.raises(ValueError, match="200 frames cannot determine 200 axes"):
         fit_whitening(units, (0,), WhiteningParameters(200))
     with pytest.raises(ValueError, match="span fewer than 32 axes"):
         fit_whitening(np.repeat(units[:5], 40, axis=0), (0,), WhiteningParameters(32))

@@ -13,7 +13,7 @@ from sceneprint.engine.search import verification
 from sceneprint.geometry.validation import map_verification
 from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.models import read_model
-from sceneprint.models.model import POWERS, AnswerParameters, scaled
+from sceneprint.models.model import POWERS, AnswerParameters, scale_lengths
 
 #: Numbers that are not lengths: shares, tiny divisors, a chi-square, and how a score is weighed.
 FREE = {0.0, 1.0, 1e-9, 1e-12, 22.458}
@@ -41,7 +41,7 @@ def test_every_length_of_the_map_is_a_multiple_of_the_scale() -> None:
     source = inspect.getsource(MapParameters)
     lengths = {line.split(":")[0].strip() for line in source.splitlines() if "metres" in line}
     assert lengths == set(POWERS[MapParameters])
-    twice = scaled(AnswerParameters(), 2.0).map
+    twice = scale_lengths(AnswerParameters(), 2.0).map
     for name in lengths:
         assert getattr(twice, name) == 2.0 * getattr(MapParameters(), name)
     assert twice.refinement.first_gate == 2.0 * MapParameters().refinement.first_gate

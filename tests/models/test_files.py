@@ -75,7 +75,7 @@ def test_a_whitening_is_part_of_the_content(small_model: Model, small_whitened: 
         )
     ]
     assert len({small_model.id, small_whitened.id, *(other.id for other in others)}) == 7
-    assert small_whitened.of_psi.id == small_model.id
+    assert small_whitened.without_whitening.id == small_model.id
 
 
 def test_round_trip_of_a_whitening(small_whitened: Model, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from sceneprint.errors import UnreadableModel
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.models import Model, ModelParameters, parse_model, read_model, write_model
-from sceneprint.models.model import parameters_of, to_mapping
+from sceneprint.models.model import parse_parameters, to_mapping
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from sceneprint.models.model import parameters_of, to_mapping
 def test_ids_of_shipped_models_stay(preset: str, start: str) -> None:
     """Signatures of another id are never compared, so a change of them changes the id."""
     model = read_model(preset)
-    assert model.of_psi.id.startswith(start)
+    assert model.without_whitening.id.startswith(start)
     assert not {"cloud", "validation"} & set(model.header["parameters"])
     assert model.parameters.cloud == CloudParameters()
     assert model.parameters.validation == ValidationParameters()
@@ -63,7 +63,7 @@ def test_only_what_differs_is_written(small_model: Model) -> None:
 )
 def test_what_is_not_known_is_refused(group: str, value: Any) -> None:
     with pytest.raises(UnreadableModel, match=f"parameters.{group}"):
-        parameters_of(to_mapping(ModelParameters()) | {group: value})
+        parse_parameters(to_mapping(ModelParameters()) | {group: value})
 
 
 @pytest.mark.parametrize(

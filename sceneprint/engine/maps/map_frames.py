@@ -24,7 +24,14 @@ from sceneprint.formats.dataset import trajectory_row, trajectory_text
 from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.export import points_of, write_ply
 from sceneprint.geometry.rigid import transform_points
-from sceneprint.pictures import depth_view, normals_view, onto, patches_view, picture, vista_of
+from sceneprint.pictures import (
+    depth_view,
+    normals_view,
+    patches_view,
+    picture,
+    project_labels,
+    vista_of,
+)
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
 from sceneprint.store.frame_queries import (
@@ -535,7 +542,7 @@ class FrameFiles:
         if isinstance(seen.camera, Intrinsics):
             return labels
         drawn = geometry_of(self._store, self._signers, found).surface
-        return onto(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
+        return project_labels(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
 
     def _signature(self, found: IndexedFrame) -> tuple[bytes, tuple[list[int], list[int]]]:
         number, model_id = found.frame.number, found.row.model_id

@@ -37,7 +37,7 @@ from sceneprint.fusion import (
     FusionParameters,
     fuse,
     open3d,
-    within,
+    prepare_view,
 )
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.surface.coverage import (
@@ -121,7 +121,7 @@ def fused(
     # points of a cloud have no image that voxels could be carved with: it is explained, not fused
     if query is not None and wanted.include_query and isinstance(query.surface.camera, Intrinsics):
         frame, source = _own(store, query, own, model_id, asked_at)
-        frames.append(within(frame, p))
+        frames.append(prepare_view(frame, p))
         told.append(_fused_view(None, frames[-1], source))
     for view in views:
         try:
@@ -129,7 +129,7 @@ def fused(
         except (NotFound, FrameError, DamagedBlob, UnreadableGeometry) as error:
             left_out.append(LeftOut(frame_id=view.frame_id, map=view.map, reason=str(error)))
             continue
-        frames.append(within(frame, p))
+        frames.append(prepare_view(frame, p))
         told.append(_fused_view(view, frames[-1], source))
     others = [frame for frame, one in zip(frames, told, strict=True) if one.frame_id is not None]
     if not others:

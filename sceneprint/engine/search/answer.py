@@ -51,7 +51,7 @@ from sceneprint.geometry.retrieval.ranking import (
     pairwise_distances,
 )
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
-from sceneprint.localization import PosedFrame, PoseEstimate, decide, unconfirmed
+from sceneprint.localization import PosedFrame, PoseEstimate, decide, mark_unconfirmed
 from sceneprint.models import Model
 from sceneprint.pipeline import VERDICT_MATCHES, PairMatch
 from sceneprint.places import PosePrior, QueryFrame
@@ -153,7 +153,7 @@ def answer(
         estimate = decide(frames, last.searched.ranking, database, numbers_of(model, query))
         last = database.attempts[-1]
         if last.late and estimate is not None:
-            estimate = unconfirmed(estimate)
+            estimate = mark_unconfirmed(estimate)
         clock.stage("locate")
     return _answer(store, places, model, last, estimate, query, deadline, clock, len(before))
 
