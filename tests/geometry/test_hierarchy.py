@@ -226,7 +226,7 @@ def test_most_patches_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
         compared.append(arguments[6] - arguments[5])
         nearer(*arguments)
 
-    for name in ("_k_means", "_seed", "_reassign", "_boxes", "_least_distances", "_largest_of"):
+    for name in ("_k_means", "_seed", "_reassign", "_boxes", "_least_distances", "_maximum"):
         monkeypatch.setattr(module, name, getattr(module, name).function)
     monkeypatch.setattr(module, "_move_nearer", counted)
     line = np.zeros((6, 400))

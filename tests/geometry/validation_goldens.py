@@ -624,7 +624,7 @@ def check_consensus(module: ModuleType) -> None:
     off[2, 2] += 0.16
     off[3] = source.means[3] @ T[:3, :3].T + T[:3, 3]
     m[3] = z
-    module._explained(*of_source, *columns(off, m), T, 0.15, 0.85, weights)
+    module._weigh_inliers(*of_source, *columns(off, m), T, 0.15, 0.85, weights)
     np.testing.assert_allclose(weights, [1, 0.84**2, 0, 0], atol=1e-9)
 
 
