@@ -1,1 +1,1 @@
-"""Depth images and clouds to oriented surfaces."""
+"""Convert depth images and clouds to oriented surfaces."""

@@ -1,15 +1,15 @@
-"""Where a camera sees a point, and depth images brought from its lens to a pinhole.
+"""Project points into a camera, and rectify depth images from its lens to a pinhole.
 
     camera  --camera_of-->  array        array, point  --project-->  column, line, depth
-    points (6, N)  --move_all, project_all, within, gather_pixels-->  pixels, a block at a time
+    points (6, N)  --move_all, project_all, select_inside, gather_pixels-->  pixels, by block
     range (H, W)  --ray_to_axis-->  z (H, W)  --undistort-->  z (H, W) of a pinhole
 
-Kernels know two cameras: a pinhole, and a sphere about a viewpoint. What a pinhole's noise and
-gates go by is depth along its axis; a sphere's, range. Both are called depth here. A pixel that
-shows nothing has the point (0, 0, 0), and so no depth.
+Kernels support a pinhole and a sphere about a viewpoint. "Depth" is depth along the axis of a
+pinhole, and range on a sphere: noise and gates depend on it. An empty pixel has the point (0, 0, 0)
+and depth 0.
 
-Rectification works on the image the sensor gave, so `ray_to_axis` comes first: the ray of a sample
-is that of the distorted pixel it was taken at. There (x, y) is a direction as x/z, y/z.
+`ray_to_axis` works on the distorted image, before `undistort`: the ray of a sample passes through
+its distorted pixel. In rectification (x, y) is a direction as x/z, y/z.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32
 
 TURN = 2.0 * math.pi
-#: Points that kernels work on at once: their numbers stay in the first level of the cache.
+#: Points per block of a kernel: their coordinates stay in the first level of the cache.
 BLOCK = 256
 
 
 @kernel
 def depth_of(kind: float, x: float, y: float, z: float) -> float:
-    """Depth of a point before the camera that saw it; 0 where that is not known."""
+    """Return the depth of a point in the camera's frame; 0 for an unknown kind of camera."""
     if kind == 0:
         return z
     if kind == 1:
@@ -49,19 +49,19 @@ def _project_sphere(camera: Floats, x: float, y: float, z: float) -> tuple[float
         a, b, c = z, x, y
     elif camera[5] == 0:
         a, b, c = y, z, x
-    # asin is flat at the pole; this is not
+    # atan2, because asin is inaccurate near the pole
     elevation = np.arctan2(c, np.sqrt(a * a + b * b))
     turn = TURN / camera[2]
     column = (np.arctan2(b, a) - camera[3]) / camera[2] + 0.5
     column -= np.floor(column / turn) * turn
-    if column >= camera[6] > 0:  # what rounding left between the last column and the first
+    if column >= camera[6] > 0:  # rounding at the seam between the last column and the first
         column = 0.0
     return column, (camera[4] - elevation) / camera[2] + 0.5, depth
 
 
 @kernel
 def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Column and line, of which the whole part is the pixel, and depth; -1 where too near."""
+    """Return column and line, whose integer part is the pixel, and depth; -1 if too near."""
     if camera[0] == 0:
         if not z > camera[1]:
             return -1.0, -1.0, z
@@ -71,7 +71,7 @@ def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float,
 
 @kernel
 def transpose_points(source: Floats32, step: int) -> Floats32:
-    """Every `step`-th of some points (N, 6), number by number: (6, n)."""
+    """Return every `step`-th of points (N, 6), transposed to (6, n)."""
     chosen = np.empty((6, (len(source) + step - 1) // step), np.float32)
     for a in range(6):
         for i in range(chosen.shape[1]):
@@ -81,7 +81,7 @@ def transpose_points(source: Floats32, step: int) -> Floats32:
 
 @disjoint_kernel
 def move_all(points: Floats32, T: Floats, first: int, count: int, out: Floats) -> None:
-    """Points `first` and on of (6, N) under a transform: (3, n)."""
+    """Write `count` transformed points of (6, N), from index `first` on, to `out` (3, n)."""
     for a in range(3):
         x, y, z, own = points[0], points[1], points[2], out[a]
         xx, xy, xz, shift = T[a, 0], T[a, 1], T[a, 2], T[a, 3]
@@ -92,7 +92,7 @@ def move_all(points: Floats32, T: Floats, first: int, count: int, out: Floats) -
 
 @disjoint_kernel
 def project_all(camera: Floats, points: Floats, count: int, out: Floats) -> None:
-    """Column, line and depth of points, (3, n) each: `project` of several at once."""
+    """Write column, line and depth of points (3, n) to `out` (3, n); see `project`."""
     x, y, z, column, line, depth = points[0], points[1], points[2], out[0], out[1], out[2]
     for i in range(count):
         column[i], line[i], depth[i] = project(camera, x[i], y[i], z[i])
@@ -103,7 +103,9 @@ def select_inside(
     projected: Floats, count: int, left: float, right: float, top: float, bottom: float,
     places: Ints32,
 ) -> int:  # fmt: skip
-    """Indices of points with a column in [left, right) and a line in [top, bottom); how many."""
+    """Write indices of points with a column in [left, right) and a line in [top, bottom) to
+    `places`; return their number.
+    """
     column, line, found = projected[0], projected[1], 0
     for i in range(count):
         inside = (column[i] >= left) & (line[i] >= top) & (column[i] < right) & (line[i] < bottom)
@@ -114,7 +116,7 @@ def select_inside(
 
 @disjoint_kernel
 def gather(values: Floats, places: Ints32, count: int, out: Floats) -> None:
-    """The rows (m, n) of numbers at some places."""
+    """Write the values (m, N) at `places` to `out` (m, n)."""
     for a in range(len(values)):
         own, chosen = values[a], out[a]
         for i in range(count):
@@ -123,7 +125,7 @@ def gather(values: Floats, places: Ints32, count: int, out: Floats) -> None:
 
 @disjoint_kernel
 def gather_pixels(projected: Floats, places: Ints32, count: int, out: Ints32) -> None:
-    """The pixels, columns and lines, of points at some places: (2, n)."""
+    """Write the pixels (column, line) of the points at `places` to `out` (2, n)."""
     for a in range(2):
         own, chosen = projected[a], out[a]
         for i in range(count):
@@ -132,52 +134,52 @@ def gather_pixels(projected: Floats, places: Ints32, count: int, out: Ints32) ->
 
 @kernel
 def depth_at(camera: Floats, points: Floats32, line: int, column: int) -> float:
-    """Depth of what a pixel shows, 0 where nothing."""
+    """Return the depth of a pixel; 0 if it is empty."""
     x, y, z = points[line, column, 0], points[line, column, 1], points[line, column, 2]
     return depth_of(camera[0], x, y, z)
 
 
 @kernel
 def growth_at(depth: float, reference: float, power: float) -> float:
-    """What lengths grow by at a depth: (depth / reference)^power, power 0, 1 or 2, at least 1."""
+    """Return the growth of lengths at a depth: (depth / reference)^power, at least 1.
+
+    `power` is 0, 1 or 2.
+    """
     ratio = depth / reference
     if power == 2:
         return max(1.0, ratio * ratio)
     return max(1.0, ratio) if power == 1 else 1.0
 
 
-# From a lens to a pinhole, from the range along the ray to z along the axis.
-
-_BLOCK = 2**18  #: samples worked on at once; bounds the memory of a 16-megapixel image
-_STEPS = 20  #: Newton steps at the most; a lens in use needs four
-_TOLERANCE = 1e-7  #: of the inverse, in x/z; a ten-thousandth of a pixel
+_BLOCK = 2**18  #: samples per block; bounds the memory for a 16-megapixel image
+_STEPS = 20  #: maximum number of Newton steps; real lenses need four
+_TOLERANCE = 1e-7  #: residual of the inverse in x/z, about 1e-4 pixels
 
 
 def undistort(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
-    """Return the depth image that a pinhole in the lens's place would have taken.
+    """Return the depth image of a pinhole without the lens's distortion.
 
-    Every pixel takes the nearest sample; nothing is interpolated, since between an edge
-    and what lies behind it there is nothing. Where the distortion polynomial folds back
-    on itself it describes no lens, and nothing is taken.
+    Each pixel takes the nearest sample: interpolation would invent points between an edge and its
+    background. Pixels are 0 beyond the field of view, and where the distortion polynomial folds
+    back on itself, since it describes no lens there.
 
     Parameters
     ----------
-    depth : (H, W) any one value per sample, 0 where missing
-    intrinsics : of the image, with its distortion
+    depth : (H, W) one value per sample, 0 if missing
+    intrinsics : intrinsics of the image, with its distortion
 
     Returns
     -------
-    depth : (H, W) the same values for `intrinsics.without_distortion()`; 0 where the
-        sensor did not look
+    depth : (H, W) the values for `intrinsics.without_distortion()`
 
     Raises
     ------
-    ValueError : the image has another size than the intrinsics.
+    ValueError : the sizes of image and intrinsics differ
     """
     _check_size(depth, intrinsics)
     if not any(intrinsics.distortion):
         return np.array(depth, dtype=np.float32)
-    # index -1 stands for "outside" and meets the zero appended here
+    # index -1 means "outside" and selects the appended zero
     samples = np.append(depth.astype(np.float32, copy=False).ravel(), np.float32(0.0))
     return samples[_sources(intrinsics)].reshape(depth.shape)
 
@@ -187,16 +189,16 @@ def ray_to_axis(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
 
     Parameters
     ----------
-    depth : (H, W) metres along the ray, 0 where missing
-    intrinsics : of the image, with its distortion
+    depth : (H, W) metres along the ray, 0 if missing
+    intrinsics : intrinsics of the image, with its distortion
 
     Returns
     -------
-    depth : (H, W) metres along the axis, 0 where missing or where the lens has no ray
+    depth : (H, W) metres along the axis, 0 if missing or if the lens has no ray there
 
     Raises
     ------
-    ValueError : the image has another size than the intrinsics.
+    ValueError : the sizes of image and intrinsics differ
     """
     _check_size(depth, intrinsics)
     return depth.astype(np.float32, copy=False) * _cosines(intrinsics)
@@ -204,11 +206,11 @@ def ray_to_axis(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
 
 @lru_cache(maxsize=2)
 def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
-    """Index of the sample each pixel takes, (H * W,); -1 where there is none."""
+    """Return the index of each pixel's sample, (H * W,); -1 if there is none."""
     c, k = intrinsics, _coefficients(intrinsics)
     sources = np.full(c.width * c.height, -1, dtype=np.int32)
     for block, x, y in _directions(c):
-        with np.errstate(all="ignore"):  # what overflows is seen by no sample
+        with np.errstate(all="ignore"):  # directions that overflow have no sample
             x_seen, y_seen = _distort(x, y, k)
             u, v = c.fx * x_seen + c.cx, c.fy * y_seen + c.cy
             inside = (u >= -0.5) & (u < c.width - 0.5) & (v >= -0.5) & (v < c.height - 0.5)
@@ -222,7 +224,7 @@ def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
 
 @lru_cache(maxsize=2)
 def _cosines(intrinsics: Intrinsics) -> Floats32:
-    """Cosine between each pixel's ray and the axis, (H, W); 0 where there is no ray."""
+    """Return the cosine between each pixel's ray and the axis, (H, W); 0 without a ray."""
     c, k = intrinsics, _coefficients(intrinsics)
     cosines = np.zeros(c.width * c.height, dtype=np.float32)
     for block, x, y in _directions(c):
@@ -237,13 +239,13 @@ def _cosines(intrinsics: Intrinsics) -> Floats32:
 def _check_size(depth: Floats32, intrinsics: Intrinsics) -> None:
     if depth.shape != (intrinsics.height, intrinsics.width):
         raise ValueError(
-            f"depth has shape {depth.shape}, the intrinsics say "
+            f"depth has shape {depth.shape}, but the intrinsics are for "
             f"({intrinsics.height}, {intrinsics.width})"
         )
 
 
 def _coefficients(intrinsics: Intrinsics) -> tuple[float, ...]:
-    """k1, k2, p1, p2, k3; those not given are 0."""
+    """Return k1, k2, p1, p2, k3, with 0 for missing ones."""
     return (*intrinsics.distortion, *(0.0,) * (5 - len(intrinsics.distortion)))
 
 
@@ -257,7 +259,7 @@ def _directions(c: Intrinsics) -> Iterator[tuple[slice, Floats, Floats]]:
 
 
 def _distort(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats]:
-    """Where a lens shows the direction (x, y): Brown-Conrady, OpenCV's order."""
+    """Distort the direction (x, y) by the Brown-Conrady model, coefficients in OpenCV's order."""
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -268,7 +270,7 @@ def _distort(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats
 
 
 def _jacobian(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats, Floats]:
-    """Derivatives of `_distort`: xx, xy and yy (it is symmetric)."""
+    """Return the derivatives xx, xy and yy of `_distort`; its Jacobian is symmetric."""
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -281,16 +283,16 @@ def _jacobian(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Float
 
 
 def _unfolded(x: Floats, y: Floats, k: tuple[float, ...]) -> NDArray[np.bool_]:
-    """Where the way from the centre to (x, y) is shown one to one: before the first fold."""
+    """Return a mask of the directions (x, y) before the first fold of the distortion."""
     unfolded = x * x + y * y < _first_fold(k) ** 2
-    for fraction in np.linspace(0.125, 1.0, 8):  # the tangential terms fold elsewhere
+    for fraction in np.linspace(0.125, 1.0, 8):  # tangential terms move the fold
         xx, xy, yy = _jacobian(fraction * x, fraction * y, k)
         unfolded &= xx * yy - xy * xy > 0.0  # False for NaN as well
     return unfolded
 
 
 def _first_fold(k: tuple[float, ...]) -> float:
-    """Least r = tan(angle to the axis) at which the radial polynomial stops growing."""
+    """Return the least r = tan(angle to the axis) at which the radial polynomial stops growing."""
     k1, k2, _, _, k3 = k
     r = np.tan(np.linspace(0.0, math.radians(89.9), 4096))
     r2 = r * r
@@ -301,7 +303,7 @@ def _first_fold(k: tuple[float, ...]) -> float:
 def _invert(
     x_seen: Floats, y_seen: Floats, k: tuple[float, ...]
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Directions that a lens shows at (x_seen, y_seen), by Newton, and where there is one."""
+    """Undistort (x_seen, y_seen) by Newton's method; return directions and a mask of the valid."""
     x, y = x_seen, y_seen
     for _ in range(_STEPS):
         x_off, y_off = (a - b for a, b in zip(_distort(x, y, k), (x_seen, y_seen), strict=True))

@@ -20,53 +20,50 @@ from sceneprint.errors import UselessFrame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 
-#: Steps of a coordinate in sums of squares, and of cubes: those of 5 million points stay below
-#: 2^63.
+#: Steps of a coordinate in sums of squares and cubes: sums of 5 million points stay below 2^63.
 _SQUARED = 2.0**20
 _CUBED = 2.0**13
 
 
 @dataclass(frozen=True)
 class CloudParameters:
-    """The numbers of what is done with a cloud; for depth sensors indoors.
+    """Parameters for clouds; the defaults are for indoor depth sensors.
 
-    Never change a default: models whose file does not hold these numbers were made with them.
+    Never change a default: models whose file lacks these parameters depend on it.
     """
 
-    minimum_range: float = 0.3  #: nearer points are left out, metres
-    maximum_range: float = 10.0  #: and farther ones, metres
-    minimum_points: int = 64  #: fewer points, voxels or pixels hold no geometry
+    minimum_range: float = 0.3  #: least range of a point, metres
+    maximum_range: float = 10.0  #: greatest range of a point, metres
+    minimum_points: int = 64  #: least number of points, voxels or pixels of a usable frame
     voxel_angle: float = 1.0 / 146.0  #: side of a voxel seen from the viewpoint, rad
-    voxel_size: float = 0.02  #: side of a voxel where there is no viewpoint, metres
-    seed_px: float = 5.2  #: from patch to patch, voxels
-    validation_seed_px: float = 8.2  #: and of those for validation, voxels
+    voxel_size: float = 0.02  #: side of a voxel without a viewpoint, metres
+    seed_px: float = 5.2  #: distance between patches, voxels
+    validation_seed_px: float = 8.2  #: distance between patches for validation, voxels
     maximum_patches: int = 1200  #: patches grow until there are no more
     maximum_validation_patches: int = 600  #: and those for validation
     maximum_pixels: int = 160 * 120 * 4  #: voxels and pixels grow until there are no more
     same_surface: float = 0.03  #: points of a pixel within this share of range are averaged
-    radius_px: int = 3  #: of the neighbourhood that a normal is of, voxels
-    range_gate: float = 0.05  #: of neighbours, first pass: as share of 1/range
-    plane_gate: float = 0.006  #: second pass: from the plane, as share of 1/range
-    noise_gate: float = 0.006  #: second pass: and beyond that share, 1/metres of 1/range
-    minimum_samples: int = 9  #: fewer neighbours fix no plane
+    radius_px: int = 3  #: radius of the neighbourhood of a normal, voxels
+    range_gate: float = 0.05  #: first pass: greatest difference of neighbours, share of 1/range
+    plane_gate: float = 0.006  #: second pass: greatest distance to the plane, share of 1/range
+    noise_gate: float = 0.006  #: second pass: constant term of that distance, 1/metres
+    minimum_samples: int = 9  #: least number of neighbours of a plane
     minimum_spread: float = 0.3  #: determinant of their 2 x 2 covariance, pixel^4
     minimum_cosine: float = 0.12  #: of the angle of incidence; more grazing is rejected
     image_angle: float = 1.0 / 146.0  #: side of a pixel of the range image, rad
-    image_radius_px: int = 3  #: of the window that a normal of it is of, pixels
+    image_radius_px: int = 3  #: radius of the window of a normal of the range image, pixels
     gap_px: int = 6  #: longest gap of a range image that is closed, pixels
-    gap_cosine: float = 0.95  #: between the normals of its two sides
+    gap_cosine: float = 0.95  #: least cosine between the normals of its two sides
 
 
 def select_in_range(cloud: Cloud, p: CloudParameters) -> Floats32:
-    """The points of a cloud that a model looks at: (M, 3) float32, C-contiguous.
+    """Return the points within the model's range, (M, 3) float32, C-contiguous.
 
-    Parameters
-    ----------
-    cloud : points about the viewpoint, metres
+    Without a viewpoint all points are returned.
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_points`.
+    UselessFrame : fewer than `minimum_points` points remain
     """
     points = np.ascontiguousarray(cloud.points, np.float32)
     if cloud.has_viewpoint:
@@ -86,12 +83,12 @@ def _select(points: Floats32, least: float, most: float, keep: np.ndarray) -> No
         keep[i] = square >= least * least and square <= most * most
 
 
-def _why_useless(cloud: Cloud, kept: int, p: CloudParameters) -> str:
+def _why_useless(cloud: Cloud, within: int, p: CloudParameters) -> str:
     name = f"{cloud.name}: " if cloud.name else ""
-    given = len(cloud.points)
-    if given < p.minimum_points:
+    count = len(cloud.points)
+    if count < p.minimum_points:
         return (
-            f"{name}{given} points are too few to show a surface. "
+            f"{name}{count} points are too few to show a surface. "
             f"Send a cloud of at least {p.minimum_points} points."
         )
     ranges = np.linalg.norm(cloud.points.astype(float), axis=1)
@@ -101,14 +98,14 @@ def _why_useless(cloud: Cloud, kept: int, p: CloudParameters) -> str:
     if middle > 100 * p.minimum_range:
         advice = f"if the coordinates are millimetres, say 1000 units per metre; or {advice}"
     return (
-        f"{name}{kept} of its {given} points lie within {span}, {p.minimum_points} are needed; "
+        f"{name}{within} of its {count} points lie within {span}, {p.minimum_points} are needed; "
         f"their median is {middle:.3g} m from the viewpoint. Check units and viewpoint: {advice}."
     )
 
 
 @kernel
 def _moments(points: Floats32, scale: float, second: np.ndarray) -> None:
-    """Sums of x_i x_j, in whole steps: (3, 3) int64."""
+    """Add x_i x_j of all points to `second` (3, 3) int64, in integer steps."""
     for i in range(len(points)):
         x = np.int64(np.rint(points[i, 0] * scale))
         y = np.int64(np.rint(points[i, 1] * scale))
@@ -123,7 +120,7 @@ def _moments(points: Floats32, scale: float, second: np.ndarray) -> None:
 
 @kernel
 def _skews(points: Floats32, scale: float, axes: Floats, third: np.ndarray) -> None:
-    """Sums of the cubes along each axis, in whole steps: (3,) int64."""
+    """Add the cubes of coordinates along each axis to `third` (3,) int64, in integer steps."""
     for i in range(len(points)):
         x, y, z = points[i, 0] * scale, points[i, 1] * scale, points[i, 2] * scale
         for k in range(3):
@@ -132,18 +129,14 @@ def _skews(points: Floats32, scale: float, axes: Floats, third: np.ndarray) -> N
 
 
 def principal_axes(points: Floats32) -> Floats:
-    """Axes of a cloud that turn with it: rows, of falling second moment about the origin.
+    """Return the principal axes of a cloud, rows of a rotation (3, 3), by falling second moment.
 
-    The first two point to where the third moment is positive; the third makes a right-handed
-    frame. Where moments tie, as of a sphere, the axes are any.
+    The first two point to positive third moments; the third completes a right-handed frame. Axes
+    with equal moments, as of a sphere, are arbitrary. `points @ axes.T` are coordinates along them.
 
     Parameters
     ----------
     points : (N, 3) float32
-
-    Returns
-    -------
-    axes : (3, 3), a rotation: `points @ axes.T` are coordinates along them
     """
     reach = float(np.abs(points).max(initial=0.0)) * 3.0**0.5
     if not reach > 0:
@@ -161,15 +154,11 @@ def principal_axes(points: Floats32) -> Floats:
     return axes
 
 
-# Input of Sec. III, clouds: the points in each cell of a grid become one.
-#
-# points (N, 3), axes  --thinned-->  means (V, 4), side of a cell
-
-#: Steps of a number from 0 to 1 in sums: those of 5 million points stay below 2^63.
+#: Steps of a number from 0 to 1 in sums: sums of 5 million points stay below 2^63.
 _STEPS = 2.0**38
-#: Cells of an axis, either way, where there is no viewpoint: three of them are one key.
+#: Cells per half axis without a viewpoint: three coordinates fit one key.
 _REACH = 1 << 20
-#: Cells that are counted before all are made larger, times the most that are wanted.
+#: Cells that are counted before they are enlarged, as a multiple of their maximum number.
 _ROOM = 4
 
 Ints64 = NDArray[np.int64]
@@ -177,7 +166,7 @@ Ints64 = NDArray[np.int64]
 
 @kernel
 def direction_cell(x: float, y: float, z: float, angle: float) -> int:
-    """Cell of a direction on the cube about the viewpoint, its sides cut into equal angles."""
+    """Return the cell of a direction on a cube whose sides are divided into equal angles."""
     n = int(np.ceil(np.pi / 2 / angle))
     ax, ay, az = abs(x), abs(y), abs(z)
     if az >= ax and az >= ay:
@@ -196,7 +185,7 @@ def direction_cell(x: float, y: float, z: float, angle: float) -> int:
 
 @kernel
 def metric_cell(x: float, y: float, z: float, size: float) -> int:
-    """Cell of a place on a grid of cubes."""
+    """Return the cell of a position in a grid of cubes."""
     a = min(max(int(np.floor(x / size)), -_REACH), _REACH - 1) + _REACH
     b = min(max(int(np.floor(y / size)), -_REACH), _REACH - 1) + _REACH
     c = min(max(int(np.floor(z / size)), -_REACH), _REACH - 1) + _REACH
@@ -205,10 +194,9 @@ def metric_cell(x: float, y: float, z: float, size: float) -> int:
 
 @kernel
 def hash_key(key: int, secret: int) -> int:
-    """Where a key goes in a hash table whose size is a power of two.
+    """Return the slot of a key in a hash table whose size is a power of two.
 
-    Who knows the hash can make a cloud all of whose cells share a slot, so there is a secret;
-    what comes of it must not depend on it.
+    The secret prevents crafted clouds whose cells share a slot. Results must not depend on it.
     """
     h = (key ^ secret) * 0x9E3779B97F4A7C1
     h ^= h >> 31
@@ -221,9 +209,9 @@ def _gather(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, side: float, step: float,
     unit: float, secret: int, keys: Ints64, bins: Ints64, sums: Ints64,
 ) -> int:  # fmt: skip
-    """Sums of the points in each occupied cell; how many there are, or -1 for too many.
+    """Sum the points of each occupied cell; return the number of cells, or -1 for too many.
 
-    seen: number, unit / r, direction; else: number, 0, coordinates in units.
+    Sums are count, unit / r and direction if `seen`, else count, 0 and coordinates in units.
     """
     size = 16
     while size < 2 * len(keys):
@@ -266,7 +254,7 @@ def _gather(
 
 @kernel
 def _merge_shells(keys: Ints64, bins: Ints64, order: Ints64, sums: Ints64, out: Ints64) -> int:
-    """Cells in order of their keys; two in one direction, one behind the other, become one."""
+    """Write cells in order of their keys, with adjacent shells of one direction merged."""
     n, i = 0, 0
     while i < len(order):
         out[n] = sums[order[i]]
@@ -281,7 +269,7 @@ def _merge_shells(keys: Ints64, bins: Ints64, order: Ints64, sums: Ints64, out: 
 
 
 def centroid(points: Floats32) -> Floats:
-    """Mean of points (N, 3), the same in any order."""
+    """Return the mean of points (N, 3), independent of their order."""
     unit = max(float(np.abs(points).max()) * 2, 1e-9)
     whole = np.rint(points.astype(float) * (_STEPS / unit)).astype(np.int64)
     mean: Floats = whole.sum(axis=0) / len(points) * (unit / _STEPS)
@@ -291,7 +279,7 @@ def centroid(points: Floats32) -> Floats:
 def average_cells(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, unit: float, p: CloudParameters
 ) -> tuple[Floats, float]:
-    """Means of the occupied cells (V, 4), and the side of a cell."""
+    """Return the means of the occupied cells (V, 4), and the side of a cell."""
     side = p.voxel_angle if seen else p.voxel_size
     room = min(_ROOM * p.maximum_pixels, len(points))
     keys, bins = np.empty(room, np.int64), np.empty(room, np.int64)

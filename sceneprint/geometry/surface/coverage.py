@@ -1,10 +1,6 @@
-"""What several views of one place have seen of it together: the paper's last figure, as numbers.
+"""Measure the surface and volume that several views of a place observe (the paper's last figure).
 
-mesh (N), views (V)  --first_seen-->  (N,) view  --added_areas-->  (V,) square metres
-views (V)            --observed_volume-->  cubic metres
-points (N), views    --share_seen-->  share of them
-
-A view is a frame whose pose is T_query_view; all lengths are metres of the query's frame.
+A view is a frame whose pose is T_query_view. All lengths are metres in the query's frame.
 """
 
 from __future__ import annotations
@@ -18,9 +14,9 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32
 
-#: A point is seen by a view that measures its depth within so many metres, and this share of it.
+#: Tolerance within which a view's depth agrees with a point's: metres plus a share of the depth.
 AGREES_M, AGREES_SHARE = 0.05, 0.03
-#: Edge of the cells in which volume is counted, and how many cells there may be.
+#: Least edge of the cells of a volume, metres, and the maximum number of cells.
 CELL_M, MOST_CELLS = 0.05, 2_000_000
 
 
@@ -31,8 +27,8 @@ class TriangleMesh:
     Parameters
     ----------
     points : (N, 3) float64, metres
-    normals : (N, 3) float64, unit length, towards the side that was seen
-    triangles : (M, 3) int32, indices of points, counter-clockwise from the side that was seen
+    normals : (N, 3) float64, unit length, towards the observed side
+    triangles : (M, 3) int32, indices of points, counter-clockwise from the observed side
     """
 
     points: Floats
@@ -40,14 +36,14 @@ class TriangleMesh:
     triangles: Ints32
 
     def areas(self) -> Floats:
-        """(M,) square metres."""
+        """Return the areas of the triangles, (M,) square metres."""
         a, b, c = (self.points[self.triangles[:, i]] for i in range(3))
         areas: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
         return areas
 
 
 def camera_of(view: DepthFrame) -> Floats:
-    """(16,) as the kernels read a view: rotation and translation T_view_query, fx, fy, cx, cy."""
+    """Return a view for kernels, (16,): rotation, translation of T_view_query, fx, fy, cx, cy."""
     if view.pose is None:
         raise ValueError(f"view {view.name!r} has no pose")
     T, k = inverse(view.pose), view.intrinsics
@@ -56,7 +52,7 @@ def camera_of(view: DepthFrame) -> Floats:
 
 @kernel
 def _depth_error(point: Floats, camera: Floats, depth: Floats32) -> tuple[float, float]:
-    """How far behind the surface a view measures a point lies, and its depth; inf if not seen."""
+    """Return a point's distance behind the view's surface, and its depth; inf if unobserved."""
     x = camera[0] * point[0] + camera[1] * point[1] + camera[2] * point[2] + camera[9]
     y = camera[3] * point[0] + camera[4] * point[1] + camera[5] * point[2] + camera[10]
     z = camera[6] * point[0] + camera[7] * point[1] + camera[8] * point[2] + camera[11]
@@ -91,19 +87,18 @@ def first_seen(
     metres: float = AGREES_M,
     share: float = AGREES_SHARE,
 ) -> tuple[Ints32, Ints32]:
-    """The first view that sees each point.
+    """Return the first view that sees each point.
 
     Parameters
     ----------
     points : (N, 3)
-    views : in order
-    metres, share : how near the measured depth must be to the point's
+    views : views in order
+    metres, share : tolerance of the depth; see AGREES_M
 
     Returns
     -------
-    first : (N,) index of the view, -1 where none sees it
-    nearest : (N,) index of the view whose surface is nearest along its rays; 0 where no view looks
-        at it
+    first : (N,) index of the view, -1 if no view sees the point
+    nearest : (N,) index of the view whose surface is nearest along its ray; 0 if there is none
     """
     first, nearest = np.full(len(points), -1, np.int32), np.zeros(len(points), np.int32)
     error = np.full(len(points), np.inf)
@@ -114,21 +109,21 @@ def first_seen(
 
 
 def share_seen(points: Floats, views: Sequence[DepthFrame]) -> float:
-    """Share of points that at least one view sees; 0 without points."""
+    """Return the share of points that at least one view sees; 0 without points."""
     first, _ = first_seen(points, views)
     return float((first >= 0).mean()) if len(points) else 0.0
 
 
 def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: float) -> Ints32:
-    """(N,) the first view that sees each point of a mesh made of these views.
+    """Return the first view that sees each point of a mesh fused from these views, (N,).
 
     Parameters
     ----------
-    views : in order
-    tolerance : how far a fused surface may lie from what one view measured, metres
+    views : views in order
+    tolerance : greatest distance of the fused surface from a view's depth, metres
     """
     first, nearest = first_seen(mesh.points, views, tolerance, 0.0)
-    # between two pixels, or at an edge, a point of the mesh may be no pixel's
+    # between two pixels, or at an edge, a point of the mesh may agree with no pixel
     return np.where(first >= 0, first, nearest).astype(np.int32)
 
 
@@ -169,16 +164,13 @@ def _mark(
 
 
 def observed_volume(views: Sequence[DepthFrame]) -> tuple[float, float]:
-    """Space that is known to be empty or surface: what lies between cameras and what they saw.
+    """Return the volume between the cameras and the observed surfaces, in cubic metres.
+
+    Also returns the edge of the cells in which it was counted, metres; distant views enlarge it.
 
     Parameters
     ----------
-    views : with depth 0 where nothing is known
-
-    Returns
-    -------
-    volume : cubic metres
-    cell : edge of the cells it was counted in, metres; larger where the views reach far
+    views : views with depth 0 where unknown
     """
     corners = [
         transform_points(view.pose, _outline(view)) for view in views if view.pose is not None
@@ -195,7 +187,7 @@ def observed_volume(views: Sequence[DepthFrame]) -> tuple[float, float]:
 
 
 def _outline(view: DepthFrame) -> Floats:
-    """The camera, and the corners of its view cone as deep as it saw: (5, 3), its own frame."""
+    """Return the camera and the corners of its view cone at the greatest depth, (5, 3)."""
     k, far = view.intrinsics, float(view.depth.max(initial=0.0))
     if not far > 0:
         return np.zeros((0, 3))

@@ -1,9 +1,12 @@
-"""Input of Sec. III: a depth image to a reduced map of inverse depth.
+"""Reduce a depth image to inverse depth, points and unit normals (Sec. III).
 
     depth (H, W)  --inverse_depth-->  1/z (h, w), with the intrinsics of the reduced map
+    1/z (h, w)  --fit_surface-->  points, normals (h, w, 3)
 
-The work is done in inverse depth throughout: the image of a plane is linear there, and the
-noise of a structured-light sensor has the same size everywhere.
+The inverse depth of a plane is linear in the image, 1/z = q + a dx + b dy, and the noise of a
+structured-light sensor is uniform there. A least-squares fit of (q, a, b) over a window gives the
+normal and the denoised point. The first pass selects samples by depth, the second by distance to
+the plane.
 """
 
 from __future__ import annotations
@@ -20,15 +23,15 @@ from sceneprint.types import DepthFrame, Floats32, Intrinsics, Surface
 
 @dataclass(frozen=True)
 class DepthParameters:
-    """The numbers of the reduction."""
+    """Parameters of the reduction."""
 
     minimum_depth: float = 0.3  #: nearer samples are missing, metres
     maximum_depth: float = 9.0  #: the sensor's range; farther samples are missing, metres
     same_surface: float = 0.03  #: samples within this share of the nearest are averaged
     focal_length_px: float = 146.0  #: the image is halved until f is nearest to this
-    maximum_pixels: int = 160 * 120 * 4  #: and on, until the map is no larger than this
-    minimum_valid: int = 64  #: fewer valid pixels of the map hold no geometry
-    minimum_side: int = 8  #: an image with fewer rows or columns shows no surface, pixels
+    maximum_pixels: int = 160 * 120 * 4  #: and until the map has at most so many pixels
+    minimum_valid: int = 64  #: least number of valid pixels of a usable frame
+    minimum_side: int = 8  #: least number of rows and columns of a usable image
 
 
 @kernel
@@ -38,7 +41,7 @@ def _in_range(depth: Floats32, minimum: float, maximum: float) -> Floats32:
     for y in range(height):
         for x in range(width):
             z = depth[y, x]
-            if z >= minimum and z <= maximum:  # false for NaN as well
+            if z >= minimum and z <= maximum:  # NaN compares false
                 q[y, x] = np.float32(1.0) / z
     return q
 
@@ -59,13 +62,13 @@ def _halve(q: Floats32, same_surface: float) -> Floats32:
             wb = one if b >= least else zero
             wc = one if c >= least else zero
             wd = one if d >= least else zero
-            # where all four are missing, least = 0 and the mean is 0: missing
+            # if all four are missing, least = 0 and the mean is 0: missing
             half[y, x] = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
     return half
 
 
 def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
-    """The camera of an image reduced 2 x 2 (pixel centres at integers; odd edges fall off)."""
+    """Return the camera of an image reduced 2 x 2 (pixel centres at integers, odd edges cut)."""
     return replace(
         intrinsics,
         width=intrinsics.width // 2,
@@ -78,7 +81,7 @@ def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
-    """How often to halve an image so that a pixel covers the same angle for every sensor."""
+    """Return the number of halvings after which pixels of all sensors cover similar angles."""
     times, camera = 0, intrinsics
     while min(camera.width, camera.height) >= 4 and (
         camera.fx > p.focal_length_px * 2**0.5 or camera.width * camera.height > p.maximum_pixels
@@ -90,9 +93,8 @@ def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
 def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intrinsics]:
     """Mask, reduce and invert a depth image.
 
-    Missing samples and those out of range go first; then each halving averages, of every
-    2 x 2 samples, those that lie on the nearest surface, so that no point is invented
-    between an edge and its background.
+    Each halving averages those of 2 x 2 samples that lie on the nearest surface, so it invents no
+    point between an edge and its background.
 
     Parameters
     ----------
@@ -100,14 +102,14 @@ def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intr
 
     Returns
     -------
-    q : (h, w) float32, 1/z in 1/metres; 0 where missing
-    intrinsics : of the reduced map
+    q : (h, w) float32, 1/z in 1/metres; 0 if missing
+    intrinsics : intrinsics of the reduced map
 
     Raises
     ------
     UselessFrame : fewer than `minimum_valid` pixels lie within the range, or the image has
-        fewer than `minimum_side` rows or columns.
-    ValueError : the depth is not (H, W) as the intrinsics say.
+        fewer than `minimum_side` rows or columns
+    ValueError : the sizes of depth and intrinsics differ
     """
     camera = frame.intrinsics
     if frame.depth.shape != (camera.height, camera.width):
@@ -127,12 +129,12 @@ def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intr
 
 
 def _why_useless(frame: DepthFrame, p: DepthParameters) -> str:
-    given = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
+    samples = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
     name = f"{frame.name}: " if frame.name else ""
-    if not given.size:
+    if not samples.size:
         return f"{name}every depth sample is missing. Check the sensor, or send another frame."
-    within = (given >= p.minimum_depth) & (given <= p.maximum_depth)
-    counted = f"{within.sum()} of its {given.size} valid depth samples lie within"
+    within = (samples >= p.minimum_depth) & (samples <= p.maximum_depth)
+    counted = f"{within.sum()} of its {samples.size} valid depth samples lie within"
     span = f"the model's range of {p.minimum_depth:g} to {p.maximum_depth:g} m"
     if within.mean() > 0.5:
         return (
@@ -140,14 +142,12 @@ def _why_useless(frame: DepthFrame, p: DepthParameters) -> str:
             "Check fx and fy, or send a frame that sees more of the scene."
         )
     return (
-        f"{name}{counted} {span}; their median is {np.median(given):.3g} m. "
+        f"{name}{counted} {span}; their median is {np.median(samples):.3g} m. "
         "Check the depth scale (stored units per metre), or use a model made for this range."
     )
 
 
-# A depth image with more pixels, for what reads the nearest one: steps become slopes again.
-
-#: Samples within this share of the nearest lie on one surface.
+#: Samples within this share of the nearest lie on one surface, for `double_resolution`.
 SAME_SURFACE = 0.05
 
 
@@ -169,7 +169,7 @@ def _double(depth: Floats32, same_surface: float) -> Floats32:
             c, d = depth[y0 + 1, x0], depth[y0 + 1, x0 + 1]
             least, most = min(a, b, c, d), max(a, b, c, d)
             if not (least > 0 and most - least <= same_surface * least):
-                continue  # nothing is invented between an edge and its background
+                continue  # interpolation would invent points between an edge and its background
             s, t = u - x0, v - y0
             # a plane is linear in inverse depth
             inverse = (1 - t) * ((1 - s) / a + s / b) + t * ((1 - s) / c + s / d)
@@ -178,15 +178,9 @@ def _double(depth: Floats32, same_surface: float) -> Floats32:
 
 
 def double_resolution(frame: DepthFrame) -> DepthFrame:
-    """A frame of twice the width and height, interpolated where it sees one surface.
+    """Return the frame at twice the width and height, interpolated within surfaces.
 
-    Parameters
-    ----------
-    frame : depth (H, W) in metres, 0 where missing
-
-    Returns
-    -------
-    the same view, (2 H, 2 W)
+    Consumers that read the nearest pixel then see slopes instead of steps.
     """
     k = frame.intrinsics
     camera = replace(
@@ -197,32 +191,23 @@ def double_resolution(frame: DepthFrame) -> DepthFrame:
     return replace(frame, depth=_double(depth, SAME_SURFACE), intrinsics=camera)
 
 
-# Input of Sec. III: a map of inverse depth to points and unit normals.
-#
-#     1/z (h, w)  --surface-->  points, normals (h, w, 3)
-#
-# In the image, the inverse depth of a plane is linear: 1/z = q + a dx + b dy. A least-squares
-# fit of (q, a, b) over a window gives normal and denoised point at once, always facing the
-# sensor. Two passes: the first takes what is near in depth, the second what is near the plane.
-
-
 @dataclass(frozen=True)
 class NormalParameters:
-    """The numbers of the plane fit."""
+    """Parameters of the plane fit."""
 
     radius_px: int = 3  #: half the window's side, pixels of the reduced map
-    depth_gate: float = 0.05  #: first pass: samples within this share of the centre's 1/z
+    depth_gate: float = 0.05  #: first pass: greatest difference, share of the centre's 1/z
     plane_gate: float = 0.006  #: second pass: samples within gate (1 + 1/z) of the plane, 1/m
-    minimum_samples: int = 9  #: fewer fix no plane
+    minimum_samples: int = 9  #: least number of samples of a plane
     minimum_spread: float = 0.3  #: determinant of the samples' 2 x 2 covariance, pixel^4
-    minimum_cosine: float = 0.12  #: of the angle of incidence; more grazing is rejected
+    minimum_cosine: float = 0.12  #: least cosine of the angle of incidence
 
 
 @kernel
 def _weigh(
     row: Floats32, centre: Floats32, expected: Floats32, gate: Floats32, w: Floats32, wr: Floats32
 ) -> None:
-    """Weights (0 or 1) of one row of samples, and weighted differences to the centre."""
+    """Write the weights (0 or 1) of a row of samples, and their differences to the centre."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(len(w)):
         near = abs(row[x] - centre[x] - expected[x]) < gate[x]
@@ -244,9 +229,8 @@ def _fit(
 ) -> None:  # fmt: skip
     """Fit 1/z - centre = c + a dx + b dy around every pixel: out[:, y, x] = c, a, b, n, det.
 
-    A sample counts while |1/z - centre - plane| < constant + relative * centre. Whole rows
-    are accumulated offset by offset, and every inner loop writes one array: only so does
-    the compiler find it safe to work on eight or sixteen pixels at once.
+    A sample counts if |1/z - centre - plane| < constant + relative * centre. Rows are accumulated
+    offset by offset, and every inner loop writes one array, so the compiler can vectorize it.
     """
     height, width = q.shape
     one = np.float32(1.0)
@@ -338,22 +322,16 @@ def _lift(
 
 
 def fit_surface(q: Floats32, intrinsics: Intrinsics, p: NormalParameters) -> Surface:
-    """Points and unit normals by a least-squares plane in inverse depth around each pixel.
+    """Return points and unit normals of least-squares planes in inverse depth around each pixel.
+
+    Pixels whose window determines no plane, or with grazing incidence, are not valid.
 
     Parameters
     ----------
-    q : (h, w) float32, 1/z in 1/metres; 0 where missing
-
-    Returns
-    -------
-    surface : points in metres, normals towards the sensor; pixels whose window fixes no
-        plane, or whose surface is seen at grazing incidence, are not valid
+    q : (h, w) float32, 1/z in 1/metres; 0 if missing
     """
     height, width = q.shape
-    first, second = (
-        np.zeros((5, height, width), np.float32),
-        np.zeros((5, height, width), np.float32),
-    )
+    first, second = np.zeros((2, 5, height, width), np.float32)
     zero, gate = np.float32(0.0), np.float32(p.plane_gate)
     _fit(q, p.radius_px, zero, np.float32(p.depth_gate), np.zeros_like(first), first)
     _fit(q, p.radius_px, gate, gate, first, second)

@@ -62,7 +62,7 @@ def _see(
     size: int, depth: Floats32, reach: float, gap: float, views: Floats, limits: Floats,
     elements: Ints32, masks: NDArray[np.uint32],
 ) -> int:  # fmt: skip
-    """Write the elements visible through a face of the cube, and their views; return their number."""
+    """Write the elements visible through a face of the cube, and their views; return the count."""
     found = 0
     half = size / 2.0
     for block in range(len(starts)):
