@@ -14,8 +14,8 @@ from scipy.stats import chi2
 from sceneprint.geometry.registration.icp import (
     FINE,
     CovarianceParameters,
-    FreeDirection,
     Refinement,
+    SlidingDirection,
     adjoint,
     free_directions,
     pair_covariance,
@@ -223,7 +223,7 @@ def planes(
     return surface
 
 
-def displaced(free: FreeDirection, points: Floats) -> Floats:
+def displaced(free: SlidingDirection, points: Floats) -> Floats:
     """How far the error moves each point along its normal, per unit of it."""
     moved = free.translation + np.cross(free.rotation, points[:, :3])
     result: Floats = np.abs((moved * points[:, 3:]).sum(axis=1))

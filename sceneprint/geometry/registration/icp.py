@@ -464,7 +464,7 @@ class CovarianceParameters:
 
 
 @dataclass(frozen=True, eq=False)
-class FreeDirection:
+class SlidingDirection:
     """A direction in which a transform is hardly constrained.
 
     Parameters
@@ -552,7 +552,7 @@ def pair_covariance(
 
 def free_directions(
     covariance: Floats, p: CovarianceParameters | None = None
-) -> tuple[FreeDirection, ...]:
+) -> tuple[SlidingDirection, ...]:
     """Return the directions whose deviation is far above the least, the freest first.
 
     A plane has three: two translations within it, and the rotation about its normal; a corridor has
@@ -568,7 +568,7 @@ def free_directions(
             towards = vectors[:, i] / scale
             length = float(np.linalg.norm(towards))
             towards = towards / length * np.sign(towards[np.abs(towards).argmax()])
-            free.append(FreeDirection(towards[:3], towards[3:], float(deviations[i]) * length))
+            free.append(SlidingDirection(towards[:3], towards[3:], float(deviations[i]) * length))
     return tuple(free)
 
 
