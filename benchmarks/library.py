@@ -62,7 +62,7 @@ class Library:
         matching = partial(associate, geometry, ranking, selection.indices.tolist(), self._geometry)
         matches = clock.run("validate", lambda: matching(pose_of=self._pose))
         estimate = clock.run("locate", lambda: self._locate(geometry, matches))
-        before = searched(matches)
+        before = unguided_validations(matches)
         # as a service does
         if before is not None and estimate is not None and estimate.status != "found":
             matches = matching(known=before)

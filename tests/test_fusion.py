@@ -90,7 +90,7 @@ def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[Dept
     with pytest.raises(InvalidRequest, match=r"Voxels of 0\.05 m take \d+ blocks") as refused:
         fuse(around[:1], replace(p, most_blocks=40))
     # what is advised suffices; unasked, a voxel is chosen that does
-    advised = float(str(refused.value).split("Ask for ")[1].split(" m")[0])
+    advised = float(str(refused.value).split("Request ")[1].split(" m")[0])
     fuse(around[:1], replace(p, voxel_m=advised, most_blocks=40))
     assert fuse(around[:1], FusionParameters(most_blocks=40))[1] > 0.05
     # two pixels of the wall ahead, 1.5 m away

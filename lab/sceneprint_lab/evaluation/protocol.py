@@ -344,7 +344,9 @@ def view_of(frame: AnyFrame) -> AnyView:
     y, x = np.mgrid[GRID // 2 : k.height : GRID, GRID // 2 : k.width : GRID]
     points = points_at(frame, y, x)
     points = points[points[..., 2] > 0]
-    return OverlapView(np.ascontiguousarray(transform_points(frame.pose, points)), frame.depth, k, frame.pose)
+    return OverlapView(
+        np.ascontiguousarray(transform_points(frame.pose, points)), frame.depth, k, frame.pose
+    )
 
 
 def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
