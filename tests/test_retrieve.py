@@ -307,7 +307,7 @@ def test_frames_are_judged_by_the_numbers_of_their_model(
     strict = replace(small_model.parameters.validation, minimum_patches=10_000)
     other = replace(small_model, parameters=replace(small_model.parameters, validation=strict))
     mine = [replace(one, model_id=other.id) for one in (query, match)]
-    with pytest.raises(ModelMismatch, match=r"has not been used by this process. Give `p`"):
+    with pytest.raises(ModelMismatch, match=r"has not been used by this process. Pass `p`"):
         validate(*mine)
     made = geometry_of(see(room_frames[0], other.parameters), other)
     assert made.model_id == other.id
