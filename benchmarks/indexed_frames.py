@@ -13,7 +13,7 @@ from sqlalchemy import Connection, insert, select, update
 from sceneprint.models import Model, write_model
 from sceneprint.store import Database
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import keep_model
+from sceneprint.store.maps import store_model
 from sceneprint.store.tables import frames, maps, signatures
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState
@@ -82,7 +82,7 @@ def _map_number(connection: Connection, name: str, model: Model) -> int:
     """Return the number of a map, which is created if need be."""
     number = connection.execute(select(maps.c.number).where(maps.c.name == name)).scalar()
     if number is None:
-        keep_model(connection, model.id, model.name, write_model(model))
+        store_model(connection, model.id, model.name, write_model(model))
         values = {"name": name, "model_id": model.id, "revision": 0, "created_at": time.time()}
         connection.execute(insert(maps).values(values))
         record_event(connection, "map.created", name)

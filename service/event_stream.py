@@ -26,8 +26,8 @@ from sceneprint.errors import Busy, RateLimited, SceneprintError
 from sceneprint.process import NOBODY
 from sceneprint.store import Database
 from sceneprint.store.events import (
+    EventFilter,
     EventRow,
-    Wanted,
     list_events,
     newest_number,
     number_events,
@@ -110,7 +110,7 @@ class Feed:
         self._wake()
 
     async def batches(
-        self, wanted: Wanted, after: int | None, may_go_on: Callable[[], bool]
+        self, wanted: EventFilter, after: int | None, may_go_on: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         """Events as they come, each time with the number of the last one that the reader may know
         and needs no more.
@@ -131,7 +131,7 @@ class Feed:
             log.error("event stream failed", extra={"error": str(error)})
 
     async def _batches(
-        self, wanted: Wanted, after: int | None, may_go_on: Callable[[], bool]
+        self, wanted: EventFilter, after: int | None, may_go_on: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         if self._poller is None or self._poller.done():
             self._poller = asyncio.create_task(self._poll())
@@ -186,7 +186,7 @@ class Feed:
         number_events(self._database)
         with self._database.read() as connection:
             newest = newest_number(connection)
-            found = list_events(connection, Wanted(), after=newest - 1, limit=1)
+            found = list_events(connection, EventFilter(), after=newest - 1, limit=1)
         return found[0] if found else None
 
     def _is_behind(self) -> bool:
@@ -195,7 +195,7 @@ class Feed:
             return False
         with self._database.read() as connection:
             after = self._last.number - 1
-            return list_events(connection, Wanted(), after=after, limit=1) != [self._last]
+            return list_events(connection, EventFilter(), after=after, limit=1) != [self._last]
 
     async def _begin(self) -> None:
         """Go on from the newest event that there is."""
@@ -207,7 +207,7 @@ class Feed:
     def _more(self, place: int) -> list[EventRow]:
         number_events(self._database)
         with self._database.read() as connection:
-            return list_events(connection, Wanted(), after=place, limit=MOST)
+            return list_events(connection, EventFilter(), after=place, limit=MOST)
 
     async def _poll(self) -> None:
         """Look for what is new, as long as anybody listens."""

@@ -542,22 +542,3 @@ def room_mesh() -> bytes:
     """The mesh of a furnished room as a PLY file, in metres, z up."""
     room = make_room(np.random.default_rng(3))
     return write_ply(room.vertices, faces=room.faces)
-
-
-@pytest.fixture(scope="session")
-def bring_to() -> Callable[[str, str], None]:
-    """Lets the migrations of a version and before it make or change the database of a URL."""
-
-    def bring(url: str, version: str) -> None:
-        from alembic import command
-        from sqlalchemy import create_engine
-
-        from sceneprint.store.database import migration_config
-
-        config, engine = migration_config(), create_engine(url)
-        with engine.begin() as connection:
-            config.attributes["connection"] = connection
-            command.upgrade(config, version)
-        engine.dispose()
-
-    return bring

@@ -28,10 +28,10 @@ from sceneprint.errors import BundleError, DamagedBlob, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database
 from sceneprint.store.blobs.folder import is_digest
-from sceneprint.store.database import is_there, known_revisions, reach_database
+from sceneprint.store.database import database_exists, known_revisions, reach_database
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint.store.postgres.connection import allow
-from sceneprint.store.read_only import opened_blobs, require_present_schema
+from sceneprint.store.read_only import inspect_blobs, require_present_schema
 from sceneprint_client.api import FrameState
 
 #: Parts and blobs that are written at once: each waits for its disk, or for the network.
@@ -109,7 +109,7 @@ def take_backup(
     BundleError : the place is another store's, or another process writes there.
     UnusableStore, NewerSchema : the database or the place cannot be used, or is damaged.
     """
-    with _opened(settings.database) as database, opened_blobs(settings.blobs, database) as blobs:
+    with _opened(settings.database) as database, inspect_blobs(settings.blobs, database) as blobs:
         there = BundlePlace.open(place, create=True)
         there.claim(OpaqueIds(database).owner)
         with there.turn(), blobs.kept():  # before rows are read: what they refer to must not go
@@ -135,7 +135,7 @@ def _opened(url: str) -> Iterator[Database]:
     with closing(database):
         if database.is_sqlite and database.file is None:
             raise BundleError("A database in memory has no backup. Name one in a file.")
-        if not is_there(url):
+        if not database_exists(url):
             shown = database.file or database.shown
             raise UnusableStore(f"{shown}: there is no database. Name its folder with --data.")
         require_present_schema(database)

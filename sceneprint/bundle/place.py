@@ -206,7 +206,7 @@ class BundlePlace:
             then = f"The newest are: {', '.join(names[:3])}." if names else "Name another place."
             raise BundleError(f"{self.shown} holds no bundle{shown}. {then}")
         key = f"{_BUNDLES}{name or names[0]}.json"
-        found = self._objects.look(key)
+        found = self._objects.head(key)
         data = b"" if found is None or found.size > LONGEST else self._objects.get(key)
         return _decode(data, f"{self.shown}/{key}")
 

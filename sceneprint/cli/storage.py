@@ -54,12 +54,14 @@ def run_migrate(options: argparse.Namespace) -> int:
     later version wrote the database, or it cannot be reached.
     """
     from sceneprint.engine import Engine
-    from sceneprint.store.database import is_there, reach_database
+    from sceneprint.store.database import database_exists, reach_database
 
     settings = settings_of(options)
     database = reach_database(settings.database)
     try:
-        before, usable = _revisions(database) if is_there(settings.database) else (None, False)
+        before, usable = (
+            _revisions(database) if database_exists(settings.database) else (None, False)
+        )
         shown = f"{database.shown}: schema {before or 'none'}"
         if options.check:
             print(shown if usable else f"{shown}; run `sceneprint migrate`")

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.store.deletion import DAY_S, count_old, without_content
+from sceneprint.store.deletion import DAY_S, count_old_frames, without_content
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
 from sceneprint.store.parent_joins import count_poses
-from sceneprint.store.queue import job_ids_of
+from sceneprint.store.queue import signing_jobs
 from sceneprint.store.reencoding_rows import switch_progress
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint.types import Floats
@@ -122,7 +122,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
     """A map."""
     names, coming, overdue = model_names(connection), None, None
     if row.retention_days is not None:
-        overdue = count_old(connection, row.number, time.time() - DAY_S * row.retention_days)
+        overdue = count_old_frames(connection, row.number, time.time() - DAY_S * row.retention_days)
     if row.next_model_id is not None:
         label = model_label(names[row.next_model_id], row.next_model_id)
         now = switch_progress(connection, row)
@@ -152,7 +152,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
 
 def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:
     """Frames of one map; of deleted ones nothing is told that their purge will remove."""
-    jobs = job_ids_of(connection, [frame.number for frame in found])
+    jobs = signing_jobs(connection, [frame.number for frame in found])
     return [_frame(row, without_content(frame), jobs[frame.number]) for frame in found]
 
 

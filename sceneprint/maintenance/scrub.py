@@ -1,9 +1,10 @@
-"""Reading all stored bytes at a low rate, to find damage before a query or a restore does.
+"""Read all stored bytes at a low rate, to find damage before a query or a restore does.
 
-frames of the store  --Scrub.run, a slice each 4 s-->  damage reported, derived data signed again
+    frames of the store  --Scrub.run, a slice each 4 s-->  damage reported, derived data signed
+    again
 
-It checks frames by the function that `sceneprint fsck` uses. What is made of an upload is made
-again; anything else is only reported: nothing is moved while nobody looks.
+Frames are checked as by `sceneprint fsck`. Signatures and artifacts are computed again from
+uploads; other damage is only reported, as nothing is moved without an operator.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ from sceneprint.store.scrub_rows import (
 
 log = logging.getLogger(__name__)
 
-#: Frames that are looked at together, and the longest time for one slice.
+#: Number of frames to check together, and maximum seconds of a slice.
 AT_ONCE, TURN_S = 16, 0.2
-#: Seconds after which a process that has begun scrubs: it has other things to do first.
+#: Seconds between the start of a process and its first slice.
 BEGIN_S = 60.0
 
 
 class Scrub:
-    """Reads a slice of the store's bytes, where it is time; any number of processes may.
+    """Read slices of the store's bytes; several processes share the work.
 
     Parameters
     ----------
@@ -55,23 +56,24 @@ class Scrub:
     def run(
         self, may_go_on: Callable[[], bool] = lambda: True, *, now: bool = False
     ) -> ScrubRow | None:
-        """Read a slice, if it is due; what goes wrong is logged and tried again.
+        """Read a slice if it is due; errors are logged, and the slice is read again.
 
         Parameters
         ----------
-        may_go_on : asked after each few frames; where it says no the slice ends: a frame waits
-        now : look whether one is due, although this process did a moment ago
+        may_go_on : function that is called after every few frames; if it returns False, the slice
+            ends
+        now : whether to check for a due slice although this process did so recently
 
         Returns
         -------
-        where the scrub stands; None: nothing was read
+        row : progress of the scrub; None: nothing was read
         """
         rested = now or time.monotonic() >= self._next
         if self._budget <= 0 or self._store.database.read_only or not rested:
             return None
         self._next = time.monotonic() + SLICE_S
         try:
-            with self._store.database.read() as connection:  # most often it is not due: no lock
+            with self._store.database.read() as connection:  # usually not due, so no lock
                 row = read_scrub(connection)
                 if row is not None and not row.is_due(read_clock(connection)):
                     return None
@@ -85,7 +87,7 @@ class Scrub:
     def _read(self, row: ScrubRow, may_go_on: Callable[[], bool]) -> ScrubRow:
         until, folder = time.monotonic() + TURN_S, Folder(self._settings, self._store)
         damaged, finished, over = 0, False, False
-        while not over:  # a few frames at least, so that every pass ends
+        while not over:  # at least a few frames, so that every pass ends
             with self._store.database.read() as connection:
                 numbers = frames_behind(connection, row.position, AT_ONCE)
             if not numbers:
@@ -110,7 +112,7 @@ class Scrub:
         return row
 
     def _report(self, finding: Finding) -> None:
-        """Log what was found, and have signed again what can be."""
+        """Log a finding, and repair derived data."""
         about = {"map": finding.map, "frame_id": finding.frame_id, "finding": finding.kind}
         log.error("damage found", extra=about | {"means": finding.means})
         if finding.map is None or finding.frame_id is None:

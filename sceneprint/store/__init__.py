@@ -1,11 +1,8 @@
-"""The truth: one database with maps, frames, signatures and jobs, and blobs.
+"""The store: one database with maps, frames, signatures and jobs, and the blobs it refers to.
 
-Everything else on disk is a cache of this. Functions take the connection of a transaction, so
-that what belongs together is committed together; `Store` opens both parts, and the geometry
-artifacts that were read lately.
-
-A query compares itself with ten to twenty frames of the map, and a robot's next query with mostly
-the same ones. What depends on a frame alone is kept along with its artifact.
+Everything else on disk is a cache. Functions take the connection of a transaction, so that related
+changes are committed together. `Store` opens both parts, and caches geometry artifacts: the ten to
+twenty frames that a robot's query is aligned with are mostly those of its previous query.
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -34,7 +31,7 @@ from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import BucketOwner, ObjectBlobs
 from sceneprint.store.database import (
     Database,
-    is_there,
+    database_exists,
     open_database,
 )
 from sceneprint.store.database_errors import unusable
@@ -50,10 +47,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-# Geometry artifacts in memory.
-
-#: Memory of a frame over that of its arrays: samples, plane weights and symmetries are kept too,
-#: 0.2 of them where queries have used all of it.
+#: Ratio of a frame's memory to that of its arrays: cached samples, plane weights and symmetries
+#: take up to another 0.2.
 _OVERHEAD = 1.25
 
 
@@ -65,14 +60,15 @@ class _Entry:
 
 
 class GeometryCache:
-    """Bounded in bytes, least recently used first; safe to share between threads.
+    """Cache geometry artifacts in memory, bounded in bytes; safe to share between threads.
 
-    Entries are known by the hash of their content, so that none is ever out of date.
+    The least recently used entries are removed first. Keys are hashes of the content, so entries
+    are never stale.
 
     Parameters
     ----------
-    blobs : what artifacts are read from
-    most_bytes : of all entries together; 0 keeps none
+    blobs : source of the artifacts
+    most_bytes : maximum size of all entries together; 0 disables the cache
     """
 
     def __init__(self, blobs: Blobs, most_bytes: int) -> None:
@@ -82,12 +78,12 @@ class GeometryCache:
         self._bytes = 0
 
     def read(self, digest: str) -> Geometry:
-        """The artifact of a digest, which callers must not change.
+        """Return the artifact of a digest; callers must not change it.
 
         Raises
         ------
-        DamagedBlob : it is missing, or not what it was.
-        UnreadableGeometry : it is no artifact of this version.
+        DamagedBlob : the blob is missing or damaged.
+        UnreadableGeometry : the blob is not an artifact of this version.
         """
         with self._lock:
             entry = self._entries.get(digest)
@@ -97,7 +93,7 @@ class GeometryCache:
         geometry = read_geometry(self._blobs.get(digest))
         entry = _Entry(geometry, int(_OVERHEAD * _array_bytes(geometry)), time.monotonic())
         with self._lock:
-            self._remove(digest)  # another thread has read it meanwhile
+            self._remove(digest)  # another thread may have read the blob meanwhile
             self._entries[digest] = entry
             self._bytes += entry.size
             while self._bytes > self._most_bytes:
@@ -105,13 +101,13 @@ class GeometryCache:
         return geometry
 
     def forget(self, digests: Iterable[str]) -> None:
-        """Drop entries whose frames were deleted."""
+        """Remove the entries of deleted frames."""
         with self._lock:
             for digest in digests:
                 self._remove(digest)
 
     def forget_older(self, seconds: float) -> None:
-        """Drop what was read longer ago: another process may have deleted its frame since."""
+        """Remove entries older than `seconds`, as another process may have deleted their frames."""
         until = time.monotonic() - seconds
         with self._lock:
             for digest in [d for d, entry in self._entries.items() if entry.read_at <= until]:
@@ -119,7 +115,7 @@ class GeometryCache:
 
     @property
     def bytes_held(self) -> int:
-        """Memory of all entries, estimated."""
+        """Estimated memory of all entries."""
         return self._bytes
 
     def _remove(self, digest: str) -> None:
@@ -134,16 +130,14 @@ def _array_bytes(geometry: Geometry) -> int:
     return sum(array.nbytes for array in arrays) + geometry.descriptors.nbytes
 
 
-# Database and blobs.
-
-
 @dataclass(frozen=True, eq=False)
 class Store:
-    """Database and blobs, opened.
+    """An open database with its blobs.
 
     Parameters
     ----------
-    decoders : that bytes of uploads are decoded by
+    geometry_bytes : maximum size of the cache of geometry artifacts
+    decoders : decoders of uploads
     """
 
     database: Database
@@ -153,21 +147,21 @@ class Store:
 
     @property
     def read_only(self) -> bool:
-        """Whether nothing can be stored: it was opened so, or its disk was remounted since."""
+        """Whether the store was opened read-only, or its disk was remounted read-only since."""
         return self.database.read_only or self.database.turned_read_only or self.blobs.read_only
 
     @cached_property
     def geometries(self) -> GeometryCache:
-        """Geometry artifacts, those that were read lately from memory."""
+        """The cache of geometry artifacts."""
         return GeometryCache(self.blobs, self.geometry_bytes)
 
     @cached_property
     def seals(self) -> OpaqueIds:
-        """What numbers of its rows look like from outside."""
+        """The cipher of the row numbers that leave the service."""
         return OpaqueIds(self.database)
 
     def close(self) -> None:
-        """Give back all connections, and end the decoders."""
+        """Close all connections, and stop the decoders."""
         self.decoders.close()
         self.blobs.close()
         self.database.close()
@@ -176,38 +170,30 @@ class Store:
 def open_store(
     url: str, blobs: Path | str, geometry_bytes: int = 0, decoders: Decoders | None = None
 ) -> Store:
-    """Open both, made where both are missing.
+    """Open a store; create database and blobs if both are missing.
 
-    The folder of a database that is there is never made: its disk is not mounted, and what was
-    written in its place would be gone when it is.
+    The folder of an existing database is never created: its disk may not be mounted yet, and would
+    later hide what was written in its place.
 
     Parameters
     ----------
     blobs : folder, or URL of an object store
-    decoders : see Store; default: one upload at a time in this process
+    decoders : decoders of uploads; default: one upload at a time in this process
 
     Raises
     ------
     UnusableStore, NewerSchema : see `open_database` and `open_blobs`.
     """
-    return replace(
-        _open_store(url, blobs), geometry_bytes=geometry_bytes,
-        decoders=decoders or LocalDecoders(1),
-    )  # fmt: skip
-
-
-def _open_store(url: str, blobs: Path | str) -> Store:
-    new = not is_read_only(url) and not is_there(url)
+    new = not is_read_only(url) and not database_exists(url)
     if isinstance(blobs, Path):
         FolderBlobs(blobs, make=new)
-        if new:  # its folder need not be that of the blobs: `file:///folder`
-            _make_folder_of(url)
-    elif new:
+    if new:  # the database may lie in another folder than the blobs
         _make_folder_of(url)
     database = open_database(url)
     try:
-        found = open_blobs(blobs, database)
-        return Store(database, found)
+        return Store(
+            database, open_blobs(blobs, database), geometry_bytes, decoders or LocalDecoders(1)
+        )
     except BaseException:
         database.close()
         raise
@@ -216,48 +202,52 @@ def _open_store(url: str, blobs: Path | str) -> Store:
 def open_blobs(
     blobs: Path | str, database: Database, *, make: bool = False, claim: bool = True
 ) -> Blobs:
-    """Open the blobs that a database refers to.
+    """Open the blobs of a database.
 
-    An object store that is away is no error yet: what is asked of it is refused while it is.
+    If the object store is unreachable, the blobs are opened anyway, and requests fail until the
+    store is back.
 
     Parameters
     ----------
     blobs : folder, or URL of an object store
-    database : whose they are
-    make : a folder that is missing
-    claim : mark a prefix of an object store, or the folder of a fleet, that is nobody's yet; else
-        it is looked at alone
+    database : database that refers to the blobs
+    make : whether to create a missing folder
+    claim : whether to mark an unclaimed prefix or folder as this database's
 
     Raises
     ------
-    UnusableStore : they cannot be opened, or are another database's.
+    UnusableStore : the blobs cannot be opened, or belong to another database.
     """
-    anew = claim and not database.read_only
+    may_mark = claim and not database.read_only
     if isinstance(blobs, Path):
         folder = FolderBlobs(blobs, make=make)
-        # a folder beside a file of SQLite is that file's; hosts may name any to a server
+        # several databases of a server may name one folder by mistake
         if not database.is_sqlite and blobs.is_dir():
-            anew &= os.access(blobs, os.W_OK)  # who reads alone may have it mounted so
-            BucketOwner.of_folder(blobs).claim(OpaqueIds(database).owner, anew=anew)
+            may_mark &= os.access(blobs, os.W_OK)  # readers may mount it read-only
+            BucketOwner.of_folder(blobs).claim(OpaqueIds(database).owner, anew=may_mark)
         return folder
     objects = open_objects(blobs)
     locks: Locks
     if database.file is not None:
         locks = FileLocks(database.file.with_name(f"{database.file.name}-blobs"), make=True)
     elif database.is_sqlite:
-        raise UnusableStore("Blobs in an object store need a database that is kept: name a file.")
+        raise UnusableStore(
+            "Blobs in an object store need a permanent database: name a file, or a server."
+        )
     else:
         locks = SessionLocks(database)
-    found = ObjectBlobs(objects, locks, lambda: OpaqueIds(database).owner)
+    opened = ObjectBlobs(objects, locks, lambda: OpaqueIds(database).owner)
     try:
-        found.claim(anew=anew)
+        opened.claim(anew=may_mark)
     except StoreAway as error:
         log.warning("object store unreachable", extra={"error": str(error)})
-    return found
+    return opened
 
 
 def _make_folder_of(url: str) -> None:
-    """The folder of a new SQLite file; opening it says what is wrong with any other URL."""
+    """Create the folder of a new SQLite file; opening the database reports what is wrong with other
+    URLs.
+    """
     with suppress(ArgumentError, ValueError):
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite" and parsed.database:
@@ -265,4 +255,4 @@ def _make_folder_of(url: str) -> None:
             try:
                 make_folder(folder)
             except OSError as error:
-                raise unusable(f"{folder}: the folder cannot be made", error) from error
+                raise unusable(f"{folder}: the folder cannot be created", error) from error

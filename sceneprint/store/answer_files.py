@@ -1,7 +1,7 @@
-"""Files of stored answers, each under the id of its query: a folder, or objects of a fleet.
+"""Files of stored answers under their query ids: a folder, or objects of a fleet.
 
-The database says which of them are needed (`query_rows`). They are not synced to disk: an answer
-that is lost costs a look at it, and no data.
+The database says which files are needed (`query_rows`). They are not synced to disk: a lost answer
+cannot be viewed, but no data is lost.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from sceneprint.store.blobs.object_store import ObjectBlobs
 
 
 class AnswerFiles(ABC):
-    """Stored answers by their ids; several processes share them.
+    """Stored answers by query id; several processes share them.
 
-    Methods raise OSError or UnusableStore where the folder or the object store cannot be used.
+    Methods raise OSError or UnusableStore if the folder or the object store cannot be used.
     """
 
     @abstractmethod
@@ -30,19 +30,19 @@ class AnswerFiles(ABC):
 
     @abstractmethod
     def get(self, query_id: str) -> bytes:
-        """Return the bytes of an answer; FileNotFoundError where there are none."""
+        """Return the bytes of an answer; raise FileNotFoundError if it is missing."""
 
     @abstractmethod
     def delete(self, query_ids: Sequence[str]) -> None:
-        """Remove answers; of no consequence where there are none."""
+        """Remove answers; ignore missing ones."""
 
     @abstractmethod
     def list(self) -> Iterator[tuple[str, float]]:
-        """Yield the names of all files, and when each was written, seconds since 1970."""
+        """Yield the name and modification time (seconds since 1970) of every file."""
 
 
 class AnswerFolder(AnswerFiles):
-    """Answers in a folder, which is created with the first of them."""
+    """Answers in a folder, which the first answer creates."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -62,7 +62,7 @@ class AnswerFolder(AnswerFiles):
             (self._folder / name).unlink(missing_ok=True)
 
     def list(self) -> Iterator[tuple[str, float]]:
-        """See AnswerFiles; unfinished files of processes that died are among them."""
+        """See AnswerFiles; unfinished files of killed processes are included."""
         with suppress(FileNotFoundError), os.scandir(self._folder) as entries:
             for entry in entries:
                 with suppress(FileNotFoundError):  # another process has removed it
@@ -85,20 +85,21 @@ class AnswerObjects(AnswerFiles):
 
     def delete(self, query_ids: Sequence[str]) -> None:
         """See AnswerFiles."""
-        self._objects.delete(*(f"queries/{one}" for one in query_ids))
+        self._objects.delete(*(f"queries/{query_id}" for query_id in query_ids))
 
     def list(self) -> Iterator[tuple[str, float]]:
         """See AnswerFiles."""
-        for one in self._objects.list("queries/"):
-            yield one.key.removeprefix("queries/"), one.changed_at
+        for entry in self._objects.list("queries/"):
+            yield entry.key.removeprefix("queries/"), entry.changed_at
 
 
 def open_answers(blobs: Blobs, folder: Path) -> AnswerFiles:
-    """Return where answers are stored: beside the blobs, so that who shares those finds them.
+    """Return the answer files beside the blobs, so that all processes that share the blobs find
+    them.
 
     Parameters
     ----------
-    blobs : of the store
-    folder : for the answers, where blobs are in a folder as well
+    blobs : blobs of the store
+    folder : folder for the answers, if the blobs are in a folder as well
     """
     return AnswerObjects(blobs.objects) if isinstance(blobs, ObjectBlobs) else AnswerFolder(folder)

@@ -1,10 +1,10 @@
-"""The audit log: who changed what. Each line is written in the transaction of its change.
+"""The audit log: which actor changed what. Each line is written in the transaction of its change.
 
-    record_event (see `events`)  -->  a line for the change that the event tells of
-    record_change                -->  a line for a change that has no event
-    record_refusal               -->  a line for a request that was refused
+    record_event (see `events`)  -->  a line for the change that the event reports
+    record_change                -->  a line for a change without an event
+    record_refusal               -->  a line for a refused request
 
-Lines are only ever appended, and removed when they are old or a tenant has too many.
+Lines are never edited. Old lines are removed, and the oldest of a tenant that has too many.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from sqlalchemy import Connection, delete, func, insert, select
 from sceneprint.process import NOBODY, Actor
 from sceneprint.store.tables import among, audit, audit_values, tenants
 
-#: Newest lines of each tenant that are kept, some 200 bytes each.
+#: Maximum number of lines per tenant, approximately 200 bytes each.
 KEPT_LINES = 1_000_000
-#: Action of a line for a request that was refused.
+#: Action of the line of a refused request.
 REFUSED = "refused"
 
 
@@ -43,14 +43,14 @@ class AuditRow:
 
 @dataclass(frozen=True)
 class AuditFilter:
-    """Which lines are wanted; None: any.
+    """Conditions on the lines of a list; None matches every line.
 
     Parameters
     ----------
     actor : name of the key
-    map : name of the map that was changed
-    action : beginning of the action, such as `key.`
-    since : seconds since 1970
+    map : name of the changed map
+    action : prefix of the action, such as `key.`
+    since : earliest time, seconds since 1970
     """
 
     actor: str | None = None
@@ -63,29 +63,29 @@ def record_change(
     connection: Connection, action: str, map_name: str | None = None, target: str | None = None,
     **data: Any,
 ) -> None:  # fmt: skip
-    """Write a line for a change by the current actor; nothing where there is none.
+    """Write a line for a change by the current actor; without an actor, write nothing.
 
     Parameters
     ----------
-    connection : of the transaction of the change
-    action : as a kind of event, such as `job.cancelled`
-    map_name, target : that were changed
-    data : more, by action
+    connection : transaction of the change
+    action : name in the style of event kinds, such as `job.cancelled`
+    map_name, target : changed map and object
+    data : details of the action
     """
     append_lines(connection, [audit_values(action, map_name, target, data)])
 
 
 def append_lines(connection: Connection, lines: Iterable[dict[str, Any] | None]) -> None:
-    """Insert lines, see `audit_values`; those that are None are left out."""
-    if found := [one for one in lines if one is not None]:
-        connection.execute(insert(audit), found)
+    """Insert lines (see `audit_values`) that are not None."""
+    if rows := [line for line in lines if line is not None]:
+        connection.execute(insert(audit), rows)
 
 
 def record_refusal(
     connection: Connection, actor: Actor, tenant: str, map_name: str | None, target: str | None,
     request_id: str, **data: Any,
 ) -> None:  # fmt: skip
-    """Write a line for a request that was refused. Its texts may be anything, and are cut."""
+    """Write a line for a refused request. Its texts are unchecked, so they are cleaned and cut."""
     texts = {"map": map_name, "target": target}
     for name, text in texts.items():
         if text is not None:
@@ -103,7 +103,7 @@ def list_lines(
     connection: Connection, wanted: AuditFilter, limit: int, *, before: int | None = None,
     after: int | None = None,
 ) -> list[AuditRow]:  # fmt: skip
-    """Return lines, the newest first; with `after`, those above that number, the oldest first."""
+    """Return lines, the newest first; with `after`, return later lines, the oldest first."""
     order = audit.c.number.desc() if after is None else audit.c.number
     statement = select(audit).order_by(order).limit(limit)
     if after is not None:
@@ -121,39 +121,39 @@ def list_lines(
     return [AuditRow(**row) for row in connection.execute(statement).mappings()]
 
 
-def spent_lines(
+def surplus_lines(
     connection: Connection, before: float, limit: int, kept: int = KEPT_LINES
 ) -> list[int]:
-    """Return numbers of lines that may be removed: the oldest, and those of a tenant beyond `kept`.
+    """Return the numbers of lines to remove: old ones, and those of a tenant beyond `kept`.
 
     Parameters
     ----------
-    before : seconds since 1970; older lines may go. Where a clock was set back, an older line
-        behind a younger one stays until that is old too
-    limit : most numbers
-    kept : newest lines of each tenant that stay
+    before : lines from before this time (seconds since 1970) are old. If a clock was set back, an
+        old line behind a younger one stays until both are old
+    limit : maximum number of lines
+    kept : maximum number of lines per tenant
     """
     oldest = connection.execute(
         select(audit.c.number, audit.c.at).order_by(audit.c.number).limit(limit)
     ).all()
-    found = []
+    numbers = []
     for number, at in oldest:
         if at >= before:
             break
-        found.append(int(number))
+        numbers.append(int(number))
     newest = connection.execute(select(func.max(audit.c.number))).scalar()
-    if found or not oldest or newest is None or newest - oldest[0].number < kept:
-        return found
+    if numbers or not oldest or newest is None or newest - oldest[0].number < kept:
+        return numbers
     for name in (NOBODY, *connection.execute(select(tenants.c.name)).scalars()):
         own = select(audit.c.number).where(audit.c.tenant == name)
         newest_first = own.order_by(audit.c.number.desc())
         floor = connection.execute(newest_first.offset(kept).limit(1)).scalar()
         if floor is not None:
-            spent = own.where(audit.c.number <= floor).order_by(audit.c.number)
-            found += connection.execute(spent.limit(limit - len(found))).scalars()
-    return found
+            surplus = own.where(audit.c.number <= floor).order_by(audit.c.number)
+            numbers += connection.execute(surplus.limit(limit - len(numbers))).scalars()
+    return numbers
 
 
 def remove_lines(connection: Connection, numbers: Sequence[int]) -> None:
-    """Remove lines; see `spent_lines`."""
+    """Remove lines; see `surplus_lines`."""
     connection.execute(delete(audit).where(among(connection, audit.c.number, numbers)))

@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import Column, Connection, Row, insert, select, update
 
 from sceneprint.store.frames import write_frame
-from sceneprint.store.maps import count_on, find_map, free_id, next_revision, position
+from sceneprint.store.maps import add_usage, find_map, free_id, next_revision, position
 from sceneprint.store.signatures import StoredSignature, put_signatures, replace_signature
 from sceneprint.store.tables import (
     FrameRow,
@@ -126,7 +126,7 @@ def add_copied(connection: Connection, row: MapRow, found: Sequence[CopiedFrame]
     ]  # fmt: skip
     added = insert(frames).returning(frames.c.number, sort_by_parameter_order=True)
     numbers = connection.execute(added, rows).scalars().all()
-    count_on(connection, row.number, len(found), sum(one.values["bytes"] for one in found))
+    add_usage(connection, row.number, len(found), sum(one.values["bytes"] for one in found))
     tags = [
         {"frame_number": number, "tag": tag}
         for number, one in zip(numbers, found, strict=True)

@@ -1,21 +1,27 @@
-"""The database: opened, brought to its schema, and handed out as transactions.
+"""The database: open it, bring it to its schema, and run transactions.
 
 URL  --open_database-->  Database  --read | write-->  Connection
 """
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from secrets import token_bytes
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Connection, Engine, event
+from sqlalchemy import URL, Connection, Engine, event, insert, inspect, make_url, select, text
+from sqlalchemy.exc import ArgumentError
 
+import migrations
 from sceneprint.errors import NewerSchema, ReadOnlyStore, StoreLocked, UnusableStore
-from sceneprint.store.database_errors import database_label
+from sceneprint.process import current_tenant
+from sceneprint.store.database_errors import database_label, fault_of
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.sqlite import (
     BUSY_S,
@@ -26,40 +32,25 @@ from sceneprint.store.sqlite import (
     read_only_file,
     shrink_log,
 )
-
-if TYPE_CHECKING:
-    import psycopg
-import re
-from functools import cache
-from secrets import token_bytes
-from typing import TYPE_CHECKING
-
-from sqlalchemy import URL, insert, inspect, make_url, select, update
-from sqlalchemy.exc import ArgumentError
-
-import migrations
-from sceneprint.process import current_tenant
-from sceneprint.store.database_errors import fault_of
 from sceneprint.store.tables import metadata, schema_range, secrets
 from sceneprint.turns import ThreadTurns
 
 if TYPE_CHECKING:
+    import psycopg
     from alembic.config import Config
 
 
 _FOLDER = Path(migrations.__file__).parent
-#: How each file of `migrations/versions` says what it makes of what.
-_SAYS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
-
-
-#: Option of a connection: whether its transaction writes to single maps, and others to others.
+#: The lines of a file in `migrations/versions` that name its revision and the one before.
+_REVISIONS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
+#: Option of a connection: whether its transaction writes to single maps, beside writers of others.
 MAPS_OPTION = "sceneprint_maps"
-#: Writers of single maps at once in a process: each keeps a connection from the readers.
+#: Maximum number of concurrent writers of single maps in a process: each takes a connection.
 MAP_WRITERS = 8
 
 
 def migration_config() -> Config:
-    """What Alembic needs to find `migrations/`."""
+    """Return Alembic's configuration, which finds `migrations/`."""
     from alembic.config import Config
 
     config = Config()
@@ -69,43 +60,42 @@ def migration_config() -> Config:
 
 @cache
 def known_revisions() -> tuple[str, frozenset[str]]:
-    """The revision that this version works with, and all that it can bring there."""
-    made: dict[str, str] = {}
+    """Return the revision of this version, and all revisions that it can upgrade from."""
+    parents: dict[str, str] = {}
     for path in _FOLDER.glob("versions/*.py"):
-        said = dict(_SAYS.findall(path.read_text(encoding="utf-8")))
-        if "revision" in said:
-            made[said["revision"]] = said["down_revision"]
-    (head,) = made.keys() - made.values()
-    return head, frozenset(made)
+        names = dict(_REVISIONS.findall(path.read_text(encoding="utf-8")))
+        if "revision" in names:
+            parents[names["revision"]] = names["down_revision"]
+    (head,) = parents.keys() - parents.values()
+    return head, frozenset(parents)
 
 
 def revision_of(connection: Connection) -> str | None:
-    """Revision of a database; None: nobody has made a schema in it."""
+    """Return the revision of a database; None if it has no schema."""
     if not inspect(connection).has_table("alembic_version"):
         return None
-    found: str | None = connection.exec_driver_sql(
-        "SELECT version_num FROM alembic_version"
-    ).scalar_one_or_none()
-    return found
+    statement = "SELECT version_num FROM alembic_version"
+    revision: str | None = connection.exec_driver_sql(statement).scalar_one_or_none()
+    return revision
 
 
 @dataclass(frozen=True)
 class SchemaRange:
-    """The processes that may use a store.
+    """The schema of a store, and the processes that may use it.
 
     Parameters
     ----------
-    revision : the schema of the store
-    least : the oldest revision whose processes may write to it
+    revision : schema of the store
+    least : oldest revision whose processes may write to the store
     """
 
     revision: str
     least: str
 
     def allows(self, own: str) -> bool:
-        """Return whether a process that works with the revision `own` may use the store as it is.
+        """Return whether a process of revision `own` may use the store.
 
-        Revisions are numbers of four digits, so that they sort as texts.
+        Revisions are numbers of four digits, so they sort as texts.
         """
         return self.revision == own or (
             self.revision.isdecimal() and self.least <= own < self.revision
@@ -113,7 +103,7 @@ class SchemaRange:
 
 
 def schema_range_of(connection: Connection) -> SchemaRange | None:
-    """Return which processes may use a database; None if it has no schema yet."""
+    """Return the schema range of a database; None if it has no schema."""
     revision = revision_of(connection)
     if revision is None:
         return None
@@ -123,25 +113,21 @@ def schema_range_of(connection: Connection) -> SchemaRange | None:
 
 
 def require_schema(connection: Connection) -> None:
-    """See that a store has not been brought beyond what this process may write.
+    """Check that this process may still write to the store.
 
     Raises
     ------
-    NewerSchema : it has, since this process opened it; nothing may be written.
+    NewerSchema : a later version has migrated the store since this process opened it.
     """
-    row = connection.exec_driver_sql(postgres.SCHEMA).one()
-    _allow_schema(connection.engine, SchemaRange(*row))
+    _check_schema(connection.engine, connection.exec_driver_sql(postgres.SCHEMA).one())
 
 
-def _allow_schema(engine: Engine, found: SchemaRange) -> None:
-    own = known_revisions()[0]
-    if not found.allows(own):
-        raise _outdated(engine, found, own)
-
-
-def _outdated(engine: Engine, found: SchemaRange, own: str) -> NewerSchema:
+def _check_schema(engine: Engine, row: Any) -> None:
+    found, own = SchemaRange(*row), known_revisions()[0]
+    if found.allows(own):
+        return
     what = "later" if found.revision > own else "earlier"
-    return NewerSchema(
+    raise NewerSchema(
         f"{database_label(engine.url)} was brought to schema {found.revision} of a "
         f"{what} version of sceneprint while this process ran, and this process works with {own}. "
         "Nothing was stored. Stop this process, and start the version that the others run."
@@ -149,74 +135,69 @@ def _outdated(engine: Engine, found: SchemaRange, own: str) -> NewerSchema:
 
 
 def create_schema(connection: Connection) -> None:
-    """Create all tables of this version in an empty SQLite database, as the migrations would."""
+    """Create all tables of this version in an empty database, and note its revision."""
     head, _ = known_revisions()
     metadata.create_all(connection, checkfirst=False)
+    if connection.dialect.name == "postgresql":
+        for statement in postgres.NUMBERING:
+            connection.exec_driver_sql(statement)
     connection.execute(insert(schema_range).values(least_revision=head))
     connection.execute(insert(secrets).values(name="seals", value=token_bytes(32)))
     connection.exec_driver_sql(
         "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
         "CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num))"
     )
-    connection.exec_driver_sql("INSERT INTO alembic_version VALUES (?)", (head,))
+    connection.execute(text("INSERT INTO alembic_version VALUES (:head)"), {"head": head})
 
 
-# Which databases a URL may mean: SQLite or PostgreSQL.
-
-#: What a URL of a server begins with; the short ones are what providers hand out.
+#: Schemes of URLs of a server; providers issue URLs with the short ones.
 _SERVERS = ("postgresql", "postgres", "postgresql+psycopg")
 
 
-def database_url(given: str) -> URL:
-    """The URL of a database, of one of the two kinds that are known.
+def database_url(url_text: str) -> URL:
+    """Parse the URL of a SQLite or PostgreSQL database.
 
     Raises
     ------
-    UnusableStore : it is none, or of no such kind; the message repeats nothing of it but the kind.
+    UnusableStore : the URL is of no such database; the message repeats only its scheme.
     """
-    kind = given.partition(":")[0]
+    kind = url_text.partition(":")[0]
     try:
         if kind in _SERVERS:
-            return _of_server(given)
-        url = make_url(given)
+            if url_text.count("@") > 1:  # SQLAlchemy would take the rest for the name of a host
+                raise ValueError("an @ in a password")
+            return make_url(url_text).set(drivername="postgresql+psycopg")
+        url = make_url(url_text)
         is_sqlite = url.get_backend_name() == "sqlite"
-    # ValueError: a port that is no number, and may be half of a password
+    # ValueError: a port that is not a number, and may be half of a password
     except (ArgumentError, ValueError):
         raise UnusableStore(
-            f"{kind!r:.80} begins no URL of a database that can be opened. Set "
-            "SCENEPRINT_DATABASE_URL to one, such as postgresql+psycopg://user:password@host/name, "
+            f"The database URL that begins with {kind!r:.80} is not valid. Set "
+            "SCENEPRINT_DATABASE_URL to one such as postgresql+psycopg://user:password@host/name, "
             "with @ : and / in a password written as %40, %3A and %2F; or leave it out for SQLite "
             "in the data folder."
         ) from None
     if not is_sqlite:
         raise UnusableStore(
-            f"{kind!r:.80} is no database that is known. Set SCENEPRINT_DATABASE_URL to "
+            f"{kind!r:.80} is not a supported database. Set SCENEPRINT_DATABASE_URL to "
             "postgresql+psycopg://user:password@host/database, or leave it out for SQLite in the "
             "data folder."
         )
     return url
 
 
-def _of_server(given: str) -> URL:
-    if given.count("@") > 1:  # the rest would be taken for the name of a host, and be told
-        raise ValueError("an @ in a password")
-    return make_url(given).set(drivername="postgresql+psycopg")
-
-
-# A database brought to the schema of this version: by one process, while others wait.
-
-#: Alembic keeps the migration that runs in a variable of its module.
+#: Alembic stores the running migration in a variable of its module.
 _migrating = threading.Lock()
 
 
 def migrate(database: Database) -> None:
-    """Bring a database to the schema of this version, in one transaction.
+    """Bring a database to the schema of this version, in one transaction; other processes wait.
 
     Raises
     ------
-    ReadOnlyStore : it may be read alone, and an earlier version wrote it.
-    NewerSchema : a later version of sceneprint wrote it; nothing is touched.
-    UnusableStore : it cannot be written, or its rows refer to others that are not there.
+    ReadOnlyStore : the database is read-only, and an earlier version wrote it.
+    NewerSchema : a later version of sceneprint wrote the database; nothing is changed.
+    UnusableStore : the database cannot be written, or a foreign key refers to a missing row.
     """
     head, _ = known_revisions()
     with database.read() as connection:
@@ -226,45 +207,43 @@ def migrate(database: Database) -> None:
     if database.read_only:
         raise ReadOnlyStore(
             f"{database.shown} has schema {current}, this version needs {head}, and "
-            "the file is read-only. Open it once where it may be written, or use the version that "
+            "the file is read-only. Open it once from a writable disk, or use the version that "
             "wrote it."
         )
     with database.write(unchecked=True) as connection:  # another process may have been first
         current = current_revision(connection)
-        if current is None and database.is_sqlite:
+        if current is None:
             create_schema(connection)
         elif current != head:
             from alembic import command
 
             config = migration_config()
             config.attributes["connection"] = connection
-            if not database.is_sqlite and current is not None:
-                # who writes out of turn ends first, and who comes later finds the new schema
+            if not database.is_sqlite:
+                # wait for writers without a turn; later ones see the new schema
                 connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
             with _migrating:
                 command.upgrade(config, "head")
-            if current is None:  # no process of an earlier version has it open
-                connection.execute(update(schema_range).values(least_revision=head))
-            # what `unchecked` did not look at, looked at in the end
+            # `unchecked` turned this check off during the migration
             if (
                 database.is_sqlite
                 and connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None
             ):
                 raise UnusableStore(
-                    f"{database.shown}: rows refer to others that are not there, so it is "
-                    "not brought to the schema of this version, and nothing was changed. Run "
-                    "`sceneprint fsck` of the version that wrote it."
+                    f"{database.shown}: rows refer to missing rows, so the database was not "
+                    "migrated, and nothing was changed. Run `sceneprint fsck` of the version that "
+                    "wrote it."
                 )
 
 
 def current_revision(connection: Connection) -> str | None:
-    """Revision of a database that this version knows; None: nobody has made a schema in it.
+    """Return the revision of a database as this version knows it; None if it has no schema.
 
-    Of a later version's schema that this one may write to, it is the revision of this version.
+    For a later schema that this version may write to, return the revision of this version.
 
     Raises
     ------
-    NewerSchema : a later version of sceneprint wrote it, and this one may not use it.
+    NewerSchema : a later version of sceneprint wrote the database, and this one may not use it.
     """
     found, (head, known) = schema_range_of(connection), known_revisions()
     if found is None:
@@ -285,31 +264,31 @@ class Database:
 
     Parameters
     ----------
-    engine : of SQLAlchemy
-    sealed : where the file may be read alone
+    engine : SQLAlchemy's engine
+    sealed : the file, if it is read-only
     """
 
     def __init__(self, engine: Engine, sealed: ReadOnlyFile | None = None) -> None:
         self._engine, self._sealed = engine, sealed
-        # what a transaction sees is one state on both: in SQLite any does
+        # a reader sees one snapshot; in SQLite every transaction does
         self._readers = engine if self.is_sqlite else engine.execution_options(
             isolation_level="REPEATABLE READ", postgresql_readonly=True
         )  # fmt: skip
-        # of PostgreSQL they begin their transactions themselves, see `postgres.begin`
+        # writers on PostgreSQL begin their transactions themselves, see `postgres.begin`
         self._writers = engine if self.is_sqlite else engine.execution_options(
             isolation_level="AUTOCOMMIT"
         )  # fmt: skip
-        # of the writers of this process one asks for the turn, and the others wait here: each of
-        # them would keep a connection from the readers
+        # one writer of this process waits for the turn at the database, and the others wait here
+        # without a connection, which readers need
         self._turns, self._map_turns = ThreadTurns(1), ThreadTurns(MAP_WRITERS)
         file = None if sealed is not None else self.file
         self._line = None if file is None else WriterLine(file.parent)
-        self._held = False  # by another process, for longer than anybody should wait
+        self._held = False  # another process has held the lock for longer than BUSY_S
         self._guarded = False
         self._schema = postgres.KnownSchema(self._check_schema)
-        #: Timeline that the PostgreSQL server writes, as of the last connection: a promoted standby
-        #: begins another, and may lack what was committed last. What is held in memory of the one
-        #: before must then be given up. None of SQLite.
+        #: Timeline of the PostgreSQL server at the last connection; None of SQLite. A promoted
+        #: standby begins another timeline, and may lack the last commits: caches of rows of the
+        #: former timeline must be dropped.
         self.history: str | None = None
         if not self.is_sqlite:
             event.listen(engine, "connect", self._note_history)
@@ -319,60 +298,57 @@ class Database:
 
     @property
     def dialect(self) -> str:
-        """Which database it is: `sqlite` or `postgresql`."""
+        """The kind of database: `sqlite` or `postgresql`."""
         return self._engine.dialect.name
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether it is a file of this machine, of which one writer at a time holds the whole."""
+        """Whether the database is a file of this machine, with one writer at a time."""
         return self.dialect == "sqlite"
 
     @property
     def shown(self) -> str:
-        """Which database it is, to be told: without a password."""
+        """The database's name for messages, without a password."""
         return database_label(self._engine.url)
 
     @property
     def file(self) -> Path | None:
-        """Its file; None of a server, and of what is in memory."""
+        """The database file; None for a server or a database in memory."""
         name = self._engine.url.database if self.is_sqlite else None
         return Path(name).absolute() if name and name != ":memory:" else None
 
     @property
     def read_only(self) -> bool:
-        """Whether it may be read alone, and every `write` raises ReadOnlyStore."""
+        """Whether the database was opened read-only, so that every `write` raises ReadOnlyStore."""
         return self._sealed is not None
 
     @property
     def turned_read_only(self) -> bool:
-        """Whether its file may be read alone by now: disks turn read-only under those who use them,
-        and the system says so before anybody writes.
+        """Whether the file is read-only by now: a disk may be remounted read-only while it is in
+        use.
         """
         return self.is_sqlite and read_only_file(self._engine.url) is not None
 
     def require_writable(self) -> None:
-        """See that it may be written.
-
-        Raises
-        ------
-        ReadOnlyStore : it may be read alone.
-        """
+        """Raise ReadOnlyStore if the database is read-only."""
         if self._sealed is not None:
             raise self._sealed.refusal()
 
     def guard_schema(self) -> None:
-        """From now on, have each `write` see that the schema is one that this version may use."""
+        """Let each later `write` check that this version may use the schema."""
         self._guarded = True
 
     def require_schema(self) -> None:
-        """See that this process may still write; NewerSchema where another version migrated it."""
+        """Check that this process may still write; raise NewerSchema if a later version migrated
+        the store.
+        """
         if self._guarded:
             with self.read() as connection:
                 require_schema(connection)
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
-        """A transaction that sees one state and changes nothing."""
+        """Run a transaction that reads one snapshot and changes nothing."""
         before = None if self._sealed is None else self._sealed.state()
         with self.explained(), self._readers.connect() as connection:
             yield connection
@@ -384,30 +360,29 @@ class Database:
         self, *, unchecked: bool = False, turn: bool = True, map_number: int | None = None,
         single: bool = False,
     ) -> Iterator[Connection]:  # fmt: skip
-        """A transaction that is committed at the end, or leaves no trace where it raises.
+        """Run a transaction that is committed at the end, or rolled back if it raises.
 
         Parameters
         ----------
-        unchecked : let SQLite not look whether rows that others refer to are there: tables can be
-            made anew then. PostgreSQL has no such haste then, as to wait for a turn or to answer
-        turn : whether others wait until it is committed. Without it, on PostgreSQL, only rows may
-            be touched that are held against others, and no event may be told; SQLite has no
-            writers but in turn
-        map_number : of the only map that is written to. On PostgreSQL writers of other maps do not
-            wait then, so that no row may be touched that is of several maps, but for inserting one;
-            `record_event` is the way to tell an event
-        single : whether it is of one statement, which PostgreSQL then takes in its turn, executes
-            and commits in one round trip: it is committed when it has an answer. It has no say on
-            SQLite, nor for several maps
+        unchecked : turn off SQLite's foreign key checks, so that tables can be rebuilt. On
+            PostgreSQL, wait longer for the turn and for statements
+        turn : whether other writers wait until the commit. Without a turn on PostgreSQL, change
+            only rows that are locked, and record no event. SQLite ignores it
+        map_number : number of the only map that is written to. On PostgreSQL, writers of other maps
+            then do not wait: change no row that several maps share, and record events with
+            `record_event`
+        single : whether the transaction is one statement. With a single map, PostgreSQL waits for
+            the turn, executes and commits it in one round trip; the answer means that it is
+            committed. SQLite ignores it
 
         Raises
         ------
-        ReadOnlyStore : it may be read alone.
-        StoreLocked : another process writes for longer than BUSY_S; who comes after that waits
-            for HELD_S only (of the database's kind), until somebody gets through.
-        StoreFull : the disk has no room.
-        NewerSchema : another version has brought it beyond what this process may write.
-        UnusableStore : it cannot be written for another reason.
+        ReadOnlyStore : the database is read-only.
+        StoreLocked : another process has been writing for longer than BUSY_S. Later writers then
+            wait for HELD_S only, until one succeeds.
+        StoreFull : the disk is full.
+        NewerSchema : another version migrated the store beyond what this process may write.
+        UnusableStore : the database cannot be written for another reason.
         """
         self.require_writable()
         if not turn and not self.is_sqlite:
@@ -420,49 +395,51 @@ class Database:
         if unchecked and not self.is_sqlite:
             wait_s = postgres.MIGRATION_S
         with (
-            self._threads_turn(self._turns if map_number is None else self._map_turns, wait_s),
+            self._take_thread_turn(self._turns if map_number is None else self._map_turns, wait_s),
             self.explained(),
             self._writers.connect() as connection,
         ):
             if single and map_number is not None:
-                with self._single(connection, [map_number], wait_s, None) as writing:
+                with self._write_single(connection, [map_number], wait_s, None) as writing:
                     yield writing
             else:
-                with self._begun(connection, wait_s, map_number, unchecked) as writing:
+                with self._write_in_turn(connection, wait_s, map_number, unchecked) as writing:
                     yield writing
             if not self.is_sqlite:
                 postgres.require_synchronous(writing)
 
     @contextmanager
     def write_maps(self, map_numbers: Collection[int], wait_s: float) -> Iterator[Connection]:
-        """As `write` of a single statement, which writes to some maps at once, PostgreSQL. One
-        thread of a process does at a time.
+        """Run a single-statement transaction (see `write`) that writes to several maps on
+        PostgreSQL.
+
+        Only one thread of a process may do so at a time.
 
         Parameters
         ----------
-        map_numbers : of the only maps that are written to
-        wait_s : seconds to wait for one of them. Writers of the others wait for that, too
+        map_numbers : numbers of the only maps that are written to
+        wait_s : seconds to wait for each map. Writers of the other maps wait for it as well
 
         Raises
         ------
-        MapsInUse : it was not free by then; nothing was written.
+        MapsInUse : a map was still in use after `wait_s`; nothing was written.
         ReadOnlyStore and others : see `write`.
         """
         self.require_writable()
         turn_s = postgres.HELD_S if self._held else BUSY_S
-        # not in the turn among threads: whoever leads, it is of many tenants, and would wait for
-        # the maps of its own that are in use
-        with self._locks_noted(), self.explained(), self._writers.connect() as connection:
-            with self._single(connection, map_numbers, turn_s, wait_s) as writing:
+        # no turn among the threads of this process: the statement serves many tenants, and would
+        # wait for maps in use by them
+        with self._note_locks(), self.explained(), self._writers.connect() as connection:
+            with self._write_single(connection, map_numbers, turn_s, wait_s) as writing:
                 yield writing
             postgres.require_synchronous(writing)
 
     @contextmanager
-    def _single(
+    def _write_single(
         self, connection: Connection, map_numbers: Collection[int], wait_s: float,
         maps_wait_s: float | None,
     ) -> Iterator[Connection]:  # fmt: skip
-        """A transaction of one statement; see `SingleStatement`."""
+        """Run a transaction of one statement; see `SingleStatement`."""
         known = self._schema if self._guarded else None
         only = postgres.SingleStatement(map_numbers, wait_s, maps_wait_s, known)
         options: dict[str, Any] = {MAPS_OPTION: True, postgres.SINGLE: only}
@@ -473,33 +450,33 @@ class Database:
 
     @contextmanager
     def _write_out_of_turn(self) -> Iterator[Connection]:
-        """As `write`, for which nobody waits; PostgreSQL."""
-        # a migration begins once what holds its row is over
-        asked = (f"{postgres.SCHEMA} FOR KEY SHARE",) if self._guarded else ()
+        """Run a transaction without a turn, on PostgreSQL."""
+        # a migration waits for this lock
+        checks = (f"{postgres.SCHEMA} FOR KEY SHARE",) if self._guarded else ()
         with self.explained(), self._writers.begin() as connection:
-            row = postgres.begin(connection, *asked)
+            row = postgres.begin(connection, *checks)
             if row is not None:
                 self._check_schema(row)
             yield connection
 
     @contextmanager
-    def _threads_turn(self, turns: ThreadTurns, wait_s: float) -> Iterator[None]:
-        """The turn among the threads of this process."""
+    def _take_thread_turn(self, turns: ThreadTurns, wait_s: float) -> Iterator[None]:
+        """Take a turn among the threads of this process."""
         tenant = current_tenant()
         if not turns.acquire(tenant, wait_s):
             raise StoreLocked(
-                f"{self.shown}: other writers of this process have waited for long, and "
-                "nothing was stored. Come back later."
+                f"{self.shown}: other writers of this process have waited for too long, and "
+                "nothing was stored. Try again later."
             )
         try:
-            with self._locks_noted():
+            with self._note_locks():
                 yield
         finally:
             turns.release(tenant)
 
     @contextmanager
-    def _locks_noted(self) -> Iterator[None]:
-        """Have those that come next wait for less where a lock could not be had."""
+    def _note_locks(self) -> Iterator[None]:
+        """Let later writers wait for less time if the lock could not be taken."""
         try:
             yield
         except StoreLocked:
@@ -507,10 +484,10 @@ class Database:
             raise
 
     @contextmanager
-    def _begun(
+    def _write_in_turn(
         self, connection: Connection, wait_s: float, map_number: int | None, unchecked: bool
     ) -> Iterator[Connection]:
-        """A transaction in its turn, committed at the end."""
+        """Run a transaction in its turn, committed at the end."""
         options: dict[str, Any] = {
             "sceneprint_write": wait_s,
             "sceneprint_line": self._line,
@@ -518,33 +495,25 @@ class Database:
         }
         if unchecked and self.is_sqlite:
             options["sceneprint_unchecked"] = True
-            connection.detach()  # nobody else gets a connection that does not look
+            connection.detach()  # a connection without checks must not return to the pool
         writing = connection.execution_options(**options)
         with writing.begin():
-            checked = self._guarded and not unchecked
-            self._begin_writing(writing, wait_s, map_number, checked=checked)
+            checked, row = self._guarded and not unchecked, None
+            if not self.is_sqlite:  # SQLite gave the turn with the transaction
+                schema = postgres.SCHEMA if checked else None
+                row = postgres.take_turn(writing, wait_s, schema, map_number)
+            self._held = False
+            if row is not None:
+                self._check_schema(row)
+            elif checked:
+                require_schema(writing)
             yield writing
 
-    def _begin_writing(
-        self, writing: Connection, wait_s: float, map_number: int | None, *, checked: bool
-    ) -> None:
-        """Have the turn, which SQLite gave with the transaction, and see that it may be used."""
-        row = None
-        if not self.is_sqlite:
-            row = postgres.take_turn(
-                writing, wait_s, postgres.SCHEMA if checked else None, map_number
-            )
-        self._held = False
-        if row is not None:
-            self._check_schema(row)
-        elif checked:
-            require_schema(writing)
-
     def _check_schema(self, row: Any) -> None:
-        _allow_schema(self._engine, SchemaRange(*row))
+        _check_schema(self._engine, row)
 
     def shrink_log(self) -> bool:
-        """Leave nothing of what was deleted in SQLite's log; False where that has to wait."""
+        """Empty SQLite's log, which may hold deleted data; return False if readers prevent it."""
         if not self.is_sqlite or self.read_only:
             return True
         with self.explained():
@@ -555,40 +524,42 @@ class Database:
                 connection.close()
 
     def explained(self) -> AbstractContextManager[None]:
-        """Within it, what the database or its driver raises is told in our words."""
+        """Translate errors of the database and its driver within the context into errors of the
+        store.
+        """
         return explained(self._engine)
 
     def driver_connection(self) -> psycopg.Connection[Any]:
-        """A connection to PostgreSQL that commits each statement at once, for whom it is opened.
+        """Return a new connection to PostgreSQL that commits each statement at once.
 
-        What lasts as long as a connection does, such as LISTEN and locks of a session, needs one
-        that nobody else is given. Who asked closes it, and asks within `explained`.
+        Session state such as LISTEN and session locks needs a connection of its own. The caller
+        closes it, and executes its statements within `explained`.
 
         Raises
         ------
         UnusableStore : the server cannot be reached.
         """
         if self.is_sqlite:
-            raise ValueError(f"{self.shown} has no connections but those of its file")
+            raise ValueError(f"{self.shown} has no sessions")
         import psycopg
 
         with self.explained():
-            args, given = self._engine.dialect.create_connect_args(self._engine.url)
-            options = {**postgres.connect_options(self._engine.url), **given}
-            found = psycopg.connect(*args, **options, autocommit=True)
+            args, named = self._engine.dialect.create_connect_args(self._engine.url)
+            options = {**postgres.connect_options(self._engine.url), **named}
+            connection = psycopg.connect(*args, **options, autocommit=True)
             try:
-                postgres.configure(found)
+                postgres.configure(connection)
             except BaseException:
-                found.close()
+                connection.close()
                 raise
-        return found
+        return connection
 
     def close(self) -> None:
-        """Close all connections; those in use, when they are given back."""
+        """Close all connections; those in use close when they are returned."""
         pool = self._engine.pool
-        self._engine.dispose()  # the old pool would leave the others to the collector
+        self._engine.dispose()  # it leaves connections in use to the garbage collector
         event.listen(pool, "checkin", _close_connection)
-        pool.dispose()  # those that were given back meanwhile
+        pool.dispose()  # connections that were returned meanwhile
         if self._line is not None:
             self._line.close()
 
@@ -598,17 +569,17 @@ def _close_connection(connection: Any, _record: object) -> None:
         connection.close()
 
 
-def is_there(url: str) -> bool:
-    """Whether the database of a URL is a file that is there, or a server's that has a schema.
+def database_exists(url: str) -> bool:
+    """Return whether the database of a URL exists: a SQLite file, or a schema on a server.
 
     Raises
     ------
-    UnusableStore : the server cannot be asked.
+    UnusableStore : the server cannot be reached.
     """
     try:
         parsed = database_url(url)
     except UnusableStore:
-        return False  # opening it says why
+        return False  # opening the database reports what is wrong
     if parsed.get_backend_name() == "sqlite":
         return parsed.database is not None and Path(parsed.database).is_file()
     database = reach_database(url)
@@ -619,29 +590,27 @@ def is_there(url: str) -> bool:
         database.close()
 
 
-def reach_database(given: str) -> Database:
-    """A database as it is: no schema is made or looked at, and a server is not yet asked.
+def reach_database(url_text: str) -> Database:
+    """Open a database without looking at its schema; a server is not contacted yet.
 
     Raises
     ------
-    UnusableStore : the URL is none of a database that is known.
+    UnusableStore : the URL is not valid.
     """
-    url = database_url(given)
+    url = database_url(url_text)
     if url.get_backend_name() == "sqlite":
         return Database(*open_sqlite(url))
     return Database(postgres.open_postgres(url))
 
 
 def open_database(url: str) -> Database:
-    """Open a database and bring it to the schema of this version.
-
-    A SQLite file that may not be written is opened for reading.
+    """Open a database and bring it to the schema of this version; a read-only file is only read.
 
     Raises
     ------
-    UnusableStore : no such database, or it cannot be opened.
-    ReadOnlyStore : it may be read alone, and an earlier version wrote it.
-    NewerSchema : a later version of sceneprint wrote it; nothing is touched.
+    UnusableStore : the database cannot be opened.
+    ReadOnlyStore : the database is read-only, and an earlier version wrote it.
+    NewerSchema : a later version of sceneprint wrote the database; nothing is changed.
     """
     database = reach_database(url)
     try:
@@ -655,11 +624,11 @@ def open_database(url: str) -> Database:
 
 @contextmanager
 def explained(engine: Engine) -> Iterator[None]:
-    """Say which database a fault is about, of what kind it is, and what to do."""
+    """Translate errors of a database within the context into errors of the store."""
     try:
         yield
     except Exception as error:
-        found = fault_of(engine, error)
-        if found is None:
+        fault = fault_of(engine, error)
+        if fault is None:
             raise
-        raise found from error
+        raise fault from error

@@ -1,8 +1,7 @@
-"""What a fault of the machine means for the store, what to do about it, and waiting for its end.
+"""Translate faults of the machine into errors of the store, and wait for a server that is starting.
 
-OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLocked or UnusableStore
-
-A store whose server is away is opened patiently: what is started beside it may be there before it.
+OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLocked or
+UnusableStore
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from sqlalchemy.exc import TimeoutError as AllInUse
 
 from sceneprint.errors import ReadOnlyStore, StoreAway, StoreFull, StoreLocked, UnusableStore
 
-#: Free space below which a write that failed is taken to have failed for want of it, bytes.
+#: A failed write counts as one on a full disk if less space than this is free, bytes.
 NO_ROOM = 1 << 20
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def unusable(what: str, error: OSError) -> UnusableStore:
-    """A file or folder that cannot be written, in our words.
+    """Return the error for a file or folder that cannot be written.
 
     Parameters
     ----------
-    what : happened, with the place
-    error : of the system
+    what : what happened, with the place
+    error : error of the system
     """
     text = f"{what} ({error.strerror})."
     if error.errno in _FULL:
@@ -47,7 +46,7 @@ def unusable(what: str, error: OSError) -> UnusableStore:
 
 
 def database_label(url: URL) -> str:
-    """Which database a URL is of, to be told: without a password, wherever the URL has it."""
+    """Return the name of a database for messages, without a password."""
     if url.get_backend_name() == "sqlite":
         return repr(url)
     named = url.query.get("host", ())
@@ -59,23 +58,23 @@ def database_label(url: URL) -> str:
 
 
 def fault_of(engine: Engine, error: Exception) -> UnusableStore | None:
-    """What an error of a database means for the store; None: it is no fault of the machine."""
+    """Return the store's error for an error of a database; None if the caller made a mistake."""
     if isinstance(error, DBAPIError):
-        known = _of_sqlite if engine.dialect.name == "sqlite" else _of_server
-        return known(engine.url, error)
+        translate = _of_sqlite if engine.dialect.name == "sqlite" else _of_server
+        return translate(engine.url, error)
     if isinstance(error, AllInUse):
         return StoreLocked(
-            f"{database_label(engine.url)}: all connections that a process may have are in use. "
-            "Come back later."
+            f"{database_label(engine.url)}: all connections of this process are in use. "
+            "Try again later."
         )
-    driver = sys.modules.get("psycopg")  # over a connection that is not SQLAlchemy's
-    if driver is None or not isinstance(error, driver.Error):  # on SQLite it is never loaded
+    driver = sys.modules.get("psycopg")  # for connections without SQLAlchemy; SQLite never loads it
+    if driver is None or not isinstance(error, driver.Error):
         return None
     return explain_error(engine.url, error, isinstance(error, driver.OperationalError))
 
 
 def _of_server(url: URL, error: DBAPIError) -> UnusableStore | None:
-    connecting = error.statement is None  # what psycopg says of a URL is a mistake of the URL
+    connecting = error.statement is None
     broken = isinstance(error, OperationalError) or error.connection_invalidated or connecting
     return explain_error(url, error.orig, broken)
 
@@ -88,11 +87,11 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
             )
         return None
     what = f"{url!r}: {_database_message(error)}."
-    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # without what it adds in detail
+    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the primary code of an extended one
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
         return StoreLocked(
-            f"{what} Another process has been writing for long, and nothing was stored. Come "
-            "back later; `fuser` on the file says who it is."
+            f"{what} Another process has been writing for too long, and nothing was stored. Try "
+            "again later; `fuser` on the file shows the process."
         )
     if code == sqlite3.SQLITE_READONLY:
         return ReadOnlyStore(
@@ -100,20 +99,19 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
         )
     if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and _turned_read_only(url.database):
         return ReadOnlyStore(
-            f"{what} Its disk is mounted read-only, as after an error of the disk. Look into the "
+            f"{what} Its disk is mounted read-only, possibly after a disk error. Look into the "
             "system's log, make the disk writable, and start again."
         )
     no_room = code == sqlite3.SQLITE_IOERR and _no_room(url.database)
     if code == sqlite3.SQLITE_FULL or no_room:
         return StoreFull(f"{what} Nothing was stored. Free some space on its disk.")
     return UnusableStore(
-        f"{what} Check that the database is there, that it may be written, and that the disk has "
-        "room."
+        f"{what} Check that the database exists and is writable, and that the disk has room."
     )
 
 
 def _turned_read_only(path: str | None) -> bool:
-    """Whether the disk of a file is mounted read-only by now: SQLite says `disk I/O error`."""
+    """Return whether the disk of a file is read-only by now: SQLite reports `disk I/O error`."""
     try:
         return path is not None and bool(os.statvfs(Path(path).parent).f_flag & os.ST_RDONLY)
     except OSError:
@@ -121,7 +119,7 @@ def _turned_read_only(path: str | None) -> bool:
 
 
 def _no_room(path: str | None) -> bool:
-    """Whether the disk of a file is full: SQLite says only of some writes that this is why."""
+    """Return whether the disk of a file is full: SQLite reports this cause for some writes only."""
     try:
         return path is not None and shutil.disk_usage(Path(path).parent).free < NO_ROOM
     except OSError:
@@ -129,109 +127,109 @@ def _no_room(path: str | None) -> bool:
 
 
 def _database_message(error: DBAPIError) -> str:
-    """What the database said, on one line: it may quote the statement that made a table."""
+    """Return the database's message on one line: it may quote a statement of several lines."""
     return " ".join(str(error.orig).split())
 
 
-#: What faults of PostgreSQL mean, by their SQLSTATE or by what it begins with, or by their class.
-_MEANT: dict[str, tuple[type[UnusableStore], str]] = {
+#: Errors and hints for faults of PostgreSQL, by SQLSTATE, its class, or our own name.
+_FAULTS: dict[str, tuple[type[UnusableStore], str]] = {
     "55P03": (
         StoreLocked,
-        "Another process has been writing for long, and nothing was stored. Come back later; "
+        "Another process has been writing for too long, and nothing was stored. Try again later; "
         "`SELECT a.pid, a.client_addr, a.state, a.query FROM pg_stat_activity a JOIN pg_locks l "
-        "USING (pid) WHERE l.locktype = 'advisory' AND l.granted` says who it is.",
+        "USING (pid) WHERE l.locktype = 'advisory' AND l.granted` shows the process.",
     ),
-    "40": (StoreLocked, "Another transaction was in the way, and nothing was stored. Come back."),
+    "40": (StoreLocked, "Another transaction was in the way, and nothing was stored. Try again."),
     "53100": (StoreFull, "Nothing was stored. Free some space on the disk of the server."),
     "53300": (
         StoreAway,
-        "The server has as many connections as it may. Raise its max_connections, or run fewer "
-        "processes; it is tried again.",
+        "The server has no free connection. Raise its max_connections, or run fewer processes. "
+        "The service tries again.",
     ),
-    "53": (UnusableStore, "The server lacks what it needs. Look into its log."),
+    "53": (UnusableStore, "The server lacks resources. Look into its log."),
     "25006": (
         ReadOnlyStore,
-        "The server is a standby, or is set to be read alone. Name the one that writes in "
+        "The server is a standby, or is read-only. Name the primary in "
         "SCENEPRINT_DATABASE_URL, or all with `target_session_attrs=read-write`.",
     ),
     "26": (
         StoreLocked,
-        "A prepared statement is gone, and nothing was stored. Come back. Where this goes on, a "
+        "A prepared statement is gone, and nothing was stored. Try again. If this goes on, a "
         "pooler gives one connection to several clients: connect to the server itself.",
     ),
-    "25P03": (UnusableStore, "This transaction was silent for long, and nothing was stored."),
-    "57014": (UnusableStore, "The server took too long, and nothing was stored. Come back later."),
-    "57": (StoreAway, "The server was stopped, or is starting. It is tried again."),
-    "08": (StoreAway, "The connection was lost. See that the server runs; it is tried again."),
+    "25P03": (UnusableStore, "This transaction was idle for too long, and nothing was stored."),
+    "57014": (UnusableStore, "The server took too long, and nothing was stored. Try again later."),
+    "57": (StoreAway, "The server was stopped, or is starting. The service tries again."),
+    "08": (
+        StoreAway,
+        "The connection was lost. Check that the server runs. The service tries again.",
+    ),
     "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
-    "3D000": (UnusableStore, "Make the database, or name another in SCENEPRINT_DATABASE_URL."),
+    "3D000": (UnusableStore, "Create the database, or name another in SCENEPRINT_DATABASE_URL."),
     "URL": (UnusableStore, "Correct SCENEPRINT_DATABASE_URL."),
-    "plan": (StoreLocked, "Tables were changed meanwhile, and nothing was stored. Come back."),
-    # not ours to have asked for: it was there when this process began
-    "42P01": (UnusableStore, "Its tables are not there, or no longer. Restore it from a copy."),
-    "42501": (UnusableStore, "The user must own the database's tables: grant what is missing."),
-    "58": (UnusableStore, "The server has trouble with its files. Look into its log."),
+    "plan": (StoreLocked, "Tables were changed meanwhile, and nothing was stored. Try again."),
+    # the tables existed when this process started
+    "42P01": (UnusableStore, "Its tables are missing. Restore the database from a copy."),
+    "42501": (UnusableStore, "The user must own the database's tables: grant the ownership."),
+    "58": (UnusableStore, "The server cannot use its files. Look into its log."),
     "XX001": (UnusableStore, "The server's files are damaged. Restore a bundle or a backup."),
     "XX002": (UnusableStore, "An index of the server is damaged. REINDEX the database."),
 }
-#: What is no good until somebody changes it, of what is said when a connection is opened.
+#: Messages of failed connections that a retry does not help, and their SQLSTATE or our own name.
 _REFUSALS = {
     r"database .+ does not exist": "3D000",
     r"authentication failed|no pg_hba\.conf entry|role .+ does not exist|no password": "28000",
     r"bad value for|invalid (connection option|.+ value|integer value|port number)": "URL",
 }
 _AWAY = (
-    "See that the server runs and can be reached from here, and that SCENEPRINT_DATABASE_URL is "
-    "right; it is tried again."
+    "Check that the server runs and can be reached from here, and that SCENEPRINT_DATABASE_URL is "
+    "right. The service tries again."
 )
 
 
 def explain_error(url: URL, error: object, broken: bool) -> UnusableStore | None:
-    """A fault of PostgreSQL in our words; None where it is a mistake of whoever asked.
+    """Return the store's error for a fault of PostgreSQL; None if the caller made a mistake.
 
     Parameters
     ----------
-    error : of psycopg
-    broken : whether it is of a kind that no other statement would have been spared
+    error : error of psycopg
+    broken : whether any other statement would have failed as well
     """
-    said = " ".join(str(error).split()).rstrip(".")
-    state = getattr(error, "sqlstate", None) or (_state_of(said) if broken else "")
+    message = " ".join(str(error).split()).rstrip(".")
+    state = getattr(error, "sqlstate", None) or ""
+    if not state and broken:  # libpq reports no SQLSTATE for a failed connection
+        matching = (name for pattern, name in _REFUSALS.items() if re.search(pattern, message))
+        state = next(matching, "")
     state = "plan" if is_of_old_plan(error) else state
-    kind, what = _MEANT.get(state) or _MEANT.get(state[:2]) or (StoreAway, _AWAY)
+    kind, what = _FAULTS.get(state) or _FAULTS.get(state[:2]) or (StoreAway, _AWAY)
     if what == _AWAY and not broken:
         return None
-    return kind(f"{database_label(url)}: {said:.400}. {what}")
+    return kind(f"{database_label(url)}: {message:.400}. {what}")
 
 
 def is_conflict(error: UnusableStore) -> bool:
-    """Whether PostgreSQL gave up a transaction for the sake of another, such as in a deadlock."""
+    """Return whether PostgreSQL aborted a transaction for another, as in a deadlock."""
     cause = error.__cause__
     state = getattr(getattr(cause, "orig", cause), "sqlstate", None)
     return state is not None and str(state).startswith("40")
 
 
 def is_of_old_plan(error: object) -> bool:
-    """Whether a statement was prepared for tables that have other columns by now.
+    """Return whether a statement was prepared for tables whose columns have changed since.
 
-    Its SQLSTATE is that of all that is not supported, and its text in the server's language.
+    Its SQLSTATE is a general one, and its text is in the server's language.
     """
     diagnosis = getattr(error, "diag", None)
     return getattr(diagnosis, "source_function", None) == "RevalidateCachedQuery"
-
-
-def _state_of(said: str) -> str:
-    """The SQLSTATE of what a server said that let nobody in: libpq does not tell it."""
-    known = (state for pattern, state in _REFUSALS.items() if re.search(pattern, said))
-    return next(known, "")
 
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: Seconds that who is started waits for a server before it gives up, and says why.
+#: Seconds that a starting process waits for its server.
 PATIENCE_S = 60.0
-#: Seconds between two tries.
+#: Seconds between two attempts.
 AGAIN_S = 1.0
 
 
@@ -239,28 +237,28 @@ def open_patiently(
     attempt: Callable[[], T], patience_s: float = PATIENCE_S,
     may_go_on: Callable[[float], bool] | None = None,
 ) -> T:  # fmt: skip
-    """What an attempt opens, as soon as its server answers; other faults are raised at once.
+    """Return the result of an attempt, retried while its server is unreachable.
 
     Parameters
     ----------
-    attempt : opens it
-    patience_s : seconds to wait at most
-    may_go_on : waits so many seconds, and says whether to try again; default: it always is
+    attempt : function that opens the store
+    patience_s : maximum seconds to wait
+    may_go_on : function that waits so many seconds, and returns whether to retry; default: always
 
     Raises
     ------
-    StoreAway : the server is away, and was waited for.
+    StoreAway : the server was still unreachable after `patience_s`.
     """
-    until, said = time.monotonic() + patience_s, False
+    until, logged = time.monotonic() + patience_s, False
     while True:
         try:
             return attempt()
         except StoreAway as error:
             if time.monotonic() + AGAIN_S > until:
                 raise
-            if not said:
+            if not logged:
                 log.warning("waiting for the database", extra={"error": str(error)})
-                said = True
+                logged = True
             if may_go_on is None:
                 time.sleep(AGAIN_S)
             elif not may_go_on(AGAIN_S):

@@ -1,11 +1,12 @@
-"""What happened, in order: written in the transaction in which it happens.
+"""Events: what happened, in order. Each event is written in the transaction of its change.
 
-writer of all  --record_event-->  events  <--number_events--  pending_events  <--  writer of a map
+    writer of all maps  --record_event-->  events  <--number_events--  pending_events  <--  writer
+    of a map
 
-Numbers are in the order of the commits, so that who has read up to one never misses a smaller one.
-Writers that have the turn to themselves give them. Writers of single maps commit at the same time,
-and cannot: what they tell is pending until somebody numbers what is committed, one at a time. Of a
-map, what is pending is in the order of its commits, as its writers take turns.
+Numbers are in commit order, so a reader of all events up to a number never misses a smaller one.
+Writers of all maps run one at a time and assign numbers themselves. Writers of single maps commit
+concurrently: their events are pending until a process numbers the committed ones. The pending
+events of a map are in commit order, since its writers take turns.
 """
 
 from __future__ import annotations
@@ -54,65 +55,64 @@ def record_event(
     details: Mapping[str, Any] | None = None,
     **data: Any,
 ) -> None:
-    """Write an event, and its line of the audit log where an actor made the change.
+    """Write an event, and a line of the audit log if an actor made the change.
 
     Parameters
     ----------
-    connection : of the transaction of the change
+    connection : transaction of the change
     kind : one of `KINDS` of the API
-    map_name, frame_id, job_id : that it is about
-    details : for the audit log alone
-    data : more, by kind
+    map_name, frame_id, job_id : changed objects
+    details : data for the audit log only
+    data : data of the event, by kind
     """
     record_events(connection, [event_values(kind, map_name, frame_id, job_id, data)], details)
 
 
 def record_events(
-    connection: Connection, found: Sequence[dict[str, Any]],
+    connection: Connection, rows: Sequence[dict[str, Any]],
     details: Mapping[str, Any] | None = None,
 ) -> None:  # fmt: skip
-    """Write events and their lines of the audit log, as `record_event`.
+    """Write events and their lines of the audit log; see `record_event`.
 
     Parameters
     ----------
-    connection : of the transaction of the changes
-    found : columns of each, see `event_values`
-    details : for the audit log alone, of each
+    connection : transaction of the changes
+    rows : columns of each event, see `event_values`
+    details : data of each line for the audit log only
     """
-    connection.execute(insert(events_table(connection)), found)
+    connection.execute(insert(events_table(connection)), rows)
     append_lines(
         connection,
         [
             audit_values(
-                one["kind"], one["map"],
-                one["frame_id"] or one["data"].get("name") or one["job_id"],
-                {**one["data"], **(details or {})},
+                row["kind"], row["map"],
+                row["frame_id"] or row["data"].get("name") or row["job_id"],
+                {**row["data"], **(details or {})},
             )
-            for one in found
-            if one["kind"] not in _DISCOVERIES
+            for row in rows
+            if row["kind"] not in _DISCOVERIES
         ],
     )  # fmt: skip
 
 
-#: Kinds of events that are no change by whoever happens to read the frame.
+#: Kinds of events that the reader of a frame discovers and does not cause.
 _DISCOVERIES = frozenset(("frame.damaged",))
 
 
 def events_table(connection: Connection) -> Table:
-    """Where a writer's events are inserted."""
+    """Return the table that the events of a writer are inserted into."""
     of_maps = connection.get_execution_options().get(MAPS_OPTION)
     return pending_events if of_maps else events
 
 
-#: Seconds that who numbers events waits for another who does: a long transaction may be one.
+#: Maximum seconds to wait for another process that numbers events, such as in a long transaction.
 NUMBERING_S = 1.0
 
 
 def number_events(database: Database) -> None:
-    """Give numbers to the events that are committed, before they are read.
+    """Assign numbers to the committed events before they are read.
 
-    Where that cannot be done now, such as in a database that may only be read, those that are
-    pending come later.
+    If that is not possible now, such as in a read-only database, the pending events appear later.
     """
     if not database.read_only:
         with suppress(UnusableStore):
@@ -120,11 +120,11 @@ def number_events(database: Database) -> None:
 
 
 def _number_pending(database: Database) -> None:
-    """As `number_events`; UnusableStore where that cannot be done now."""
+    """Assign numbers to the committed events; raise UnusableStore if that is not possible now."""
     if database.is_sqlite:
         return
     with database.read() as connection:
-        if connection.execute(_PENDING).first() is None:
+        if connection.execute(select(pending_events.c.number).limit(1)).first() is None:
             return
     with database.write(turn=False) as connection:
         wait_ms = str(int(1000 * NUMBERING_S))
@@ -132,17 +132,14 @@ def _number_pending(database: Database) -> None:
         connection.execute(select(func.number_pending_events()))
 
 
-_PENDING = select(pending_events.c.number).limit(1)
-
-
 def anchor_of_now(database: Database, map_name: str) -> str:
-    """The last event of a map, as a mark of the state that it has now.
+    """Return the last event of a map as an anchor that identifies the map's present state.
 
-    It is later than all that was committed before this is called: what is pending has no number.
+    It covers all changes that were committed before this call.
 
     Raises
     ------
-    UnusableStore : the events that are pending cannot be numbered now.
+    UnusableStore : the pending events cannot be numbered now.
     """
     _number_pending(database)
     with database.read() as connection:
@@ -156,18 +153,18 @@ def anchor_of_now(database: Database, map_name: str) -> str:
 
 
 def holds_anchor(connection: Connection, anchor: str) -> bool:
-    """Whether the state that was marked is this one, or an earlier one of the same history.
+    """Return whether an anchor marks the present state, or an earlier one of the same history.
 
-    A database that was put back to an earlier state gives the same numbers out again, but not at
-    the same time to the same frames.
+    A database that was restored to an earlier state assigns the same numbers again, but not at the
+    same times to the same frames.
     """
     number = anchor_number(anchor)
     if number is None:
         return False
-    found = connection.execute(
+    row = connection.execute(
         select(events.c.number, events.c.at, events.c.frame_id).where(events.c.number == number)
     ).first()
-    return found is not None and _fingerprint(*found) == anchor
+    return row is not None and _fingerprint(*row) == anchor
 
 
 def _fingerprint(number: int, at: float, frame_id: str | None) -> str:
@@ -188,16 +185,16 @@ class EventRow:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Which events somebody asks for, and may see.
+class EventFilter:
+    """Conditions on the events of a list, and the caller's permissions.
 
     Parameters
     ----------
-    maps : only of these; None: of all, and those of no map
-    kinds : beginnings of kinds, one of which must fit; none: all
-    of_maps : whether those of no map are left out
-    since : when whoever asks was first let in, seconds since 1970: of a map that was deleted before
-        nothing is told, though another has its name; None: of those too
+    maps : names of the only maps; None: all maps, and events without a map
+    kinds : prefixes of kinds, one of which must match; empty: all kinds
+    of_maps : whether events without a map are excluded
+    since : time at which the caller first got access, seconds since 1970. Events of a map that was
+        deleted before are hidden, even if another map has its name; None: show them
     """
 
     maps: frozenset[str] | None = None
@@ -206,37 +203,36 @@ class Wanted:
     since: float | None = None
 
     def __call__(self, event: EventRow) -> bool:
-        """Whether an event is one of them."""
+        """Return whether the caller requested an event and may see it."""
         return self.sees(event) and (not self.kinds or event.kind.startswith(self.kinds))
 
     def sees(self, event: EventRow) -> bool:
-        """Whether an event is one that may be told, of whatever kind."""
+        """Return whether the caller may see an event of any kind."""
         if self.maps is None:
             return event.map is not None or not self.of_maps
         return event.map in self.maps
 
 
 def newest_number(connection: Connection) -> int:
-    """Number of the newest event, 0 where there is none."""
+    """Return the number of the newest event; 0 if there are no events."""
     return int(connection.execute(select(func.max(events.c.number))).scalar() or 0)
 
 
-def newest_seen(connection: Connection, wanted: Wanted) -> int:
-    """Number of the newest event that may be told, of whatever kind; 0 where there is none.
+def newest_seen(connection: Connection, wanted: EventFilter) -> int:
+    """Return the number of the newest event of any kind that the caller may see; 0 if none.
 
-    What is told of how far somebody has read is this, and never the number of an event that is
-    hidden: when it changes, the caller was told what happened.
+    Positions in the list are reported as this number: it does not change with hidden events.
     """
     if wanted.maps is not None:
         beginnings = _beginnings(connection, wanted)
         newest = select(func.max(events.c.number))
-        of = [
+        rows = [
             connection.execute(
-                newest.where(events.c.map == one, events.c.number > beginnings.get(one, 0))
+                newest.where(events.c.map == name, events.c.number > beginnings.get(name, 0))
             )
-            for one in wanted.maps
+            for name in wanted.maps
         ]
-        return max((int(one.scalar() or 0) for one in of), default=0)
+        return max((int(row.scalar() or 0) for row in rows), default=0)
     if not wanted.of_maps:
         return newest_number(connection)
     last = select(events.c.number).where(events.c.map.is_not(None))
@@ -244,168 +240,167 @@ def newest_seen(connection: Connection, wanted: Wanted) -> int:
 
 
 def list_events(
-    connection: Connection, wanted: Wanted, *, after: int = 0, before: int | None = None,
+    connection: Connection, wanted: EventFilter, *, after: int = 0, before: int | None = None,
     limit: int = 1000, newest_first: bool = False,
 ) -> list[EventRow]:  # fmt: skip
-    """Events between two numbers, neither of them included.
+    """Return the events between two numbers, both excluded.
 
-    `number_events` first finds those of writers of single maps.
+    Call `number_events` first to include the events of writers of single maps.
     """
     order = events.c.number.desc() if newest_first else events.c.number
-    asked = select(events).where(events.c.number > after).order_by(order).limit(limit)
+    statement = select(events).where(events.c.number > after).order_by(order).limit(limit)
     if before is not None:
-        asked = asked.where(events.c.number < before)
+        statement = statement.where(events.c.number < before)
     if wanted.maps is not None:
-        asked = asked.where(_of_maps(wanted.maps, _beginnings(connection, wanted)))
+        statement = statement.where(_of_maps(wanted.maps, _beginnings(connection, wanted)))
     elif wanted.of_maps:
-        asked = asked.where(events.c.map.is_not(None))
+        statement = statement.where(events.c.map.is_not(None))
     if wanted.kinds:
-        fits = [events.c.kind.startswith(one, autoescape=True) for one in wanted.kinds]
-        asked = asked.where(or_(*fits))
-    return [EventRow(**row) for row in connection.execute(asked).mappings()]
+        matches = [events.c.kind.startswith(kind, autoescape=True) for kind in wanted.kinds]
+        statement = statement.where(or_(*matches))
+    return [EventRow(**row) for row in connection.execute(statement).mappings()]
 
 
-#: Maps with a beginning of their own that one statement asks about: SQLite bounds its depth.
+#: Maximum number of maps with their own beginning in a statement: SQLite limits its depth.
 _MOST_BEGINNINGS = 500
-#: As the index of those says it; see `_LIVING` of `deletion`.
+#: Condition as in the partial index; see `_LIVING` of `deletion`.
 _DELETED: ColumnElement[bool] = events.c.kind == literal_column("'map.deleted'")
 
 
-def _beginnings(connection: Connection, wanted: Wanted) -> dict[str, int]:
-    """By map, the number after which its events begin for whoever asks, where a map of the name was
-    deleted before it was let in.
+def _beginnings(connection: Connection, wanted: EventFilter) -> dict[str, int]:
+    """Return, by map, the last event to hide: a map with that name was deleted before the caller's
+    access.
     """
     if wanted.since is None or wanted.maps is None:
         return {}
-    asked = (
+    statement = (
         select(events.c.map, func.max(events.c.number))
         .where(_DELETED, events.c.map.in_(sorted(wanted.maps)), events.c.at < wanted.since)
         .group_by(events.c.map)
     )
-    return {row[0]: int(row[1]) for row in connection.execute(asked)}
+    return {row[0]: int(row[1]) for row in connection.execute(statement)}
 
 
 def _of_maps(names: Collection[str], beginnings: Mapping[str, int]) -> ColumnElement[bool]:
-    """That an event is of one of some maps, and not of before its beginning."""
+    """Return the condition that an event is of one of the maps, and after the map's beginning."""
     whole = events.c.map.in_(sorted(set(names) - beginnings.keys()))
     if len(beginnings) > _MOST_BEGINNINGS:
         last = max(beginnings.values())
         return or_(whole, and_(events.c.map.in_(sorted(beginnings)), events.c.number > last))
-    of = [
+    parts = (
         and_(events.c.map == name, events.c.number > last)
         for name, last in sorted(beginnings.items())
-    ]
-    return or_(whole, *of)
+    )
+    return or_(whole, *parts)
 
 
 def anchor_number(anchor: str) -> int | None:
-    """Number of the event that an anchor marks; None where it is none."""
+    """Return the number of the event in an anchor; None if the anchor is malformed."""
     number = anchor.partition(" ")[0]
     return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else None
 
 
-# Which events are kept: so many of each map, whatever happens in the others.
+def removal_floors(connection: Connection, kept: int) -> dict[str | None, int]:
+    """Return, by map, the number of its newest surplus event, for maps with more than `kept`
+    events.
 
-
-def floors(connection: Connection, kept: int) -> dict[str | None, int]:
-    """By map, the number of the newest event that is no longer kept, where there is such a one.
-
-    None stands for the events of no map and those of maps that are gone, taken together: nobody
-    could bound what is kept of maps that are made and deleted for ever.
+    None stands for the events without a map and those of deleted maps together, so that their
+    number is bounded.
 
     Parameters
     ----------
-    kept : newest events that stay of each map
+    kept : maximum number of events per map
     """
     oldest = connection.execute(select(func.min(events.c.number))).scalar()
     if oldest is None or newest_number(connection) - oldest < kept:
-        return {}  # there are no more of all of them
-    found: dict[str | None, int] = {}
+        return {}  # all maps together have no more
+    numbers: dict[str | None, int] = {}
     for name in (*_names(connection), None):
-        of = _of(name)
+        condition = _of(name)
         least, most = (
-            connection.execute(select(end(events.c.number)).where(of)).scalar()
+            connection.execute(select(end(events.c.number)).where(condition)).scalar()
             for end in (func.min, func.max)
         )
         if least is None or most is None or most - least < kept:
             continue
-        beyond = select(events.c.number).where(of).order_by(events.c.number.desc())
+        beyond = select(events.c.number).where(condition).order_by(events.c.number.desc())
         number = connection.execute(beyond.offset(kept).limit(1)).scalar()
         if number is not None:
-            found[name] = number
-    return found
+            numbers[name] = number
+    return numbers
 
 
-def floor_of(connection: Connection, wanted: Wanted, kept: int, after: int) -> int:
-    """Number up to which events of those that are wanted may be gone; 0: all are there.
+def removal_floor(connection: Connection, wanted: EventFilter, kept: int, after: int) -> int:
+    """Return the number up to which requested events may have been removed; 0: none were.
 
     Parameters
     ----------
-    wanted : whose maps are looked at, and not its kinds
-    kept : see `floors`
-    after : only whether the answer is greater is asked for: most often that is known at once
+    wanted : filter; its kinds are ignored
+    kept : see `removal_floors`
+    after : position of the reader; a smaller result may be returned as 0
     """
     if newest_number(connection) - kept <= after:
         return 0  # a map has no more events than there are numbers
-    found = floors(connection, kept)
+    numbers = removal_floors(connection, kept)
     if wanted.maps is None:
-        return max(found.values(), default=0)
+        return max(numbers.values(), default=0)
     names = set(_names(connection))
-    own = [found.get(one, 0) for one in wanted.maps & names]
+    own = [numbers.get(name, 0) for name in wanted.maps & names]
     beginnings = _beginnings(connection, wanted)
     gone = {
         name for name in wanted.maps - names
         if last_event(connection, name) > beginnings.get(name, 0)
     }  # fmt: skip
-    return max([*own, *_floors_of_gone(connection, gone, found.get(None, 0))])
+    return max([*own, *_former_floors(connection, gone, numbers.get(None, 0))])
 
 
-def _floors_of_gone(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
-    """As `floor_of`, of each of some maps that are gone: 0 first, so that there is one.
+def _former_floors(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
+    """Yield the result of `removal_floor` for each deleted map, after a 0.
 
-    Their events go together, and yet nothing is missed after the last of one's own.
+    The events of deleted maps are removed together, but a reader misses nothing after a map's last
+    event.
     """
     yield 0
     for name in names:
         last = last_event(connection, name)
         left = select(events.c.number).where(events.c.map == name).limit(1)
-        # the last of all that go together may be gone too: then no floor tells of them
+        # if its last event is removed as well, the common floor does not cover the map
         yield last if connection.execute(left).first() is None else min(floor, last)
 
 
-def spent_numbers(
+def surplus_events(
     connection: Connection, kept: int, anchors: Collection[int], limit: int
 ) -> list[int]:
-    """Numbers of events that may be removed, map by map, the oldest of each first.
+    """Return the numbers of events to remove, map by map, the oldest first.
 
-    An index is believed while the event is there that was the last of its map when it was made:
-    its anchor. So of each map the last one stays of those that are old enough to go: an index
-    that is being published has no other. And so do the anchors of indexes that are there.
+    An index is valid while its anchor exists: the last event of its map when it was built. So the
+    newest surplus event of each map stays, which an index under construction may use, and so do the
+    anchors of existing indexes.
 
     Parameters
     ----------
-    kept : newest events of each map that stay
-    anchors : numbers that stay too
-    limit : at most so many
+    kept : maximum number of events per map
+    anchors : numbers of the events that stay
+    limit : maximum number of events
     """
-    found: list[int] = []
-    for name, floor in floors(connection, kept).items():
+    numbers: list[int] = []
+    for name, floor in removal_floors(connection, kept).items():
         old = select(events.c.number).where(_of(name), events.c.number <= floor)
         stay = {number for number in anchors if number <= floor}
         if name is not None:
             stay.add(floor)
-        most = limit - len(found) + len(stay)
+        most = limit - len(numbers) + len(stay)
         oldest = connection.execute(old.order_by(events.c.number).limit(most)).scalars()
-        found += [number for number in oldest if number not in stay]
-        if len(found) >= limit:
+        numbers += [number for number in oldest if number not in stay]
+        if len(numbers) >= limit:
             break
-    return found[:limit]
+    return numbers[:limit]
 
 
 def remove_events(connection: Connection, numbers: Sequence[int]) -> None:
-    """Remove events; see `spent_numbers`."""
-    for some in blocks(numbers):
-        connection.execute(delete(events).where(among(connection, events.c.number, some)))
+    """Remove events; see `surplus_events`."""
+    for block in blocks(numbers):
+        connection.execute(delete(events).where(among(connection, events.c.number, block)))
 
 
 def _names(connection: Connection) -> list[str]:
@@ -413,25 +408,21 @@ def _names(connection: Connection) -> list[str]:
 
 
 def _of(name: str | None) -> ColumnElement[bool]:
-    """That an event is of a map; None: of none that is there."""
+    """Return the condition that an event is of a map; None: of no existing map."""
     if name is not None:
         return events.c.map == name
-    gone = select(maps.c.name)
-    return or_(events.c.map.is_(None), events.c.map.not_in(gone))
+    return or_(events.c.map.is_(None), events.c.map.not_in(select(maps.c.name)))
 
 
-# What is remembered of maps that are gone, by their names.
-#
-# The number of its last event: who read on after that has missed nothing of it, whatever was
-# removed of other maps since. And its quota, which the next map of the name inherits.
+# Former maps, by name: the number of the last event, after which a reader has missed nothing, and
+# the quota, which the next map with the name inherits.
 
-#: Names that are remembered, beside those with a quota: of older ones it is not known any more
-#: when they went.
+#: Maximum number of former maps without a quota.
 MOST_FORMER = 10_000
 
 
-def remember(connection: Connection, row: MapRow) -> None:
-    """Note a map that was just removed; its last event is told already."""
+def record_former_map(connection: Connection, row: MapRow) -> None:
+    """Record a map that was just removed, after its last event."""
     last = select(func.max(events.c.number)).where(events.c.map == row.name)
     connection.execute(delete(former_maps).where(former_maps.c.name == row.name))
     connection.execute(
@@ -440,37 +431,40 @@ def remember(connection: Connection, row: MapRow) -> None:
             quota_frames=row.quota_frames, quota_bytes=row.quota_bytes,
         )
     )  # fmt: skip
-    beyond = (
+    surplus = (
         select(former_maps.c.number)
-        .where(_spent())
+        .where(_without_quota())
         .order_by(former_maps.c.number.desc())
         .offset(MOST_FORMER)
         .limit(1)
     )
-    oldest = connection.execute(beyond).scalar()
+    oldest = connection.execute(surplus).scalar()
     if oldest is not None:
-        connection.execute(delete(former_maps).where(_spent(), former_maps.c.number <= oldest))
+        connection.execute(
+            delete(former_maps).where(_without_quota(), former_maps.c.number <= oldest)
+        )
 
 
-def inherited(connection: Connection, name: str) -> dict[str, float | None]:
-    """The quota of the map that had a name before; from now on the new one has it."""
-    asked = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
-    found = connection.execute(asked.where(former_maps.c.name == name)).mappings().first()
+def inherit_quota(connection: Connection, name: str) -> dict[str, float | None]:
+    """Return the quota of the former map with a name, and pass it on to the new one."""
+    statement = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
+    row = connection.execute(statement.where(former_maps.c.name == name)).mappings().first()
     connection.execute(delete(former_maps).where(former_maps.c.name == name))
-    return {} if found is None else dict(found)
+    return {} if row is None else dict(row)
 
 
 def last_event(connection: Connection, name: str) -> int:
-    """Number of the last event of a deleted map, or from which on it has none."""
-    asked = select(former_maps.c.number).where(former_maps.c.name == name)
-    found = connection.execute(asked).scalar()
-    if found is not None:
-        return int(found)
+    """Return the number of the last event of a deleted map, or a lower bound if forgotten."""
+    number = connection.execute(
+        select(former_maps.c.number).where(former_maps.c.name == name)
+    ).scalar()
+    if number is not None:
+        return int(number)
     count, least = connection.execute(
-        select(func.count(), func.min(former_maps.c.number)).where(_spent())
+        select(func.count(), func.min(former_maps.c.number)).where(_without_quota())
     ).one()
     return int(least) if count >= MOST_FORMER else 0
 
 
-def _spent() -> ColumnElement[bool]:
+def _without_quota() -> ColumnElement[bool]:
     return former_maps.c.quota_frames.is_(None) & former_maps.c.quota_bytes.is_(None)

@@ -1,4 +1,4 @@
-"""Frames that are there already: renewed, edited, deleted."""
+"""Changes to existing frames and maps, and references to blobs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sqlalchemy import (
 from sceneprint.errors import UnknownFrame
 from sceneprint.store.deletion import delete_frames
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import ROOMLESS, count_on, find_map, frame_of, write_tags
+from sceneprint.store.maps import ROOMLESS, add_usage, find_map, frame_of, write_tags
 from sceneprint.store.surface_rows import FUSED_COLUMNS, note_edit
 from sceneprint.store.tables import (
     FrameRow,
@@ -36,8 +36,8 @@ from sceneprint_client.api import FrameState
 
 
 def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
-    """Take a frame that failed as received once more, with its upload as it came now."""
-    _weigh(connection, number, FrameState.RECEIVED, values["bytes"])
+    """Set a failed frame to received again, with its new upload."""
+    _update_usage(connection, number, FrameState.RECEIVED, values["bytes"])
     connection.execute(
         update(frames)
         .where(frames.c.number == number)
@@ -49,14 +49,14 @@ def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> 
 def renew_upload(
     connection: Connection, number: int, blob: str, size: int, reason: str | None
 ) -> None:
-    """Let a frame refer to its content as it came once more; nothing else of it changes.
+    """Replace the upload of a frame by one with the same content; nothing else changes.
 
     Parameters
     ----------
-    blob, size : of the upload
-    reason : that is left of the frame's
+    blob, size : new upload
+    reason : new reason of the frame's state
     """
-    _weigh(connection, number, None, size)
+    _update_usage(connection, number, None, size)
     connection.execute(
         update(frames).where(frames.c.number == number).values(blob=blob, bytes=size, reason=reason)
     )
@@ -68,7 +68,7 @@ def set_state(
     """Move a frame to a state in which it is not searched; a deleted frame stays deleted."""
     ended_at = None
     if state == FrameState.REDUNDANT:
-        _weigh(connection, number, state, None)
+        _update_usage(connection, number, state, None)
         ended_at = now(connection)
     connection.execute(
         update(frames)
@@ -80,11 +80,11 @@ def set_state(
 def delete_frame(
     connection: Connection, row: MapRow, frame: FrameRow, deletion: int | None = None
 ) -> list[str]:
-    """Delete one frame; parameters and result as of `delete_frames`.
+    """Delete one frame; parameters and result as in `delete_frames`.
 
     Raises
     ------
-    UnknownFrame : it was deleted before.
+    UnknownFrame : the frame is deleted already.
     """
     if frame.state == FrameState.DELETED:
         raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
@@ -92,17 +92,17 @@ def delete_frame(
 
 
 def not_purged() -> ColumnElement[bool]:
-    """Return the condition that a frame exists, or was deleted and can be restored."""
+    """Return the condition that a frame exists, or is deleted and can be restored."""
     return or_(frames.c.state != FrameState.DELETED, frames.c.deletion.is_not(None))
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
-    """Whether anything refers to a blob; see `referred_blobs`."""
+    """Return whether anything refers to a blob; see `referred_blobs`."""
     return bool(referred_blobs(connection, [blob]))
 
 
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
-    """Those of at most a thousand blobs that a row of any kind refers to."""
+    """Return those of at most a thousand blobs that a row of any table refers to."""
     has_upload = or_(frames.c.state.not_in(ROOMLESS), frames.c.deletion.is_not(None))
     referring = (
         (frames.c.blob, has_upload),
@@ -111,43 +111,42 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
         (surface_tiles.c.blob,),
         (surface_tiles.c.draft,),
     )
-    asked = (select(column).where(column.in_(blobs), *more) for column, *more in referring)
-    return set(connection.execute(union(*asked)).scalars())
+    parts = (select(column).where(column.in_(blobs), *more) for column, *more in referring)
+    return set(connection.execute(union(*parts)).scalars())
 
 
 def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:
-    """How many frames are in each state that has any, of one map or of all."""
-    asked = select(frames.c.state, func.count()).group_by(frames.c.state).order_by(frames.c.state)
+    """Return the number of frames in each state, of one map or of all."""
+    counts = select(frames.c.state, func.count()).group_by(frames.c.state).order_by(frames.c.state)
     if map_number is not None:
-        asked = asked.where(frames.c.map_number == map_number)
-    return {row[0]: row[1] for row in connection.execute(asked)}
+        counts = counts.where(frames.c.map_number == map_number)
+    return {row[0]: row[1] for row in connection.execute(counts)}
 
 
-def _weigh(connection: Connection, number: int, state: FrameState | None, size: int | None) -> None:
-    """Count what a frame takes from now on.
+def _update_usage(
+    connection: Connection, number: int, state: FrameState | None, size: int | None
+) -> None:
+    """Update the use of the map for a frame's new state and size.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    state : that it comes to; None: it stays as it is
-    size : bytes of its upload; None: as they are
+    connection : writing transaction
+    state : new state; None: unchanged
+    size : new bytes of the upload; None: unchanged
     """
-    asked = select(frames.c.map_number, frames.c.state, frames.c.bytes)
-    map_number, old, before = connection.execute(asked.where(frames.c.number == number)).one()
+    statement = select(frames.c.map_number, frames.c.state, frames.c.bytes)
+    map_number, old, before = connection.execute(statement.where(frames.c.number == number)).one()
     if old == FrameState.DELETED:
-        return  # and stays so
+        return
     was, is_now = old not in ROOMLESS, (state or old) not in ROOMLESS
     after = before if size is None else size
-    count_on(connection, map_number, is_now - was, is_now * after - was * before)
+    add_usage(connection, map_number, is_now - was, is_now * after - was * before)
 
 
-# What a frame was uploaded on condition of: that its map lacks the place.
+def relax_novelty(connection: Connection, number: int, novelty: float | None) -> None:
+    """Set the weaker of two novelty thresholds for a frame that is not signed yet.
 
-
-def loosen(connection: Connection, number: int, novelty: float | None) -> None:
-    """Keep a frame that is not signed yet on the weaker of two conditions.
-
-    Who sends it with a weaker one, or with none, is told that it is there.
+    None is the weakest: the frame is stored in any case.
     """
     weaker: ColumnElement[bool] = frames.c.novelty.is_not(None)
     if novelty is not None:
@@ -163,19 +162,16 @@ def loosen(connection: Connection, number: int, novelty: float | None) -> None:
     )
 
 
-# Metadata written anew, with all that is searched for beside it.
-
-
 def write_frame(
     connection: Connection, row: MapRow, frame: FrameRow, values: Mapping[str, Any]
 ) -> FrameRow:
-    """Change columns of a frame's metadata.
+    """Change columns of a frame's metadata, with the columns and tags that searches use.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    frame : as it is
-    values : by column; position and tags that are searched for follow `pose` and `tags`
+    connection : writing transaction
+    frame : present row
+    values : new values by column
     """
     changed = {name: new for name, new in values.items() if getattr(frame, name) != new}
     if not changed:
@@ -194,7 +190,7 @@ def write_frame(
     return frame_of(connection, frame.number)
 
 
-#: Columns of a map whose new values are in the audit log.
+#: Columns of a map whose new values the audit log contains.
 _LIMITS = ("quota_frames", "quota_bytes", "retention_days")
 
 
@@ -204,7 +200,6 @@ def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) ->
     if not changed:
         return row
     connection.execute(update(maps).where(maps.c.number == row.number).values(**changed))
-    # not what they are: who may read the map sees it there
     limits = {name: changed[name] for name in _LIMITS if name in changed}
     record_event(connection, "map.edited", row.name, details=limits, fields=sorted(changed))
     return find_map(connection, row.name)

@@ -1,4 +1,4 @@
-"""Keys of the API: shown once, kept as a hash."""
+"""Keys of the API, stored as hashes, and requests with an `Idempotency-Key`."""
 
 from __future__ import annotations
 
@@ -23,18 +23,17 @@ from sqlalchemy import (
     tuple_,
     update,
 )
-from sqlalchemy.dialects import postgresql, sqlite
 
 from sceneprint.errors import Conflict, IdempotencyConflict, UnknownKey
 from sceneprint.store.events import record_event
-from sceneprint.store.tables import idempotency, keys
+from sceneprint.store.tables import dialect_insert, idempotency, keys
 from sceneprint.store.tenants import join_tenant, leave_tenant
 from sceneprint_client.api.admin import Scope
 
 if TYPE_CHECKING:
     from sceneprint.store.database import Database
 
-#: So that a key is known for one where it should not be, such as in a public file.
+#: Prefix by which scanners recognise a leaked key, such as in a public file.
 PREFIX = "sp_"
 
 
@@ -44,13 +43,13 @@ class KeyRow:
 
     Parameters
     ----------
-    id : never given to another, unlike its name
-    name : unique
-    grants : scope by name of a map, `*` for all
-    created_at, expires_at : None: it does not expire
-    tenant : whom it belongs to
-    previous_until : until when the secret before the last rotation works; None: none does
-    last_used_at : to the hour or so; None: never yet
+    id : unique for ever, unlike the name
+    name : unique name
+    grants : scope by name of a map, `*` for all maps
+    created_at, expires_at : None: the key does not expire
+    tenant : owner of the key
+    previous_until : end of validity of the secret before the last rotation; None: it is not valid
+    last_used_at : time of the last use, to the hour; None: never
     """
 
     id: str
@@ -67,14 +66,14 @@ def create_key(
     connection: Connection, name: str, grants: Mapping[str, Scope],
     expires_at: float | None = None, tenant: str | None = None,
 ) -> str:  # fmt: skip
-    """Make a key and return its secret, which is stored nowhere; for the rest see KeyRow.
+    """Create a key and return its secret, which is not stored; parameters as in KeyRow.
 
-    Without `tenant` it belongs to one of its own name.
+    Without `tenant`, the key belongs to a tenant of its own name.
 
     Raises
     ------
-    Conflict : there is a key of that name.
-    UnknownTenant : there is no such tenant.
+    Conflict : the name is in use.
+    UnknownTenant : the tenant does not exist.
     """
     if connection.execute(select(keys.c.id).where(keys.c.name == name)).first() is not None:
         raise Conflict(f"There is a key named {name!r}. Choose another name.")
@@ -94,50 +93,51 @@ def create_key(
 
 
 def find_key(connection: Connection, secret: str) -> KeyRow | None:
-    """The key with that secret, or None; also one that has expired.
+    """Return the key with a secret, even if it has expired; None if there is none.
 
-    Found by the secret before its rotation, a key expires when that does.
+    If the secret is the one before the last rotation, the key expires with it.
     """
     digest = _digest(secret)
-    found = connection.execute(_select_keys().where(keys.c.digest == digest)).mappings().first()
-    if found is not None:
-        return KeyRow(**found)
+    row = connection.execute(_select_keys().where(keys.c.digest == digest)).mappings().first()
+    if row is not None:
+        return KeyRow(**row)
     previous = (keys.c.previous_digest == digest) & (keys.c.previous_until > time.time())
-    found = connection.execute(_select_keys().where(previous)).mappings().first()
-    if found is None:
+    row = connection.execute(_select_keys().where(previous)).mappings().first()
+    if row is None:
         return None
-    ends = [one for one in (found["expires_at"], found["previous_until"]) if one is not None]
-    return replace(KeyRow(**found), expires_at=min(ends))
+    ends = [end for end in (row["expires_at"], row["previous_until"]) if end is not None]
+    return replace(KeyRow(**row), expires_at=min(ends))
 
 
 def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
-    """Give a key a new secret, and return it; what it may do stays.
+    """Give a key a new secret, and return it; the grants stay.
 
-    The secret before works for so long. Where one before that still does, it keeps its time, and
-    the one between ends: an answer with a new secret that was lost costs nobody the key in use.
+    The current secret stays valid for the overlap. If an earlier secret is still valid, it keeps
+    its time instead and the current one ends: a lost answer with a new secret then does not
+    invalidate the secret in use.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    overlap_s : seconds; 0: all secrets before end now
+    connection : writing transaction
+    overlap_s : seconds; 0: all former secrets end now
 
     Raises
     ------
-    UnknownKey : there is none of that name.
+    UnknownKey : the key does not exist.
     """
     now = time.time()
-    found = connection.execute(
+    row = connection.execute(
         select(keys.c.digest, keys.c.previous_digest, keys.c.previous_until)
         .where(keys.c.name == name)
     ).first()  # fmt: skip
-    if found is None:
+    if row is None:
         raise _unknown_key(name)
-    previous: str | None = found.digest
+    previous: str | None = row.digest
     until: float | None = now + overlap_s
     if overlap_s == 0:
         previous = until = None
-    elif found.previous_until is not None and found.previous_until > now:
-        previous, until = found.previous_digest, found.previous_until
+    elif row.previous_until is not None and row.previous_until > now:
+        previous, until = row.previous_digest, row.previous_until
     secret = _new_secret()
     connection.execute(
         update(keys)
@@ -149,30 +149,25 @@ def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
 
 
 def find_named_key(connection: Connection, name: str) -> KeyRow:
-    """The key of that name; UnknownKey where there is none."""
-    found = connection.execute(_select_keys().where(keys.c.name == name)).mappings().first()
-    if found is None:
+    """Return the key of a name; raise UnknownKey if it does not exist."""
+    row = connection.execute(_select_keys().where(keys.c.name == name)).mappings().first()
+    if row is None:
         raise _unknown_key(name)
-    return KeyRow(**found)
+    return KeyRow(**row)
 
 
 def list_keys(
     connection: Connection, after: str | None = None, limit: int | None = None
 ) -> list[KeyRow]:
-    """Keys by name, from behind `after` on; default: all."""
-    asked = _select_keys().order_by(keys.c.name).limit(limit)
+    """Return keys sorted by name, after the name `after`; default: all keys."""
+    statement = _select_keys().order_by(keys.c.name).limit(limit)
     if after is not None:
-        asked = asked.where(keys.c.name > after)
-    return [KeyRow(**row) for row in connection.execute(asked).mappings()]
+        statement = statement.where(keys.c.name > after)
+    return [KeyRow(**row) for row in connection.execute(statement).mappings()]
 
 
 def revoke_key(connection: Connection, name: str) -> None:
-    """Forget a key.
-
-    Raises
-    ------
-    UnknownKey : there is none of that name.
-    """
+    """Delete a key; raise UnknownKey if the key does not exist."""
     gone = delete(keys).where(keys.c.name == name).returning(keys.c.tenant)
     tenant = connection.execute(gone).scalar()
     if tenant is None:
@@ -203,66 +198,64 @@ def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-#: Seconds for which a use of a key is not noted again: whether it is in use at all is the question.
+#: Seconds after a recorded use of a key in which other uses are not recorded.
 USED_S = 3600.0
 
 
 class KeyUses:
-    """When keys were used, noted in memory and written now and then; safe to share."""
+    """Record uses of keys in memory, and write them to the database in batches; safe to share."""
 
     def __init__(self) -> None:
         self._due: dict[str, float] = {}
         self._lock = threading.Lock()
 
     def note(self, key: KeyRow) -> None:
-        """Note that a key is used now, unless the database knows about as much."""
+        """Record a use of a key, unless the database has a recent one."""
         now = time.time()
         if key.last_used_at is None or not 0 <= now - key.last_used_at < USED_S:
             with self._lock:
                 self._due[key.id] = now
 
     def write(self, database: Database) -> None:
-        """Write what was noted; what cannot be written is lost, and noted at the next use."""
+        """Write the recorded uses; if that fails, they are lost until the next use."""
         with self._lock:
             due, self._due = self._due, {}
         if not due or database.read_only:
             return
-        # in one order, as two processes may write the same keys at once
-        used = [{"of": key_id, "at": at} for key_id, at in sorted(due.items())]
-        asked = update(keys).where(keys.c.id == bindparam("of"))
+        # sorted against deadlocks: two processes may write the same keys at once
+        rows = [{"key_id": key_id, "at": at} for key_id, at in sorted(due.items())]
+        statement = update(keys).where(keys.c.id == bindparam("key_id"))
         with database.write(turn=False) as connection:
-            connection.execute(asked.values(last_used_at=bindparam("at")), used)
+            connection.execute(statement.values(last_used_at=bindparam("at")), rows)
 
 
-# Keys under which a caller may send a request again: what came of it, kept for a day.
-#
-# Stored in the transaction of what it guards, so that neither is there without the other.
+# Requests with an `Idempotency-Key`, stored in the transaction of their effect.
 
-#: Seconds for which a key is remembered.
+#: Seconds for which the result of a request is stored.
 KEPT_S = 86_400.0
 
 
 @dataclass(frozen=True)
 class IdempotentRequest:
-    """A request that is to take effect once.
+    """A request that must take effect once.
 
     Parameters
     ----------
-    actor : name of the caller's key, or ""
-    key : that the caller made up
-    fingerprint : 64 digits, of what is asked for
+    actor : name of the caller's API key, or ""
+    key : `Idempotency-Key` of the request
+    fingerprint : 64 digits that identify route and content
     """
 
     actor: str
     key: str
     fingerprint: str
 
-    def found(self, connection: Connection) -> dict[str, Any] | None:
-        """What `keep` was given when the same was asked before; None where it was not.
+    def stored_result(self, connection: Connection) -> dict[str, Any] | None:
+        """Return the stored result of the same request; None if there is none.
 
         Raises
         ------
-        IdempotencyConflict : something else was asked with this key.
+        IdempotencyConflict : another request was sent with the key.
         """
         row = connection.execute(
             select(idempotency.c.fingerprint, idempotency.c.data).where(
@@ -276,51 +269,52 @@ class IdempotentRequest:
         if row.fingerprint != self.fingerprint:
             raise IdempotencyConflict(
                 f"The Idempotency-Key {self.key!r:.80} was sent with another request within a day. "
-                "Make up one for each request, and send it again only with the same content."
+                "Create a key for each request, and send it again only with the same content."
             )
         data: dict[str, Any] = row.data
         return data
 
     def columns(self, data: dict[str, Any]) -> dict[str, Any]:
-        """Columns of `idempotency`, with what came of it."""
+        """Return the columns of `idempotency` for a result."""
         own = {"actor": self.actor, "key": self.key, "fingerprint": self.fingerprint}
         return {**own, "data": data, "created_at": time.time()}
 
-    def keep(self, connection: Connection, data: dict[str, Any]) -> None:
-        """Remember what came of it, in the transaction that stores that.
+    def store(self, connection: Connection, data: dict[str, Any]) -> None:
+        """Store the result, in the transaction of the effect.
 
-        One statement, as others wait meanwhile. What was remembered before gives way: it is older
-        than a day, or of a map that was deleted since.
+        One statement, as other writers wait. It replaces a stored result that is older than a day
+        or of a map that was deleted since.
 
         Raises
         ------
-        Overtaken : another request with this key was stored since `found`, of another map.
+        Overtaken : a transaction on another map has stored a result for the key meanwhile.
         """
         values, own = self.columns(data), ("actor", "key")
-        kind: Any = sqlite if connection.dialect.name == "sqlite" else postgresql
-        made = kind.insert(idempotency).values(**values)
-        gives_way = or_(
+        replaceable = or_(
             idempotency.c.fingerprint == self.fingerprint,
             idempotency.c.created_at <= values["created_at"] - KEPT_S,
         )
-        known = {name: value for name, value in values.items() if name not in own}
-        kept = made.on_conflict_do_update(
-            index_elements=own, set_=known, where=gives_way
-        ).returning(idempotency.c.key)
-        if connection.execute(kept).first() is None:
+        others = {name: value for name, value in values.items() if name not in own}
+        statement = (
+            dialect_insert(connection, idempotency)
+            .values(**values)
+            .on_conflict_do_update(index_elements=own, set_=others, where=replaceable)
+            .returning(idempotency.c.key)
+        )
+        if connection.execute(statement).first() is None:
             raise Overtaken
 
 
 class Overtaken(Exception):
-    """Another transaction stored first what this one relied on being absent: do it again."""
+    """Another transaction stored a row first that this one required to be absent: repeat it."""
 
 
-#: Keys that are removed in one transaction: others wait meanwhile.
+#: Keys to remove in one transaction; other writers wait for it.
 _REMOVED_AT_ONCE = 5_000
 
 
 def remove_old_requests(database: Database) -> int:
-    """Forget requests of more than a day ago, in short transactions; how many."""
+    """Remove results of requests older than a day, in short transactions; return their number."""
     old = idempotency.c.created_at <= time.time() - KEPT_S
     some = select(idempotency.c.actor, idempotency.c.key).where(old).limit(_REMOVED_AT_ONCE)
     removed = 0
@@ -328,7 +322,7 @@ def remove_old_requests(database: Database) -> int:
         due = connection.execute(some.limit(1)).first() is not None
     while due:
         with database.write() as connection:
-            those = tuple_(idempotency.c.actor, idempotency.c.key).in_(some)
-            count = connection.execute(delete(idempotency).where(those)).rowcount
+            old_keys = tuple_(idempotency.c.actor, idempotency.c.key).in_(some)
+            count = connection.execute(delete(idempotency).where(old_keys)).rowcount
         removed, due = removed + count, count == _REMOVED_AT_ONCE
     return removed

@@ -1,4 +1,4 @@
-"""Maps, the models they are signed with, and their frames: received, and found."""
+"""Maps, their models and quotas, and their frames: insert, find, and poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 
 from sceneprint.errors import QuotaExceeded, UnknownFrame, UnknownMap
-from sceneprint.store.events import inherited, record_event
+from sceneprint.store.events import inherit_quota, record_event
 from sceneprint.store.tables import (
     ARCHIVE,
     FRAME_COLUMNS,
@@ -53,12 +53,7 @@ from sceneprint_client.api import FrameState
 
 
 def find_map(connection: Connection, name: str) -> MapRow:
-    """The map of a name.
-
-    Raises
-    ------
-    UnknownMap : there is none.
-    """
+    """Return the map of a name; raise UnknownMap if the map does not exist."""
     row = connection.execute(_map_of_name(), {"name": name}).first()
     if row is None:
         raise unknown_map(name)
@@ -70,20 +65,22 @@ def _map_of_name() -> Select[Any]:
     return select(*MAP_COLUMNS).where(maps.c.name == bindparam("name"))
 
 
-def living_map(connection: Connection, of: MapRow) -> MapRow:
-    """A map as it is now; UnknownMap where it was deleted, whether or not another has its name."""
-    row = find_map(connection, of.name)
-    if row.number != of.number:
-        raise unknown_map(of.name)
+def current_map(connection: Connection, former: MapRow) -> MapRow:
+    """Return the present row of a map; raise UnknownMap if it was deleted, even if its name is in
+    use.
+    """
+    row = find_map(connection, former.name)
+    if row.number != former.number:
+        raise unknown_map(former.name)
     return row
 
 
 def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
-    """The maps of some names, in their order, by one statement; UnknownMap where one is none."""
+    """Return maps by their names, in order; raise UnknownMap if one does not exist."""
     if len(names) == 1:
         return [find_map(connection, names[0])]
-    found = connection.execute(select(maps).where(maps.c.name.in_(names))).mappings()
-    rows = {row["name"]: map_row(row) for row in found}
+    selected = connection.execute(select(maps).where(maps.c.name.in_(names))).mappings()
+    rows = {row["name"]: map_row(row) for row in selected}
     for name in names:
         if name not in rows:
             raise unknown_map(name)
@@ -91,20 +88,20 @@ def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
 
 
 def unknown_map(name: str) -> UnknownMap:
-    """What is said of a map that is not there, or not for whoever asks: the same words."""
+    """Return the error for a map that does not exist, or that the caller may not see."""
     return UnknownMap(
         f"There is no map {name!r:.80}. List the maps with `sceneprint maps` or GET /v1/maps, "
-        "or make it."
+        "or create it."
     )
 
 
-def map_of(connection: Connection, number: int) -> MapRow:
-    """The map of a number that is known to exist."""
+def map_of_number(connection: Connection, number: int) -> MapRow:
+    """Return the map of a number, which must exist."""
     return map_row(connection.execute(select(maps).where(maps.c.number == number)).mappings().one())
 
 
 def list_maps(connection: Connection) -> list[MapRow]:
-    """All maps by name."""
+    """Return all maps, sorted by name."""
     return [
         map_row(row) for row in connection.execute(select(maps).order_by(maps.c.name)).mappings()
     ]
@@ -114,19 +111,19 @@ def add_map(
     connection: Connection, name: str, title: str | None, model_id: str,
     limits: Mapping[str, object] | None = None,
 ) -> MapRow:  # fmt: skip
-    """Make a map; its name must be free.
+    """Create a map; its name must be free.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    limits : `quota_frames`, `quota_bytes`, `retention_days`, `up`, where they are given; quotas
-        that are not are those of the map that had this name before: whoever may delete a map and
-        make it anew does not get rid of its quota
+    connection : writing transaction
+    limits : `quota_frames`, `quota_bytes`, `retention_days` and `up`, as far as they are set. Other
+        quotas are those of the former map with the name: a user who may delete and create maps must
+        not remove a quota by doing so
     """
     connection.execute(
         insert(maps).values(
             name=name, title=title, model_id=model_id, revision=0, created_at=time.time(),
-            **(inherited(connection, name) | dict(limits or {})),
+            **(inherit_quota(connection, name) | dict(limits or {})),
         )
     )  # fmt: skip
     record_event(connection, "map.created", name)
@@ -134,17 +131,17 @@ def add_map(
 
 
 def next_revision(connection: Connection, map_number: int, count: int = 1) -> int:
-    """The last of so many revisions of a map that are taken at once.
+    """Reserve consecutive revisions of a map, and return the last.
 
-    One is a change of what is searched; commits of one map follow each other in this order.
+    A revision is a change to what is searched; they are in commit order.
     """
-    taken = update(maps).where(maps.c.number == map_number)
-    raised = taken.values(revision=maps.c.revision + count).returning(maps.c.revision)
+    own = update(maps).where(maps.c.number == map_number)
+    raised = own.values(revision=maps.c.revision + count).returning(maps.c.revision)
     return int(connection.execute(raised).scalar_one())
 
 
-def keep_model(connection: Connection, model_id: str, name: str, content: bytes) -> None:
-    """Keep a model's file, where it is not kept yet."""
+def store_model(connection: Connection, model_id: str, name: str, content: bytes) -> None:
+    """Store a model's file, unless it is stored already."""
     if connection.execute(select(models.c.id).where(models.c.id == model_id)).first() is None:
         connection.execute(
             insert(models).values(
@@ -154,59 +151,58 @@ def keep_model(connection: Connection, model_id: str, name: str, content: bytes)
 
 
 def model_content(connection: Connection, model_id: str) -> bytes:
-    """The file of a model that a map refers to."""
+    """Return the file of a model that a map refers to."""
     return bytes(
         connection.execute(select(models.c.content).where(models.c.id == model_id)).scalar_one()
     )
 
 
 def model_names(connection: Connection) -> dict[str, str]:
-    """Names of all models by their id."""
+    """Return the names of all models by their id."""
     return {row.id: row.name for row in connection.execute(select(models.c.id, models.c.name))}
 
 
-# What a map holds and may hold: frames, and bytes of their uploads.
-#
-# Counted are frames that are neither deleted nor redundant, whatever became of them, and bytes:
-# their uploads and those of tombstones as they were sent, with what robots made of them while that
-# waits, and the archives of imports until these end. Not counted is what we make of them:
-# signatures, artifacts, indexes.
-# Two columns of the map count on in the transaction that changes it; writers take turns, so that a
-# quota holds to the frame whoever sends at once.
+# Use and quotas of a map. Frames count unless they are deleted or redundant. Bytes are those of
+# uploads, including those of tombstones and of robots' own signatures while they wait, and of
+# archives until their import ends. Signatures, artifacts and indexes of the service do not count.
+# Two columns of the map hold the sums. Each transaction updates them in the map's turn, so quotas
+# are exact.
 
-#: States of frames that take no room: their uploads are removed.
+#: States of frames without an upload, which do not count.
 ROOMLESS = (FrameState.DELETED, FrameState.REDUNDANT)
 
 
 @dataclass(frozen=True)
 class MapUsage:
-    """How much of a map is in use."""
+    """Frames and bytes that count against a map's quota."""
 
     frames: int
     bytes: int
 
 
-def use_of(connection: Connection, map_number: int) -> MapUsage:
-    """What a map holds, as it was counted on."""
-    asked = select(maps.c.used_frames, maps.c.used_bytes).where(maps.c.number == map_number)
-    return MapUsage(*connection.execute(asked).one())
+def map_usage(connection: Connection, map_number: int) -> MapUsage:
+    """Return the stored use of a map."""
+    statement = select(maps.c.used_frames, maps.c.used_bytes).where(maps.c.number == map_number)
+    return MapUsage(*connection.execute(statement).one())
 
 
-def count_on(connection: Connection, map_number: int, more: int, more_bytes: int) -> None:
-    """Count that a map holds so many frames and bytes more, or less."""
+def add_usage(connection: Connection, map_number: int, new_frames: int, new_bytes: int) -> None:
+    """Add frames and bytes, which may be negative, to the use of a map."""
     connection.execute(
         update(maps)
         .where(maps.c.number == map_number)
-        .values(used_frames=maps.c.used_frames + more, used_bytes=maps.c.used_bytes + more_bytes)
+        .values(
+            used_frames=maps.c.used_frames + new_frames, used_bytes=maps.c.used_bytes + new_bytes
+        )
     )
 
 
 def counted_usage(connection: Connection, map_number: int) -> MapUsage:
-    """What a map holds, counted over all its frames: what `use_of` must say."""
-    asked = select(func.count(), func.coalesce(func.sum(frames.c.bytes), 0)).where(
+    """Count the use of a map over all its frames; `map_usage` must return the same."""
+    statement = select(func.count(), func.coalesce(func.sum(frames.c.bytes), 0)).where(
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
-    n, size = connection.execute(asked).one()
+    n, size = connection.execute(statement).one()
     size += tombstone_bytes(connection, map_number)
     archives = (
         select(func.coalesce(func.sum(job_files.c.bytes), 0))
@@ -217,78 +213,69 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
-    """Check that a map's quota leaves room for one more frame, or for a larger upload of one.
+    """Check that a map's quota leaves room for another frame, or for a larger upload of a frame.
 
-    Tombstones count as free: `make_room` purges as many as it takes.
+    Tombstones count as free: `make_room` purges as many as necessary.
 
     Parameters
     ----------
-    connection : of the transaction that would add it, or of a reading one for a first look
-    size : bytes that it takes more
-    new : whether the frame is not counted yet
+    connection : transaction that adds the frame, or a reading one for an early check
+    size : additional bytes
+    new : whether the frame does not count yet
 
     Raises
     ------
-    QuotaExceeded : it does not.
+    QuotaExceeded : there is no room.
     """
     if row.quota_frames is None and row.quota_bytes is None:
         return
-    use = use_of(connection, row.number)
+    hint = (
+        "Delete frames that are no longer needed, or ask the operator for a larger quota "
+        f"(PATCH /v1/maps/{row.name})."
+    )
+    use = map_usage(connection, row.number)
     if new and row.quota_frames is not None and use.frames >= row.quota_frames:
         raise QuotaExceeded(
             f"Map {row.name!r} holds {use.frames} frames of the {row.quota_frames} that its quota "
-            f"allows, so the frame was not taken. {_todo(row.name)}"
+            f"allows, so the frame was not stored. {hint}"
         )
     if size <= 0 or row.quota_bytes is None or use.bytes + size <= row.quota_bytes:
         return
-    held = use.bytes - tombstone_bytes(connection, row.number)  # these are purged for others
+    held = use.bytes - tombstone_bytes(connection, row.number)
     if held + size > row.quota_bytes:
         raise QuotaExceeded(
             f"Map {row.name!r} holds {held} bytes of uploads of the {row.quota_bytes} that its "
-            f"quota allows, so {size} bytes more were not stored. {_todo(row.name)}"
+            f"quota allows, so {size} bytes more were not stored. {hint}"
         )
 
 
 def tombstone_bytes(connection: Connection, map_number: int) -> int:
-    """Return the bytes of uploads of the deleted frames that can be restored."""
+    """Return the bytes of uploads of deleted frames that can be restored."""
     c = frames.c
-    asked = select(func.coalesce(func.sum(c.bytes), 0)).where(
+    statement = select(func.coalesce(func.sum(c.bytes), 0)).where(
         c.map_number == map_number, c.deletion.is_not(None)
     )
-    return int(connection.execute(asked).scalar_one())
-
-
-def _todo(name: str) -> str:
-    return (
-        "Delete frames that are not needed any more, or ask the operator for a larger quota "
-        f"(PATCH /v1/maps/{name})."
-    )
-
-
-# Frames of a map.
-
-#: Frames of one content that are looked at: nobody needs more.
-_MOST_ALIKE = 100
+    return int(connection.execute(statement).scalar_one())
 
 
 def add_frame(
     connection: Connection, map_number: int, values: dict[str, Any], frame_id: str | None = None
 ) -> FrameRow:
-    """Insert a frame as received.
+    """Insert a received frame.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    values : its columns but number, id, state and times
-    frame_id : its id, which no frame of the map has that is not deleted; default: a new one
+    connection : writing transaction
+    values : columns but number, id, state and times
+    frame_id : id, which no existing frame of the map has; default: a new one
     """
     if frame_id is None:
         frame_id = uuid.uuid4().hex
     else:
         free_id(connection, map_number, frame_id)
-    made = insert(frames).values(received_values(connection, map_number, frame_id, values))
-    row = frame_row(connection.execute(made.returning(frames)).mappings().one())
-    count_on(connection, map_number, 1, values["bytes"])
+    new = insert(frames).values(received_values(connection, map_number, frame_id, values))
+    row = frame_row(connection.execute(new.returning(frames)).mappings().one())
+    add_usage(connection, map_number, 1, values["bytes"])
     write_tags(connection, row.number, row.tags)
     return row
 
@@ -296,60 +283,60 @@ def add_frame(
 def received_values(
     connection: Connection, map_number: int, frame_id: str, values: dict[str, Any]
 ) -> dict[str, Any]:
-    """Columns of a frame that is received now; see `add_frame`."""
+    """Return the columns of a frame that is received now; see `add_frame`."""
     state, at = FrameState.RECEIVED, now(connection)
     own = {"id": frame_id, "map_number": map_number, "state": state, "received_at": at}
     return {**own, **values, **position(values["pose"])}
 
 
 def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
-    """Columns of a frame's position, to be searched for."""
+    """Return the columns of a frame's position, which searches use."""
     return {f"pose_{axis}": None if pose is None else pose[i][3] for i, axis in enumerate("xyz")}
 
 
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
-    """The frame of an id in a map, deleted ones too.
+    """Return the frame of an id in a map, even if it is deleted.
 
     Raises
     ------
-    UnknownFrame : there is none.
+    UnknownFrame : the frame does not exist.
     """
-    found = _first(connection, frames.c.map_number == row.number, frames.c.id == frame_id)
-    if found is None:
+    frame = _first(connection, frames.c.map_number == row.number, frames.c.id == frame_id)
+    if frame is None:
         raise UnknownFrame(
             f"There is no frame {frame_id!r:.80} in map {row.name!r}. List them with "
             f"GET /v1/maps/{row.name}/frames."
         )
-    return found
+    return frame
 
 
 def frames_of_content(connection: Connection, map_number: int, content_id: str) -> list[FrameRow]:
-    """Frames of a map with that content, as they came; more than one where they were PUT."""
-    found = connection.execute(
+    """Return up to 100 frames of a map with some content, in the order of their upload."""
+    rows = connection.execute(
         select(frames)
         .where(frames.c.map_number == map_number, frames.c.content_id == content_id)
         .order_by(frames.c.number)
-        .limit(_MOST_ALIKE)
+        .limit(100)
     ).mappings()
-    return [frame_row(row) for row in found]
+    return [frame_row(row) for row in rows]
 
 
 def living_frame(connection: Connection, map_number: int, frame_id: str) -> FrameRow | None:
-    """The frame of an id in a map, or None where there is none that is not deleted."""
-    there = frames.c.state != FrameState.DELETED
-    return _first(connection, frames.c.map_number == map_number, frames.c.id == frame_id, there)
+    """Return the frame of an id in a map; None if it does not exist or is deleted."""
+    existing = frames.c.state != FrameState.DELETED
+    return _first(connection, frames.c.map_number == map_number, frames.c.id == frame_id, existing)
 
 
 def frame_of(connection: Connection, number: int) -> FrameRow:
-    """The frame of a number that is known to exist."""
-    asked = select(frames).where(frames.c.number == number)
-    return frame_row(connection.execute(asked).mappings().one())
+    """Return the frame of a number, which must exist."""
+    row = connection.execute(select(frames).where(frames.c.number == number)).mappings().one()
+    return frame_row(row)
 
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
-    """Frames by their numbers; those that are gone are left out."""
-    found = rows_of_statement(connection, _frames_of_numbers, numbers)
-    return {row.number: row for row in frame_rows(found)}
+    """Return frames by their numbers, without deleted ones."""
+    rows = rows_of_statement(connection, _frames_of_numbers, numbers)
+    return {row.number: row for row in frame_rows(rows)}
 
 
 @cache
@@ -359,31 +346,27 @@ def _frames_of_numbers(dialect: str) -> Select[Any]:
 
 
 def free_id(connection: Connection, map_number: int, frame_id: str) -> None:
-    """Let a deleted frame give its id up: its row stays, as readers learn of it by its number.
-
-    A tombstone without its id can no longer be restored.
-    """
+    """Give the row of a deleted frame another id; a tombstone can then no longer be restored."""
     deleted = frames.c.state == FrameState.DELETED
     own = update(frames).where(frames.c.map_number == map_number, frames.c.id == frame_id, deleted)
     connection.execute(own.values(id=uuid.uuid4().hex, deleted_from=None))
 
 
 def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow | None:
-    found = connection.execute(select(frames).where(*conditions)).mappings().first()
-    return None if found is None else frame_row(found)
+    row = connection.execute(select(frames).where(*conditions)).mappings().first()
+    return None if row is None else frame_row(row)
 
 
 def write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
-    """Write the tags of a frame that has none yet."""
-    named = [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]
-    if named:
-        connection.execute(insert(frame_tags), named)
+    """Write the tags of a frame without tags."""
+    if rows := [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]:
+        connection.execute(insert(frame_tags), rows)
 
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
-    """Blobs of the geometry artifacts of frames."""
-    found = rows_of_statement(connection, _geometry_of_numbers, numbers, model_id=model_id)
-    return {row.frame_number: row.geometry for row in found}
+    """Return the blobs of the geometry artifacts of frames."""
+    rows = rows_of_statement(connection, _geometry_of_numbers, numbers, model_id=model_id)
+    return {row.frame_number: row.geometry for row in rows}
 
 
 @cache
@@ -393,18 +376,13 @@ def _geometry_of_numbers(dialect: str) -> Select[Any]:
     return select(signatures.c.frame_number, signatures.c.geometry).where(own, among)
 
 
-# Frames by where they were taken: for whoever compares poses in a map.
-#
-# A query reads hundreds of poses, mostly those that the query before it has read. They are kept by
-# the text they are stored as, which tells all of a pose: nothing has to say that one has changed.
-
-#: Poses that are kept, about 800 bytes each.
-_POSES = 8192
+# Frames by their positions. A query reads hundreds of poses, mostly those of the query before.
+# Parsed poses are cached by their stored text, so entries are never stale; each takes 800 bytes.
 
 
-@lru_cache(_POSES)
+@lru_cache(8192)
 def _pose_of_text(text: str) -> Floats:
-    """T_parent_sensor (4, 4) as it is stored; everybody gets the same one, which is read-only."""
+    """Return T_parent_sensor (4, 4) of its stored text; the array is shared and read-only."""
     pose = np.array(json.loads(text), np.float64)
     pose.flags.writeable = False
     return pose
@@ -412,7 +390,7 @@ def _pose_of_text(text: str) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFrame:
-    """Number, T_parent_sensor (4, 4), geometry, kind (point cloud?) and tags of a posed frame."""
+    """Number, T_parent_sensor (4, 4), artifact, kind (point cloud?) and tags of a posed frame."""
 
     number: int
     pose: Floats
@@ -425,14 +403,14 @@ def placed_frames(
     connection: Connection, map_number: int, parent: str, model_id: str,
     centre: Sequence[float], within: float, most: int,
 ) -> list[PlacedFrame]:  # fmt: skip
-    """Indexed frames of a parent frame taken near a point, the nearest first.
+    """Return indexed frames of a parent frame near a point, the nearest first.
 
     Parameters
     ----------
-    map_number, parent : whose frames
+    map_number, parent : map and parent frame
     centre : x, y, z of the point, metres
-    within : half the width of the cube that they are in, metres
-    most : of them
+    within : half the edge of the cube around the point, metres
+    most : maximum number of frames
     """
     values: dict[str, object] = {
         "map_number": map_number, "parent": parent, "model_id": model_id, "most": most,
@@ -473,7 +451,7 @@ def _placed_frames() -> Select[Any]:
 
 @dataclass(frozen=True, eq=False)
 class FrameViewpoint:
-    """Where a frame was taken, with its pose T_parent_sensor (4, 4); fields as in the table."""
+    """A frame's viewpoint, with its pose T_parent_sensor (4, 4); fields as in the table."""
 
     number: int
     map_number: int
@@ -483,7 +461,7 @@ class FrameViewpoint:
 
 
 def viewpoints_among(connection: Connection, numbers: Iterable[int]) -> list[FrameViewpoint]:
-    """Where the frames of some numbers were taken; those without a pose are left out."""
+    """Return the viewpoints of frames by their numbers, without frames that have no pose."""
     return [
         FrameViewpoint(number, of_map, parent, _pose_of_text(pose), is_cloud)
         for number, of_map, parent, pose, is_cloud in rows_of_statement(

@@ -1,10 +1,11 @@
-"""New frames, taken with the jobs that sign them: all that most uploads write.
+"""New frames: insert them with their jobs, events and audit lines, which is all that most uploads
+write.
 
-    [NewFrame, ...]  --receive_frames-->  those that were taken
+    [NewFrame, ...]  --receive_frames-->  ids of the inserted frames
 
-Others wait for this. On PostgreSQL it is one statement for all of them, whatever their maps: what
-a statement costs beside its rows, and the wait for the disk, is shared. On SQLite, where no round
-trip is waited for, it is a statement for each table and frame.
+Other writers wait for this. On PostgreSQL, one statement inserts frames of several maps, which
+share its overhead and the wait for the disk. On SQLite, which has no round trips, it is one
+statement per table and frame.
 """
 
 from __future__ import annotations
@@ -68,16 +69,16 @@ from sceneprint.store.tables import (
 
 @dataclass(frozen=True, eq=False)
 class NewFrame:
-    """A frame whose content its map may lack.
+    """A frame to insert, if its map lacks the content.
 
     Parameters
     ----------
-    row : of the map, as it was when somebody looked
-    values : see `add_frame`
-    priority : of the job that signs it
-    kept : columns of `idempotency`, PostgreSQL
-    frame_id, job_id : that they get
-    context : of the request that it came with, whoever writes it
+    row : map, as last read
+    values : columns, see `add_frame`
+    priority : priority of the job that signs the frame
+    kept : columns of `idempotency`, on PostgreSQL
+    frame_id, job_id : new ids
+    context : context variables of the upload's request
     """
 
     row: MapRow
@@ -90,61 +91,61 @@ class NewFrame:
 
     @property
     def content(self) -> tuple[int, str]:
-        """What a map has once: its number, and the content."""
+        """Number of the map and id of the content, which together are unique."""
         return self.row.number, self.values["content_id"]
 
     @property
     def tags(self) -> list[str]:
-        """Its tags, each once."""
+        """The frame's tags, without duplicates."""
         return sorted(set(self.values["tags"]))
 
     @property
     def room(self) -> dict[str, Any]:
-        """What `_room_taken` asks for."""
+        """Parameters of `_count_frame`."""
         return {"map_number": self.row.number, "map_name": self.row.name,
                 "size": self.values["bytes"], "content": self.values["content_id"]}  # fmt: skip
 
     def rows(self, connection: Connection) -> dict[str, dict[str, Any]]:
-        """Return the columns of its frame, job and event; of its line of the audit log and of its
-        idempotency key, where it has them.
+        """Return the columns of the frame, job and event, and of audit line and idempotency key if
+        any.
         """
         number = self.row.number
         job = self.context.run(job_values, connection, "sign", self.priority)
-        told = event_values("frame.received", self.row.name, self.frame_id, self.job_id, {})
-        line = self.context.run(audit_values, told["kind"], self.row.name, self.frame_id, {})
+        event = event_values("frame.received", self.row.name, self.frame_id, self.job_id, {})
+        line = self.context.run(audit_values, event["kind"], self.row.name, self.frame_id, {})
         rows = {
             "frame": received_values(connection, number, self.frame_id, self.values),
             "job": {**job, "id": self.job_id, "map_number": number},
-            "event": told,
+            "event": event,
         }
         optional = {"line": line, "kept": self.kept}
         return {**rows, **{of: row for of, row in optional.items() if row is not None}}
 
 
-def receive_frames(connection: Connection, given: Sequence[NewFrame]) -> set[str]:
-    """Take frames whose content their maps lack, and queue their signing.
+def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
+    """Insert frames whose content their maps lack, and queue their signing.
 
     Parameters
     ----------
-    connection : of a transaction that writes to their maps
-    given : the first of those with one content in one map is taken
+    connection : transaction that writes to the maps
+    new : frames; the first one with a content in a map is inserted
 
     Returns
     -------
-    ids : of those that were taken. Nothing was written of others: the map is gone or renamed, has
-        no room for all that came for it, or has the content; `add_frame` and what is asked before
-        it say which. Nor, on PostgreSQL, where something is known under the key of `kept`
+    ids : ids of the inserted frames. Nothing was written for the others: the map was deleted or
+        renamed, lacks room for all of its frames, or has the content; `add_frame` and its checks
+        say which. On PostgreSQL, the key in `kept` may also have a result already
 
     Raises
     ------
-    IntegrityError : something is done at this moment under the key of a `kept`, for another map.
+    IntegrityError : another map is storing a result for the key in `kept` at this moment.
     """
     of_content = dict[tuple[int, str], NewFrame]()
-    for one in given:
+    for one in new:
         of_content.setdefault(one.content, one)
     first = list(of_content.values())
     if connection.dialect.name == "sqlite":
-        return {one.frame_id for one in first if _received(connection, one)}
+        return {one.frame_id for one in first if _insert_on_sqlite(connection, one)}
     if not first:
         return set()
     rows = [one.rows(connection) for one in first]
@@ -155,22 +156,21 @@ def receive_frames(connection: Connection, given: Sequence[NewFrame]) -> set[str
     fixed = {key: rows[0][of][name] for of, name, key in _keys(names) if key in _FIXED}
     columns = tuple((of, tuple(names[of])) for of in ("frame", "job", "event", *_OPTIONAL)
                     if of in names)  # fmt: skip
-    asked = _reception(
+    statement = _insert_frames(
         events_table(connection), columns, fixed=tuple(fixed.items()),
         tagged=any(one.tags for one in first),
     )  # fmt: skip
     records = [_record(i, *one) for i, one in enumerate(zip(first, rows, strict=True))]
-    found = connection.execute(asked, {"records": records})
-    return set(found.scalars())
+    return set(connection.execute(statement, {"records": records}).scalars())
 
 
-def _received(connection: Connection, one: NewFrame) -> bool:
-    """Take a frame on SQLite; whether it was taken."""
-    if connection.execute(_room_taken(), one.room).first() is None:
+def _insert_on_sqlite(connection: Connection, one: NewFrame) -> bool:
+    """Insert a frame on SQLite; return whether it was inserted."""
+    if connection.execute(_count_frame(), one.room).first() is None:
         return False
     rows = one.rows(connection)
-    made = insert(frames).values(rows["frame"]).returning(frames.c.number)
-    number = connection.execute(made).scalar_one()
+    new = insert(frames).values(rows["frame"]).returning(frames.c.number)
+    number = connection.execute(new).scalar_one()
     write_tags(connection, number, one.tags)
     connection.execute(insert(jobs).values(frame_number=number, **rows["job"]))
     connection.execute(insert(events_table(connection)).values(rows["event"]))
@@ -179,8 +179,10 @@ def _received(connection: Connection, one: NewFrame) -> bool:
 
 
 @cache
-def _room_taken() -> ReturningUpdate[tuple[int]]:
-    """Count one frame more, if its map is still the same, has room, and lacks the content."""
+def _count_frame() -> ReturningUpdate[tuple[int]]:
+    """Return the statement that counts a frame if its map is unchanged, has room, and lacks the
+    content.
+    """
     number, size = bindparam("map_number", type_=WHOLE), bindparam("size", type_=WHOLE)
     content = bindparam("content", type_=TEXT)
     alike = frames.c.map_number == number, frames.c.content_id == content
@@ -189,7 +191,7 @@ def _room_taken() -> ReturningUpdate[tuple[int]]:
         .where(
             maps.c.number == number,
             maps.c.name == bindparam("map_name", type_=TEXT),
-            *_has_room(1, size),
+            *_room_conditions(1, size),
             ~exists().where(*alike),
         )
         .values(_counted(1, size))
@@ -197,8 +199,8 @@ def _room_taken() -> ReturningUpdate[tuple[int]]:
     )
 
 
-def _has_room(n: Any, size: Any) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
-    """Whether a map has room for so many frames more, of so many bytes."""
+def _room_conditions(n: Any, size: Any) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
+    """Return the conditions that a map has room for so many more frames and bytes."""
     return (
         or_(maps.c.quota_frames.is_(None), maps.c.used_frames + n <= maps.c.quota_frames),
         or_(maps.c.quota_bytes.is_(None), maps.c.used_bytes + size <= maps.c.quota_bytes),
@@ -209,30 +211,28 @@ def _counted(n: Any, size: Any) -> dict[str, Any]:
     return {"used_frames": maps.c.used_frames + n, "used_bytes": maps.c.used_bytes + size}
 
 
-# One statement for many frames, PostgreSQL.
+# One statement for many frames, on PostgreSQL. Keys such as `frame_<column>` name the columns of
+# the records. Values that the server knows are not sent: reading them took a fifth of the time.
 
-# Columns of what is inserted are named by keys: `frame_<column>` and so on. Not sent for each frame
-# are those whose values are known otherwise: reading them took a fifth of all.
-
-#: Those whose values are the time of the statement.
+#: Columns whose values are the time of the statement.
 _STAMPED = frozenset(("frame_received_at", "job_run_after", "job_created_at"))
-#: Those whose values are the same for all new frames.
+#: Columns whose values are the same for all new frames.
 _FIXED = frozenset(
     ("frame_state", "job_kind", "job_model_id", "job_state", "job_attempts", "job_failures",
      "job_token", "event_kind")
 )  # fmt: skip
-#: Those whose values are another's.
+#: Columns whose values equal another column's.
 _SAME = {
     "job_map_number": "frame_map_number", "event_frame_id": "frame_id", "event_job_id": "job_id",
     "line_at": "event_at", "line_tenant": "job_tenant", "line_action": "event_kind",
     "line_map": "event_map", "line_target": "frame_id", "line_data": "event_data",
 }  # fmt: skip
-#: What not every new frame has, each with a column that is null where it is missing.
+#: Optional rows of a new frame, each with a column that is null if the row is missing.
 _OPTIONAL = {"line": "actor", "kept": "key"}
 
 
 def _keys(names: Mapping[str, Iterable[str]]) -> Iterator[tuple[str, str, str]]:
-    """Of each column what it is of, its name and its key."""
+    """Yield table, name and key of each column."""
     return ((of, name, f"{of}_{name}") for of, columns in names.items() for name in columns)
 
 
@@ -241,59 +241,60 @@ def _is_sent(key: str) -> bool:
 
 
 def _record(place: int, one: NewFrame, rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """A frame as `_reception` is given it."""
+    """Return the record of a frame for `_insert_frames`."""
     values = {key: rows[of][name] for of, name, key in _keys(rows) if _is_sent(key)}
     return {**values, "place": place, "tags": one.tags, "size": one.room["size"]}
 
 
 @cache
-def _reception(
-    told: Table, columns: tuple[tuple[str, tuple[str, ...]], ...], *,
+def _insert_frames(
+    event_table: Table, columns: tuple[tuple[str, tuple[str, ...]], ...], *,
     fixed: tuple[tuple[str, Any], ...], tagged: bool,
 ) -> Select[Any]:  # fmt: skip
-    """Return the statement that takes frames with their jobs, events, tags, lines of the audit log
-    and idempotency keys.
+    """Return the statement that inserts frames with their jobs, events, tags, audit lines and
+    idempotency keys.
 
     Parameters
     ----------
-    told : table that events are inserted into
+    event_table : table of the events
     columns : names of the columns of each row
-    fixed : values of columns by their keys, the same for all
+    fixed : values of columns by their keys, equal for all frames
     tagged : whether a frame has a tag
     """
-    of = {"frame": frames, "job": jobs, "event": told, "line": audit, "kept": idempotency}
+    of = {"frame": frames, "job": jobs, "event": event_table, "line": audit, "kept": idempotency}
     tables = {name: (of[name], names) for name, names in columns}
-    known = dict(fixed)
-    given = _given(tables)
-    lacking = _lacking(given, kept="kept" in tables)
-    room = _rooms_taken(lacking)
+    constants = dict(fixed)
+    records = _records(tables)
+    lacking = _lacking(records, kept="kept" in tables)
+    room = _count_frames(lacking)
     has_room = and_(room.c.number == lacking.c.frame_map_number,
                     room.c.name == lacking.c.event_map)  # fmt: skip
     source = lacking.join(room, has_room)
-    made = _inserted("frame", tables, known, lacking, source).returning(
-        frames.c.number, frames.c.id
+    new = (
+        _insert_rows("frame", tables, constants, lacking, source)
+        .returning(frames.c.number, frames.c.id)
+        .cte("new")
     )
-    new = made.cte("new")
-    taken = lacking.join(new, new.c.id == lacking.c.frame_id)
+    inserted = lacking.join(new, new.c.id == lacking.c.frame_id)
     others = [
-        _inserted("job", tables, known, lacking, taken, frame_number=new.c.number),
-        _inserted("event", tables, known, lacking, taken),
+        _insert_rows("job", tables, constants, lacking, inserted, frame_number=new.c.number),
+        _insert_rows("event", tables, constants, lacking, inserted),
     ]
     if tagged:
         tag = func.json_array_elements_text(lacking.c.tags)
-        rows = select(new.c.number, tag).select_from(taken)
+        rows = select(new.c.number, tag).select_from(inserted)
         others.append(insert(frame_tags).from_select(["frame_number", "tag"], rows))
     for name in (one for one in _OPTIONAL if one in tables):
-        is_there = lacking.c[f"{name}_{_OPTIONAL[name]}"].is_not(None)
-        others.append(_inserted(name, tables, known, lacking, taken, is_there))
+        present = lacking.c[f"{name}_{_OPTIONAL[name]}"].is_not(None)
+        others.append(_insert_rows(name, tables, constants, lacking, inserted, present))
     return select(new.c.id).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
 
 
 _Tables = dict[str, tuple[Table, tuple[str, ...]]]
 
 
-def _given(tables: _Tables) -> TableValuedAlias:
-    """Records of `_record`, as rows."""
+def _records(tables: _Tables) -> TableValuedAlias:
+    """Return the records of `_record` as rows."""
     names = {of: columns for of, (_, columns) in tables.items()}
     columns = [
         column(key, _kind(tables[of][0].c[name].type))
@@ -301,45 +302,47 @@ def _given(tables: _Tables) -> TableValuedAlias:
         if _is_sent(key)
     ]
     own = column("place", BigInteger), column("size", BigInteger), column("tags", JSON)
-    records = func.json_to_recordset(bindparam("records", type_=JSON))
-    given = records.table_valued(*columns, *own, name="given")
-    return given.render_derived(name="given", with_types=True)
+    rows = func.json_to_recordset(bindparam("records", type_=JSON))
+    table = rows.table_valued(*columns, *own, name="records")
+    return table.render_derived(name="records", with_types=True)
 
 
 def _kind(kind: TypeEngine[Any]) -> TypeEngine[Any]:
-    """The type of a column of a record: a length would cut off what the table refuses."""
+    """Return the type of a record's column, without a length: the table must refuse what is too
+    long.
+    """
     return TEXT if isinstance(kind, String) else kind
 
 
-def _lacking(given: TableValuedAlias, *, kept: bool) -> CTE:
-    """Of what was given, what its map lacks, and what was not done before under its key.
+def _lacking(records: TableValuedAlias, *, kept: bool) -> CTE:
+    """Return the records whose content their map lacks, and whose key has no result.
 
-    Each is looked for by itself, as what comes next in the order of one index: the plan may be of
-    when the tables were empty, and any index of a map's frames seemed as good.
+    Each content is looked up as the next entry of one index: a cached plan may date from when the
+    tables were empty and all indexes seemed equally good.
     """
     key = frames.c.map_number, frames.c.content_id
-    own = given.c.frame_map_number, given.c.frame_content_id
-    next_is_it = (
+    own = records.c.frame_map_number, records.c.frame_content_id
+    is_next = (
         select(and_(key[0] == own[0], key[1] == own[1]))
         .where(tuple_(*key) >= tuple_(*own))
         .order_by(*key)
         .limit(1)
     )
-    absent = [next_is_it.scalar_subquery().is_not(true())]
+    absent = [is_next.scalar_subquery().is_not(true())]
     if kept:
-        same = idempotency.c.actor == given.c.kept_actor, idempotency.c.key == given.c.kept_key
+        same = idempotency.c.actor == records.c.kept_actor, idempotency.c.key == records.c.kept_key
         done = select(true()).where(*same).limit(1).scalar_subquery()
         absent.append(done.is_(None))
-    return select(given).where(*absent).cte("lacking")
+    return select(records).where(*absent).cte("lacking")
 
 
-def _rooms_taken(lacking: CTE) -> CTE:
-    """Maps that are what was looked at still, and have room for all that they lack, counted."""
+def _count_frames(lacking: CTE) -> CTE:
+    """Return the unchanged maps that have room for all of their records, after counting these."""
     each = lacking.c.frame_map_number, lacking.c.event_map
     size = cast(func.sum(lacking.c.size), BigInteger)
     more = select(*each, func.count().label("n"), size.label("size")).group_by(*each).cte("more")
     own = maps.c.number == more.c.frame_map_number, maps.c.name == more.c.event_map
-    counted = update(maps).where(*own, *_has_room(more.c.n, more.c.size))
+    counted = update(maps).where(*own, *_room_conditions(more.c.n, more.c.size))
     return (
         counted.values(_counted(more.c.n, more.c.size))
         .returning(maps.c.number, maps.c.name)
@@ -347,11 +350,11 @@ def _rooms_taken(lacking: CTE) -> CTE:
     )
 
 
-def _inserted(
+def _insert_rows(
     of: str, tables: _Tables, fixed: dict[str, Any], lacking: CTE, source: FromClause,
     *conditions: ColumnElement[bool], **more: ColumnElement[Any],
 ) -> Insert:  # fmt: skip
-    """A row inserted for each frame of a source, in the order in which they were given."""
+    """Return the INSERT of a row for each frame of a source, in the order of the records."""
     table, names = tables[of]
 
     def value(name: str) -> ColumnElement[Any]:

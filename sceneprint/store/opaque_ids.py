@@ -1,9 +1,8 @@
-"""Numbers of rows as the outside sees them: ids of events, and cursors of pages.
+"""Opaque forms of row numbers for clients: ids of events, and cursors of pages.
 
-Rows are numbered over all maps, so that the numbers themselves, and the gaps between them, would
-tell who may see one map how much happens in the others. A seal is a number under AES-SIV (RFC
-5297), which only the store can read: the same for the same number, and like chance beside any
-other.
+Rows are numbered across all maps, so plain numbers and their gaps would reveal to a user of one map
+how much happens in the others. A seal is a number encrypted with AES-SIV (RFC 5297) and the store's
+secret. It is deterministic, and unrelated to the seals of other numbers.
 """
 
 from __future__ import annotations
@@ -23,28 +22,28 @@ from sceneprint.errors import InvalidRequest, UnusableStore
 from sceneprint.store.database import Database
 from sceneprint.store.tables import secrets
 
-#: What a number counts: a seal of one kind is none of another.
+#: Kinds of rows: a seal is valid for one kind only.
 Kind = Literal["audit", "deletion", "event", "frame", "job", "query"]
-#: Before everything: what no row has as its number, and so needs no seal.
+#: Position before all rows; no row has number 0, so it needs no seal.
 START = "0"
-#: A place in a list that is ordered by time: seconds since 1970, and the number of a row.
+#: Position in a list that is sorted by time: seconds since 1970, and the number of a row.
 _MOMENT = struct.Struct(">dQ")
 
 
 class OpaqueIds:
-    """The seals of one store."""
+    """Encrypt and decrypt the row numbers of one store."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def seal(self, kind: Kind, number: int) -> str:
-        """48 digits that stand for a number; START for 0."""
+        """Return 48 digits that stand for a number; START for 0."""
         if number == 0:
             return START
         return self._cipher.encrypt(number.to_bytes(8, "big"), [kind.encode()]).hex()
 
     def open(self, kind: Kind, seal: str) -> int | None:
-        """The number that a seal stands for; None where this store gave out no such seal."""
+        """Return the number behind a seal; None if this store did not issue it."""
         if seal == START:
             return 0
         if not re.fullmatch(r"[0-9a-f]{48}", seal):
@@ -55,28 +54,28 @@ class OpaqueIds:
             return None
         return int.from_bytes(plain, "big")
 
-    def event(self, given: str, place: str = "after") -> int:
-        """The number of the event that an id stands for; 0 for START, which is before all of them.
+    def event(self, event_id: str, place: str = "after") -> int:
+        """Return the number of the event behind an id; 0 for START, the position before all events.
 
         Raises
         ------
-        InvalidRequest : it is the id of no event of this store.
+        InvalidRequest : the id is not that of an event of this store.
         """
-        number = self.open("event", given)
+        number = self.open("event", event_id)
         if number is None:
             raise InvalidRequest(
-                f"{given!r:.40} is not the id of an event here. Start again: with {START} for all "
-                "stored events, or without an id for new events only.",
+                f"{event_id!r:.40} is not the id of an event here. Start again: with {START} for "
+                "all stored events, or without an id for new events only.",
                 ((place, "not the id of an event"),),
             )
         return number
 
     def row(self, kind: Kind, cursor: str | None) -> int | None:
-        """The number of the row that a page before ended with, by its cursor; None for the first.
+        """Return the number of the last row of the previous page; None for the first page.
 
         Raises
         ------
-        InvalidRequest : it was not given out.
+        InvalidRequest : this store did not issue the cursor.
         """
         if cursor is None:
             return None
@@ -86,25 +85,25 @@ class OpaqueIds:
         return number
 
     def next_cursor(self, kind: Kind, numbers: Sequence[int], limit: int) -> str | None:
-        """The cursor of the page after one of `limit` rows; None: no more were found than these."""
+        """Return the cursor of the page after `limit` rows; None if there are no more rows."""
         return self.seal(kind, numbers[limit - 1]) if len(numbers) > limit else None
-
-    # of lists that are ordered by time: rows of one time are told apart by their numbers
 
     def next_moment(
         self, kind: Kind, moments: Sequence[tuple[float, int]], limit: int
     ) -> str | None:
-        """The cursor of the page after one of `limit` rows; None: no more were found than these."""
+        """Return the cursor of the page after `limit` rows of a list that is sorted by time and
+        number.
+        """
         if len(moments) <= limit:
             return None
         return self._cipher.encrypt(_MOMENT.pack(*moments[limit - 1]), [kind.encode()]).hex()
 
     def moment(self, kind: Kind, cursor: str | None) -> tuple[float, int] | None:
-        """Time and number of the row that a page before ended with; None for the first page.
+        """Return time and number of the last row of the previous page; None for the first page.
 
         Raises
         ------
-        InvalidRequest : it was not given out.
+        InvalidRequest : this store did not issue the cursor.
         """
         if cursor is None:
             return None
@@ -120,7 +119,7 @@ class OpaqueIds:
 
     @property
     def owner(self) -> str:
-        """32 digits that stand for the store itself, and tell nothing of its secret."""
+        """Return 32 digits that identify the store, and reveal nothing of its secret."""
         return owner_of(self._secret)
 
     @cached_property
@@ -130,22 +129,22 @@ class OpaqueIds:
     @cached_property
     def _secret(self) -> bytes:
         with self._database.read() as connection:
-            asked = select(secrets.c.value).where(secrets.c.name == "seals")
-            found = connection.execute(asked).scalar()
-        if found is None:
+            statement = select(secrets.c.value).where(secrets.c.name == "seals")
+            value = connection.execute(statement).scalar()
+        if value is None:
             raise UnusableStore(
-                "The database lacks the secret that ids of events are made with. Restore the data "
+                "The database lacks the secret that encrypts the ids of events. Restore the data "
                 "folder from a copy."
             )
-        return bytes(found)
+        return bytes(value)
 
 
 def row_of(cursor: str | None) -> int | None:
-    """The place that a cursor stands for in a list that is numbered by itself.
+    """Return the position behind the cursor of a list with its own numbers.
 
     Raises
     ------
-    InvalidRequest : it was not given out.
+    InvalidRequest : the service did not issue the cursor.
     """
     if cursor is None:
         return None
@@ -155,7 +154,7 @@ def row_of(cursor: str | None) -> int | None:
 
 
 def invalid_cursor(cursor: str) -> InvalidRequest:
-    """What is said of a cursor that was not given out."""
+    """Return the error for a cursor that the service did not issue."""
     return InvalidRequest(
         f"The cursor {cursor!r:.40} is not valid. Use the `next_cursor` of a page.",
         (("cursor", "not a cursor of this service"),),
@@ -163,5 +162,5 @@ def invalid_cursor(cursor: str) -> InvalidRequest:
 
 
 def owner_of(secret: bytes) -> str:
-    """Return the name of the store that has a secret; see `OpaqueIds.owner`."""
+    """Return the public name of the store that has a secret."""
     return hmac.digest(secret, b"store", "sha256")[:16].hex()

@@ -1,7 +1,7 @@
-"""Parent frames joined into one: their rows, and the poses of frames that follow them.
+"""Joins of parent frames: their rows, and the poses of frames that follow them.
 
-A join leads from a parent frame to another. Frames that were sent with poses in a parent frame have
-them in its root, which is where its joins lead to, and keep what was sent beside that.
+A join transforms poses from one parent frame to another. Frames that were sent with poses in a
+joined parent frame have poses in its root, where its joins end, and keep the sent pose as well.
 
     join_parent, undo_joins  -->  rows of joins  --find_joins-->  roots  -->  poses of frames
 """
@@ -17,7 +17,7 @@ import numpy as np
 from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
 
 from sceneprint.store.maps import position
-from sceneprint.store.surface_rows import note_moved
+from sceneprint.store.surface_rows import note_edits
 from sceneprint.store.tables import FrameRow, frames, parent_joins
 from sceneprint.types import Floats
 from sceneprint_client.api import FrameState
@@ -25,7 +25,7 @@ from sceneprint_client.api import FrameState
 
 @dataclass(frozen=True, eq=False)
 class ParentJoin:
-    """A parent frame that is joined, the root, and T_root_parent (4, 4)."""
+    """A joined parent frame, its root, and T_root_parent (4, 4)."""
 
     parent: str
     root: str
@@ -34,7 +34,7 @@ class ParentJoin:
 
 @dataclass(frozen=True)
 class ParentRun:
-    """Indexed frames of a map in one parent frame and session: how many, and the first number."""
+    """The indexed frames of a map in one parent frame and session: count and first number."""
 
     parent: str
     session: str | None
@@ -44,29 +44,29 @@ class ParentRun:
 
 
 def find_joins(connection: Connection, map_number: int) -> dict[str, ParentJoin]:
-    """Return how each joined parent frame of a map lies in its root, by its name."""
+    """Return the joins of a map's parent frames to their roots, by parent frame."""
     c = parent_joins.c
     stands = c.map_number == map_number, c.undone_at.is_(None)
     rows = connection.execute(select(c.parent, c.towards, c.transform).where(*stands))
     steps = {row.parent: (row.towards, np.array(row.transform)) for row in rows}
-    found = {}
+    joins = {}
     for parent, (root, T) in steps.items():
-        while root in steps:  # it ends: a join leads from one root to another
+        while root in steps:  # this ends, as a join leads from one root to another
             root, onwards = steps[root]
             T = onwards @ T
-        found[parent] = ParentJoin(parent, root, T)
-    return found
+        joins[parent] = ParentJoin(parent, root, T)
+    return joins
 
 
 def is_joined_by(connection: Connection, map_number: int, job_id: str) -> bool:
-    """Return whether a join that an association found stands."""
+    """Return whether a join that an association proposed is in effect."""
     c = parent_joins.c
     stands = c.map_number == map_number, c.job_id == job_id, c.undone_at.is_(None)
     return connection.execute(select(c.parent).where(*stands)).first() is not None
 
 
 def undone_pairs(connection: Connection, map_number: int) -> list[set[str]]:
-    """Return the roots that the two ends of each undone join lead to now."""
+    """Return the present roots of the two ends of each undone join."""
     c, joins = parent_joins.c, find_joins(connection, map_number)
     undone = select(c.parent, c.towards).where(c.map_number == map_number, c.undone_at.is_not(None))
     return [{_root(joins, name) for name in row} for row in connection.execute(undone)]
@@ -77,38 +77,38 @@ def _root(joins: Mapping[str, ParentJoin], name: str) -> str:
 
 
 def posed_runs(connection: Connection, map_number: int) -> list[ParentRun]:
-    """Return the sessions of a map's indexed frames with poses, the one that came first first."""
+    """Return the sessions of a map's posed, indexed frames, in the order of their first frames."""
     c, first = frames.c, func.min(frames.c.number)
     run = (c.pose_parent, c.session, c.robot)
-    asked = select(*run, func.count(), first).where(
+    statement = select(*run, func.count(), first).where(
         c.map_number == map_number, c.state == FrameState.INDEXED, c.pose_x.is_not(None)
     )
-    found = connection.execute(asked.group_by(*run).order_by(first))
-    return [ParentRun(*row) for row in found]
+    rows = connection.execute(statement.group_by(*run).order_by(first))
+    return [ParentRun(*row) for row in rows]
 
 
 def count_poses(connection: Connection, map_number: int) -> tuple[int, int]:
-    """Return how many indexed frames of a map have a pose, and in how many parent frames."""
+    """Return the number of posed, indexed frames of a map, and of their parent frames."""
     c = frames.c
-    asked = select(func.count(c.pose_x), func.count(c.pose_parent.distinct())).where(
+    statement = select(func.count(c.pose_x), func.count(c.pose_parent.distinct())).where(
         c.map_number == map_number, c.state == FrameState.INDEXED, c.pose_x.is_not(None)
     )
-    posed, parents = connection.execute(asked).one()
+    posed, parents = connection.execute(statement).one()
     return posed, parents
 
 
 def root_columns(connection: Connection, frame: FrameRow) -> dict[str, Any]:
-    """Return the pose in the root of a frame whose pose is as it was sent, in a joined frame; else
-    nothing.
+    """Return the pose in the root of a frame with an unmoved pose in a joined parent frame; else
+    {}.
     """
     if frame.pose is None or frame.pose_parent is None or frame.sent_parent is not None:
-        return {}  # what was moved follows its joins by itself
+        return {}  # a moved pose follows its joins anyway
     one = find_joins(connection, frame.map_number).get(frame.pose_parent)
     return {} if one is None else _columns(frame.pose_parent, frame.pose, one)
 
 
 def _columns(parent: str, sent: Any, one: ParentJoin | None) -> dict[str, Any]:
-    """Return the columns of a frame that was sent in a parent frame, by the join of that."""
+    """Return the columns of a frame with its sent pose, moved by the join of the parent frame."""
     if one is None:
         return {"pose_parent": parent, "pose": sent, "sent_parent": None, "sent_pose": None}
     moved = (one.T @ np.array(sent)).tolist()
@@ -116,25 +116,25 @@ def _columns(parent: str, sent: Any, one: ParentJoin | None) -> dict[str, Any]:
 
 
 def join_parent(connection: Connection, map_number: int, one: ParentJoin, job_id: str) -> bool:
-    """Let all poses in a parent frame, and those that were joined to it, lead to a root.
+    """Move all poses in a parent frame, and those joined to it, to a root.
 
     Parameters
     ----------
-    connection : of a writing transaction of the map
-    map_number : of the map
-    one : a join of two roots
-    job_id : of the association that found it
+    connection : writing transaction of the map
+    map_number : map
+    one : join of two roots
+    job_id : association that proposed it
 
     Returns
     -------
-    joined : False, and nothing was written, where one of them is joined by now
+    joined : False, and nothing was written, if one of the roots is joined already
     """
     before = find_joins(connection, map_number)
     if one.parent in before or one.root in before:
         return False
     c = parent_joins.c
     ends = c.map_number == map_number, c.parent == one.parent, c.towards == one.root
-    connection.execute(delete(parent_joins).where(*ends))  # it may have been undone before
+    connection.execute(delete(parent_joins).where(*ends))  # an undone join may exist
     connection.execute(
         insert(parent_joins).values(
             map_number=map_number, parent=one.parent, towards=one.root, transform=one.T.tolist(),
@@ -146,11 +146,11 @@ def join_parent(connection: Connection, map_number: int, one: ParentJoin, job_id
 
 
 def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
-    """Take back the joins that an association found, in a writing transaction of the map.
+    """Undo the joins that an association proposed, in a writing transaction of the map.
 
     Returns
     -------
-    undone : False, and nothing was written, where none of them stands
+    undone : False, and nothing was written, if none is in effect
     """
     before = find_joins(connection, map_number)
     if not is_joined_by(connection, map_number, job_id):
@@ -163,7 +163,7 @@ def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
 
 
 def _move_frames(connection: Connection, map_number: int, before: Mapping[str, ParentJoin]) -> None:
-    """Give frames whose root is another one than before their poses in it, by what was sent."""
+    """Write the poses, from the sent ones, of the frames whose root has changed."""
     now = find_joins(connection, map_number)
     changed = [name for name in {*before, *now} if _root(before, name) != _root(now, name)]
     f = frames.c
@@ -171,11 +171,11 @@ def _move_frames(connection: Connection, map_number: int, before: Mapping[str, P
         f.map_number == map_number,
         f.pose_x.is_not(None),
         f.pose_parent.in_(changed) | f.sent_parent.in_(changed),
-    )  # deleted ones too: they may be restored
+    )  # includes deleted frames, which may be restored
     moved = []
     for number, parent, pose, sent_parent, sent_pose in connection.execute(affected).all():
         sent = (parent, pose)
-        if sent_parent in changed:  # else a copy of a frame that another map had moved
+        if sent_parent in changed:  # else the frame was copied from a map that had moved it
             sent = (sent_parent, sent_pose)
         values = _columns(*sent, now.get(sent[0]))
         moved.append({"own": number, **values, **position(values["pose"])})
@@ -185,4 +185,4 @@ def _move_frames(connection: Connection, map_number: int, before: Mapping[str, P
     columns = [name for name in moved[0] if name != "own"]
     named = own.values({name: bindparam(name, type_=f[name].type) for name in columns})
     connection.execute(named, moved)
-    note_moved(connection, [one["own"] for one in moved], map_number)
+    note_edits(connection, [one["own"] for one in moved], map_number)

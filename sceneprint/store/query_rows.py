@@ -1,4 +1,4 @@
-"""Rows of queries: who statement which map, the outcome, and whether the answer is stored.
+"""Rows of queries: who searched which map, the outcome, and whether the answer is stored.
 
 NewQuery, ...  --add_queries-->  rows and events in one commit  --list_queries-->  QueryRow, ...
 """
@@ -38,7 +38,7 @@ from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.results import RecordStatus
 
 _c = queries.c
-#: Most characters of `reason`.
+#: Maximum number of characters of `reason`.
 MOST_REASON = 1000
 
 
@@ -70,21 +70,21 @@ class NewQuery(_Query):
 
     Parameters
     ----------
-    at : when the query came, seconds since 1970
+    at : arrival of the query, seconds since 1970
     map : name of the map that the row belongs to
-    maps : names of all maps that were searched; None: only `map`
-    robot, session : who sent it, and in which run, as far as is known
-    status, cause, reason : of the answer; or `failed`, the type of the error, and its text
-    pose_parent, pose : x, y, z, qx, qy, qz, qw of T_parent_query where it was found
-    confidence : of that pose, or of the best alternative
-    support : of the pose that was found
-    alternatives : number of poses that the evidence supports as well
+    maps : names of all searched maps; None: only `map`
+    robot, session : sender and run, if known
+    status, cause, reason : those of the answer; or `failed`, the type of the error, and its text
+    pose_parent, pose : parent frame, and x, y, z, qx, qy, qz, qw of T_parent_query, if it was found
+    confidence : confidence of that pose, or of the best alternative
+    support : support of that pose
+    alternatives : number of other poses that the evidence supports
     milliseconds : duration
-    kind : of the frame, if it was read
-    frame_map, frame_id : the stored frame that was the query
-    key_id : of the key that the request came with
-    listed : whether the history lists it; an event reports it then as well
-    bytes : of the stored answer; 0: it is not stored
+    kind : kind of the query frame, if it was decoded
+    frame_map, frame_id : map and id of a stored frame that was the query
+    key_id : id of the request's key
+    listed : whether the history lists the query, and an event reports it
+    bytes : size of the stored answer; 0: it is not stored
     shown : numbers of the frames that the answer shows
     """
 
@@ -96,14 +96,14 @@ class NewQuery(_Query):
 
 @dataclass(frozen=True)
 class QueryRow(_Query):
-    """A query as it is stored; other fields as in NewQuery.
+    """A stored query; other fields as in NewQuery.
 
     Parameters
     ----------
-    key : name of the key; None without one, and where it was revoked
-    bytes : of the answer; 0 where it is not stored, or no longer
-    kept_at : since when the answer is kept; None: it expires
-    title : of a kept answer
+    key : name of the key; None without a key, or if it was revoked
+    bytes : size of the stored answer; 0: it is not stored
+    kept_at : time since which the answer is kept; None: it expires
+    title : title of a kept answer
     """
 
     number: int
@@ -114,36 +114,36 @@ class QueryRow(_Query):
 
     @property
     def searched(self) -> Sequence[str]:
-        """Names of all maps that were searched."""
+        """Names of all searched maps."""
         return [self.map] if self.maps is None else self.maps
 
 
-#: How a row is read, without the answer itself.
+#: Statement that reads rows without their answers.
 _ROW = select(
     *(_c[one.name] for one in fields(QueryRow) if one.name not in ("map", "key")),
     select(maps.c.name).where(maps.c.number == _c.map_number).scalar_subquery().label("map"),
     select(keys.c.name).where(keys.c.id == _c.key_id).scalar_subquery().label("key"),
 )
-#: As the partial index says it: a planner does not know a bound value to be this one.
+#: Condition as in the partial index: planners do not match bound values to it.
 _STORED: ColumnElement[bool] = literal_column("bytes > 0")
-#: Kind of the event that reports a query, and the columns that it repeats.
+#: Kind of the event that reports a query, and the columns that it contains.
 EVENT = "query.answered"
 _REPORTED = ("status", "robot", "session", "cause", "support", "milliseconds")
 
 
 def add_queries(connection: Connection, new: Sequence[NewQuery]) -> None:
-    """Store queries, and an event for each that is listed.
+    """Store queries, and an event for each listed one.
 
-    Queries of a map that was deleted or created again since they came are left out.
+    Queries of a map that was deleted or replaced since their arrival are ignored.
     """
     names = sorted({one.map for one in new})
     statement = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
-    known = {row.name: row for row in connection.execute(statement)}
-    found = [one for one in new if one.map in known and known[one.map].created_at <= one.at]
-    if not found:
+    existing = {row.name: row for row in connection.execute(statement)}
+    valid = [one for one in new if one.map in existing and existing[one.map].created_at <= one.at]
+    if not valid:
         return
-    connection.execute(insert(queries), [_values(one, known[one.map].number) for one in found])
-    if reported := [_event(one) for one in found if one.listed]:
+    connection.execute(insert(queries), [_values(one, existing[one.map].number) for one in valid])
+    if reported := [_event(one) for one in valid if one.listed]:
         connection.execute(insert(events), reported)
 
 
@@ -167,7 +167,7 @@ def _event(one: NewQuery) -> dict[str, Any]:
             "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
         }
     own = one.frame_id if one.frame_map == one.map else None
-    # the time of the event, not of the query: events are in the order of their times
+    # the time of the event, not of the query, as events are sorted by time
     return {
         "at": time.time(), "kind": EVENT, "map": one.map, "frame_id": own, "job_id": None,
         "data": data,
@@ -176,15 +176,15 @@ def _event(one: NewQuery) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class WantedQueries:
-    """Which queries to list.
+    """Conditions on the queries of a list.
 
     Parameters
     ----------
-    map_numbers : only of these maps; None: of all
-    statuses : one of these; none: any
-    robot : that sent it; None: any
-    since, until : that came at that time or later, and before that one, seconds since 1970
-    kept : only those with kept answers
+    map_numbers : numbers of the only maps; None: all maps
+    statuses : statuses, one of which must match; empty: any
+    robot : sender; None: any
+    since, until : interval of the arrival, without its end, seconds since 1970
+    kept : whether only kept answers match
     """
 
     map_numbers: tuple[int, ...] | None = None
@@ -202,9 +202,9 @@ def list_queries(
 
     Parameters
     ----------
-    wanted : which
-    before : time and number of the row that the previous page ended with
-    limit : at most so many
+    wanted : conditions
+    before : time and number of the last row of the previous page
+    limit : maximum number
     """
     statement = _ROW.where(*_conditions(wanted))
     if before is not None:
@@ -217,7 +217,7 @@ def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
     yield _c.kept_at.is_not(None) if wanted.kept else or_(_c.listed, _c.kept_at.is_not(None))
     numbers = wanted.map_numbers
     if numbers is not None:
-        # a sum is in no index: the queries of a robot are few, and found by its own
+        # "+ 0" rules out the indexes of the map: the robot's own finds its few queries faster
         own = _c.map_number if wanted.robot is None else _c.map_number + 0
         yield own == numbers[0] if len(numbers) == 1 else own.in_(numbers)
     if wanted.statuses:
@@ -238,12 +238,12 @@ def find_query(connection: Connection, query_id: str) -> QueryRow | None:
 
 def read_kept(connection: Connection, number: int) -> bytes | None:
     """Return the kept answer of a query, or None."""
-    found: bytes | None = connection.execute(select(_c.answer).where(_c.number == number)).scalar()
-    return found
+    answer: bytes | None = connection.execute(select(_c.answer).where(_c.number == number)).scalar()
+    return answer
 
 
 def is_current(connection: Connection, row: QueryRow) -> bool:
-    """Return whether the maps that a query searched, and the stored frame it named, still exist."""
+    """Return whether the searched maps, and the stored frame that was the query, still exist."""
     names = set(row.searched)
     statement = select(maps.c.name).where(maps.c.name.in_(names), maps.c.created_at <= row.at)
     if len(connection.execute(statement).all()) < len(names):
@@ -263,11 +263,8 @@ def is_current(connection: Connection, row: QueryRow) -> bool:
     return number is not None and number in (shown or [])  # else another frame has its id
 
 
-# Kept answers.
-
-
 def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> bool:
-    """Keep an answer in the database, as part of every backup; return whether it is stored."""
+    """Store an answer in the database and its backups; return False if it has expired."""
     own = update(queries).where(_c.number == number, _STORED)
     return connection.execute(own.values(answer=data, kept_at=at)).rowcount == 1
 
@@ -284,45 +281,44 @@ def release_answer(connection: Connection, number: int) -> None:
 
 
 def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
-    """Return the number of kept answers of a map, and bytes of the kept answers of all maps."""
+    """Return the number of kept answers of a map, and the bytes of those of all maps."""
     kept = select(func.count(), func.coalesce(func.sum(_c.bytes), 0)).where(_c.kept_at.is_not(None))
     of_map = select(maps.c.number).where(maps.c.name == map_name).scalar_subquery()
     count = connection.execute(kept.where(_c.map_number == of_map)).one()[0]
     return int(count), int(connection.execute(kept).one()[1])
 
 
-# What is removed: old queries and those that a map has too many of, the oldest answers where room
-# is needed, and answers that show deleted frames.
+# Removal of old and surplus queries, of the oldest answers, and of answers with deleted frames.
 
 
 def old_queries(connection: Connection, before: float, limit: int) -> list[int]:
-    """Return numbers of the oldest queries that came before a time and are not kept."""
+    """Return the numbers of the oldest queries from before a time that are not kept."""
     spent = select(_c.number).where(_c.at < before, _c.kept_at.is_(None))
     return list(connection.execute(spent.order_by(_c.at, _c.number).limit(limit)).scalars())
 
 
 def surplus_queries(connection: Connection, most: int, limit: int) -> list[int]:
-    """Return numbers of the oldest queries of maps that have more than so many."""
+    """Return the numbers of the oldest queries of maps with more than `most` queries."""
     span = connection.execute(select(func.max(_c.number) - func.min(_c.number))).scalar()
     if (span or 0) < most:  # the usual case, without counting
         return []
     counts = select(_c.map_number, func.count()).group_by(_c.map_number)
-    found: list[int] = []
+    numbers: list[int] = []
     for map_number, count in connection.execute(counts.having(func.count() > most)).all():
         own = select(_c.number).where(_c.map_number == map_number, _c.kept_at.is_(None))
-        least = min(count - most, limit - len(found))
-        found += connection.execute(own.order_by(_c.at, _c.number).limit(least)).scalars()
-    return found
+        least = min(count - most, limit - len(numbers))
+        numbers += connection.execute(own.order_by(_c.at, _c.number).limit(least)).scalars()
+    return numbers
 
 
 def queries_of_map(connection: Connection, map_number: int, limit: int) -> list[int]:
-    """Return numbers of some queries of a map."""
+    """Return the numbers of some queries of a map."""
     own = select(_c.number).where(_c.map_number == map_number).limit(limit)
     return list(connection.execute(own).scalars())
 
 
 def remove_queries(connection: Connection, numbers: Sequence[int]) -> list[str]:
-    """Remove queries, a few hundred at most; returns the ids of those whose answers were stored."""
+    """Remove a few hundred queries at most; return the ids of those with a stored answer."""
     own = among(connection, _c.number, numbers)
     stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
     connection.execute(delete(queries).where(own))
@@ -336,27 +332,27 @@ def stored_bytes(connection: Connection) -> int:
 
 
 def oldest_answers(connection: Connection, limit: int) -> list[tuple[int, int]]:
-    """Return numbers and bytes of the oldest answers that are not kept."""
+    """Return number and bytes of the oldest answers that are not kept."""
     statement = select(_c.number, _c.bytes).where(_STORED, _c.kept_at.is_(None))
-    found = connection.execute(statement.order_by(_c.at, _c.number).limit(limit))
-    return [(row.number, row.bytes) for row in found]
+    rows = connection.execute(statement.order_by(_c.at, _c.number).limit(limit))
+    return [(row.number, row.bytes) for row in rows]
 
 
 def shown_frames(connection: Connection, after: int, limit: int) -> list[tuple[int, list[int]]]:
-    """Return numbers of stored answers above `after`, and of the frames that each of them shows."""
+    """Return the next stored answers by number, and the numbers of the frames that each shows."""
     statement = select(_c.number, _c.shown).where(_STORED, _c.number > after)
-    found = connection.execute(statement.order_by(_c.number).limit(limit))
-    return [(row.number, row.shown or []) for row in found]
+    rows = connection.execute(statement.order_by(_c.number).limit(limit))
+    return [(row.number, row.shown or []) for row in rows]
 
 
 def unpurged_frames(connection: Connection, numbers: set[int]) -> set[int]:
-    """Return those of some frames that exist, or that can be restored."""
+    """Return those of some frames that exist or can be restored."""
     statement = select(frames.c.number).where(not_purged())
     return {row.number for row in rows_among(connection, statement, frames.c.number, numbers)}
 
 
 def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
-    """Remove at most a few hundred answers, and their unlisted queries; returns their ids."""
+    """Remove a few hundred answers at most, and their unlisted queries; return the ids."""
     own = among(connection, _c.number, numbers)
     stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
     connection.execute(delete(queries).where(own, ~_c.listed))
@@ -366,6 +362,6 @@ def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
 
 
 def stored_among(connection: Connection, query_ids: Sequence[str]) -> set[str]:
-    """Return those of some ids, a thousand at most, whose answers are stored in files."""
+    """Return those of a thousand ids at most whose answers are stored in files."""
     statement = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
     return set(connection.execute(statement).scalars())

@@ -2,31 +2,31 @@
 
     enqueue  -->  queued  --claim-->  running  --finish | fail-->  over, or queued again
 
-Tenants take turns: a claim goes to the tenant that was served the longest ago of those that have
-a job due, and takes its first by priority. Between two turns of one, each other has at most one,
-for each worker that claims at the same moment. What nobody asked for, such as the re-encoding of
-a map, waits while anybody has a job.
+Tenants take turns: a claim takes a due job of the tenant whose last claim is oldest, the one with
+the highest priority. Between two jobs of a tenant, each other tenant gets at most one per
+concurrently claiming worker. Upkeep without a tenant, such as the re-encoding of a map, waits for
+all other jobs.
 
-A claim is a lease: who does not renew it in time loses the job to another worker. Each claim has
-a token greater than the last; a worker that comes back late holds an old one, and what it brings
-is refused. So a job may run twice, but takes effect once.
+A claim is a lease: if the worker does not renew it in time, another worker gets the job. Each claim
+has a token greater than the last, and results with an older token are refused. So a job may run
+twice, but takes effect once.
 
-Claims and renewals wait for no turn on PostgreSQL (`write(turn=False)`), where a thousand workers
-would stand in the way of uploads. What keeps them apart is the row of the job, locked:
+On PostgreSQL, claims and renewals wait for no turn (`write(turn=False)`), so that a thousand
+workers do not delay uploads. Locks of the job's row order them:
 
-- two claims: SKIP LOCKED, so that each goes on to the next job; a row that changed before it was
-  locked is looked at again, and passed over if it is no longer due;
-- a claim, and an end (`finish`, `fail`, `go_on`, `give_back`, `check_held`) by a worker whose
-  lease is over: the end locks the job first and the claim passes it over, or the claim was first
-  and the end finds another token;
-- a claim, and `cancel`, a deletion, `dead_letter` or `fail_of_dead`: these lock the job before all
-  else. Where the claim was first they wait for its commit, and see the job as it is then (READ
-  COMMITTED looks at WHERE once more); where they were, the claim passes it over;
-- a renewal, and any of these: an UPDATE of the token's own row, which waits for the other, and
-  then finds that it holds no more, or finds nothing.
+- two claims: SKIP LOCKED makes each go on to the next job; a row that changed before it was locked
+  is checked again, and skipped if it is no longer due;
+- a claim, and an end (`finish`, `fail`, `requeue_slice`, `release_job`, `check_held`) by a worker
+  whose lease is over: either the end locks the job first and the claim skips it, or the claim is
+  first and the end finds another token;
+- a claim, and `cancel`, a deletion, `dead_letter` or `fail_dead_worker`: these lock the job before
+  all else. If the claim is first, they wait for its commit and see the new row (READ COMMITTED
+  evaluates WHERE again); else the claim skips the job;
+- a renewal, and any of these: the UPDATE of the row with its token waits for the other one, and
+  then changes the row or finds none.
 
-A claim locks the job, then its frame; whoever has the turn does so in the same order, so that none
-waits in a circle. Times are the database's (`now`): hosts may differ by hours.
+A claim locks the job before its frame, and so do writers with a turn, which rules out deadlocks.
+Times are the database's (`now`), since the clocks of hosts may differ by hours.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from sqlalchemy import (
 
 from sceneprint.errors import JobOver, LostLease, UnknownJob
 from sceneprint.process import NOBODY
-from sceneprint.store.maps import count_on
+from sceneprint.store.maps import add_usage
 from sceneprint.store.tables import (
     ARCHIVE,
     JOB_COLUMNS,
@@ -70,15 +70,13 @@ from sceneprint.store.tables import (
     rows_among,
     tenants,
 )
-from sceneprint.store.tenants import keep_turns
+from sceneprint.store.tenants import save_turns
 from sceneprint_client.api import JobState
-
-# Jobs, one by one and as a list.
 
 
 @dataclass(frozen=True)
-class Listed:
-    """A job with the names of what it is about."""
+class ListedJob:
+    """A job with the names of its frame and map."""
 
     job: JobRow
     frame_id: str | None
@@ -89,14 +87,15 @@ class Listed:
 def list_jobs(
     connection: Connection, before: int | None, limit: int, state: JobState | None,
     kind: str | None = None, map_names: Collection[str] | None = None,
-) -> list[Listed]:  # fmt: skip
-    """Jobs, the newest first, from below number `before` on.
+) -> list[ListedJob]:  # fmt: skip
+    """Return jobs, the newest first.
 
     Parameters
     ----------
-    before, limit : see above
-    state, kind : of those that are wanted
-    map_names : of those that are wanted; jobs of no map are not among them
+    before : number of the last job of the previous page
+    limit : maximum number of jobs
+    state, kind : conditions; None: any
+    map_names : names of the only maps; jobs without a map are excluded then
     """
     later = jobs.alias()
     last = (
@@ -110,7 +109,7 @@ def list_jobs(
         .correlate(jobs)
         .scalar_subquery()
     )  # fmt: skip
-    asked = (
+    statement = (
         select(
             *JOB_COLUMNS, frames.c.id.label("frame_id"), maps.c.name.label("map_name"),
             last.label("followed_by"),
@@ -121,24 +120,19 @@ def list_jobs(
         .limit(limit)
     )  # fmt: skip
     if kind is not None:
-        asked = asked.where(jobs.c.kind == kind)
+        statement = statement.where(jobs.c.kind == kind)
     if map_names is not None:
-        asked = asked.where(maps.c.name.in_(list(map_names)))
+        statement = statement.where(maps.c.name.in_(list(map_names)))
     if before is not None:
-        asked = asked.where(jobs.c.number < before)
+        statement = statement.where(jobs.c.number < before)
     if state is not None:
-        asked = asked.where(jobs.c.state == state)
-    found: list[Any] = list(connection.execute(asked))
-    return [Listed(job_of_columns(row), *row[len(JOB_COLUMNS) :]) for row in found]
+        statement = statement.where(jobs.c.state == state)
+    rows: list[Any] = list(connection.execute(statement))
+    return [ListedJob(job_of_columns(row), *row[len(JOB_COLUMNS) :]) for row in rows]
 
 
 def find_job(connection: Connection, job_id: str) -> JobRow:
-    """The job of an id.
-
-    Raises
-    ------
-    UnknownJob : there is none.
-    """
+    """Return the job of an id; raise UnknownJob if the job does not exist."""
     row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
     if row is None:
         raise unknown_job(job_id)
@@ -146,23 +140,23 @@ def find_job(connection: Connection, job_id: str) -> JobRow:
 
 
 def job_of_number(connection: Connection, number: int) -> JobRow | None:
-    """The job of a number; None where it was removed."""
+    """Return the job of a number; None if it was removed."""
     row = connection.execute(select(jobs).where(jobs.c.number == number)).mappings().first()
     return None if row is None else job_row(row)
 
 
 def unknown_job(job_id: str) -> UnknownJob:
-    """What is said of a job that is not there, or not for whoever asks: the same words."""
+    """Return the error for a job that does not exist, or that the caller may not see."""
     return UnknownJob(
-        f"There is no job {job_id!r:.80}. An upload answers with the id of its job, and "
-        "deleting a map deletes its jobs."
+        f"There is no job {job_id!r:.80}. An upload returns the id of its job, and deleting a map "
+        "deletes its jobs."
     )
 
 
-def last_of(
+def latest_job(
     connection: Connection, kind: str, frame_number: int, model_id: str | None = None
 ) -> JobRow | None:
-    """The latest job of a kind, and for a model, of a frame."""
+    """Return the latest job of a frame with a kind and model."""
     row = connection.execute(
         select(jobs)
         .where(
@@ -175,55 +169,55 @@ def last_of(
     return None if row is None else job_row(row)
 
 
-def job_ids_of(connection: Connection, frame_numbers: list[int]) -> dict[int, str]:
-    """The latest job of each frame that is to have it indexed, not those that sign it again."""
-    asked = select(jobs.c.frame_number, jobs.c.id).where(jobs.c.kind == "sign")
-    found = rows_among(
-        connection, asked.order_by(jobs.c.number), jobs.c.frame_number, frame_numbers
+def signing_jobs(connection: Connection, frame_numbers: list[int]) -> dict[int, str]:
+    """Return the latest `sign` job of each frame, without its re-encodings."""
+    statement = select(jobs.c.frame_number, jobs.c.id).where(jobs.c.kind == "sign")
+    rows = rows_among(
+        connection, statement.order_by(jobs.c.number), jobs.c.frame_number, frame_numbers
     )
-    return {row[0]: row[1] for row in found}
+    return {row[0]: row[1] for row in rows}
 
 
 def count_jobs(
     connection: Connection, map_number: int | None = None,
     states: Collection[JobState] | None = None,
 ) -> dict[str, int]:  # fmt: skip
-    """How many jobs are in each state that has any, of one map or of all; of some states, 0 too."""
-    asked = select(jobs.c.state, func.count()).group_by(jobs.c.state)
+    """Return the numbers of jobs by state, of one map or of all; requested ones may be 0."""
+    counts = select(jobs.c.state, func.count()).group_by(jobs.c.state)
     if map_number is not None:
-        asked = asked.where(jobs.c.map_number == map_number)
+        counts = counts.where(jobs.c.map_number == map_number)
     if states is not None:
-        asked = asked.where(jobs.c.state.in_(states))
-    none = dict.fromkeys(map(str, states or ()), 0)
-    return none | {row[0]: row[1] for row in connection.execute(asked)}
+        counts = counts.where(jobs.c.state.in_(states))
+    zeros = dict.fromkeys(map(str, states or ()), 0)
+    return zeros | {row[0]: row[1] for row in connection.execute(counts)}
 
 
 def waiting_by_tenant(connection: Connection) -> dict[str, int]:
-    """How many jobs of each tenant wait; of none that has none."""
-    asked = select(jobs.c.tenant, func.count()).where(jobs.c.state == JobState.QUEUED)
-    return {row[0]: row[1] for row in connection.execute(asked.group_by(jobs.c.tenant))}
+    """Return the number of queued jobs of each tenant that has any."""
+    counts = select(jobs.c.tenant, func.count()).where(jobs.c.state == JobState.QUEUED)
+    return {row[0]: row[1] for row in connection.execute(counts.group_by(jobs.c.tenant))}
 
 
 def read_clock(connection: Connection) -> float:
-    """The time now, seconds since 1970."""
+    """Return the time now by the database's clock, seconds since 1970."""
     if connection.dialect.name == "sqlite":
         return time.time()
     return float(connection.execute(select(now(connection))).scalar_one())
 
 
-#: States of jobs that something may still come of.
+#: States of jobs that are not over.
 PENDING = (JobState.QUEUED, JobState.RUNNING)
-#: Tries that broke down before a job is dead.
+#: Number of failures after which a job is dead.
 MAXIMUM_FAILURES = 3
-#: Tries in all before it is. More, as a worker that fell silent or was killed may have died of
-#: something else: a machine that is restarted again and again must not cost a frame.
+#: Number of attempts after which a job is dead. It is greater, since a worker may die of another
+#: cause than its job: frequent restarts of a machine must not cost a frame.
 MAXIMUM_ATTEMPTS = 10
-#: Priority of upkeep, and of whatever else nobody asked for that has no more.
+#: Highest priority of upkeep, which no user requested.
 UPKEEP = -10
-#: Seconds before the second try; each further one waits four times as long.
+#: Seconds before the second attempt; the pause quadruples with each failure.
 BACKOFF_S = 2.0
-#: No job waits longer than this, and no lease is longer (seconds): what is due later was written
-#: before the clock was set back, and is due now.
+#: Longest pause of a job, and longest lease (seconds). A job with a later time was written before
+#: the clock was set back, and is due now.
 LONGEST_PAUSE_S, LONGEST_LEASE_S = 60.0, 3600.0
 
 
@@ -232,75 +226,78 @@ def enqueue(
     model_id: str | None = None, *, map_number: int | None = None,
     data: dict[str, Any] | None = None,
 ) -> JobRow:  # fmt: skip
-    """Queue a job, in the transaction that stores what it is about.
+    """Queue a job, in the transaction of the change that it follows from.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    kind, frame_number, priority, model_id, data : see the table
-    map_number : where it is of no single frame; else the frame's map is taken
+    connection : writing transaction
+    kind, frame_number, priority, model_id, data : columns of the table
+    map_number : map of a job without a single frame; else the frame's map is used
     """
-    of_map: Any = map_number
+    map_column: Any = map_number
     if frame_number is not None:
-        of_map = (
-            select(frames.c.map_number).where(frames.c.number == frame_number).scalar_subquery()
-        )
+        own = frames.c.number == frame_number
+        map_column = select(frames.c.map_number).where(own).scalar_subquery()
     values = job_values(connection, kind, priority, model_id, data)
-    made = insert(jobs).values(map_number=of_map, frame_number=frame_number, **values)
-    return job_row(connection.execute(made.returning(jobs)).mappings().one())
+    new = insert(jobs).values(map_number=map_column, frame_number=frame_number, **values)
+    return job_row(connection.execute(new.returning(jobs)).mappings().one())
 
 
 def due_in_s(connection: Connection) -> float | None:
-    """Seconds until the next job can be claimed if nobody touches any; costs no lock."""
+    """Return the seconds until a job can be claimed if none changes; None without jobs. Takes no
+    lock.
+    """
     waiting = select(func.min(jobs.c.run_after)).where(jobs.c.state == JobState.QUEUED)
     silent = select(func.min(jobs.c.leased_until)).where(jobs.c.state == JobState.RUNNING)
-    times = [connection.execute(one).scalar() for one in (waiting, silent)]
-    found = [one for one in times if one is not None]
-    return min(found) - read_clock(connection) if found else None
+    scalars = [connection.execute(one).scalar() for one in (waiting, silent)]
+    times = [time for time in scalars if time is not None]
+    return min(times) - read_clock(connection) if times else None
 
 
 def has_due(connection: Connection) -> bool:
-    """Whether there is a job to claim or to move to the dead letters; costs no lock."""
+    """Return whether there is a job to claim or to give up, without a lock."""
     at = now(connection)
     early, late = jobs.c.run_after <= at, jobs.c.run_after > at + LONGEST_PAUSE_S
     waiting = and_(jobs.c.state == JobState.QUEUED, or_(early, late))
     silent = and_(jobs.c.state == JobState.RUNNING, _lease_over(at))
-    asked = select(jobs.c.number).where(or_(waiting, silent)).limit(1)
-    return connection.execute(asked).first() is not None
+    statement = select(jobs.c.number).where(or_(waiting, silent)).limit(1)
+    return connection.execute(statement).first() is not None
 
 
 def _lease_over(at: ColumnElement[float]) -> ColumnElement[bool]:
-    """That a lease has ended, or ends later than any lease that was given by this clock."""
+    """Return the condition that a lease has ended, or is too long to have been granted by this
+    clock.
+    """
     return or_(jobs.c.leased_until < at, jobs.c.leased_until > at + LONGEST_LEASE_S)
 
 
 def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
-    """Take the next job: one that waits, or one whose worker fell silent.
+    """Take the next job: a queued one, or one whose lease has ended.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    worker : who asks
-    lease_s : seconds until it must be renewed
+    connection : writing transaction
+    worker : name of the worker
+    lease_s : seconds until the lease ends
     """
     at = now(connection)
     waiting = _waiting(at)
     silent = jobs.c.state == JobState.RUNNING, _lease_over(at)
-    found = None
-    for one in _tenants_due(connection, *waiting):  # the first's may all be locked
-        found = _lock_first(connection, one.turn, *waiting, jobs.c.tenant == one.tenant)
-        if found is not None:
+    place = None
+    for one in _tenants_due(connection, *waiting):  # all jobs of the first one may be locked
+        place = _lock_first(connection, one.turn, *waiting, jobs.c.tenant == one.tenant)
+        if place is not None:
             break
-    # of those that fell silent, which are few, one is locked only where its turn is before
+    # a silent worker's job, of which there are few, is locked only if it comes first
     other = _first_of_few(connection, *silent)
-    if other is not None and (found is None or other < found):
+    if other is not None and (place is None or other < place):
         own = jobs.c.number == other.number
-        found = _lock_first(connection, other.turn, *silent, own) or found
-    if found is None:
+        place = _lock_first(connection, other.turn, *silent, own) or place
+    if place is None:
         return None
     row = connection.execute(
         update(jobs)
-        .where(jobs.c.number == found.number)
+        .where(jobs.c.number == place.number)
         .values(
             state=JobState.RUNNING, attempts=jobs.c.attempts + 1, token=jobs.c.token + 1,
             leased_until=at + lease_s, worker=worker, started_at=at,
@@ -311,12 +308,12 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     return job_row(row)
 
 
-#: The table in other parts of a statement: made once, as each takes a millisecond to make.
+#: Aliases of the table, created once, as each takes a millisecond.
 _FIRST, _LATER, _TURNS = (jobs.alias() for _ in range(3))
 
 
 class _Place(NamedTuple):
-    """Where a job stands in the order of claims: the least is next."""
+    """The position of a job in the order of claims: the least is next."""
 
     upkeep: bool
     turn: int  # of its tenant, the latest
@@ -327,29 +324,29 @@ class _Place(NamedTuple):
 
 
 def _lock_first(connection: Connection, turn: int, *due: ColumnElement[bool]) -> _Place | None:
-    """The first to be claimed of the due jobs of one tenant, locked; others may have locked all.
+    """Lock and return the first due job of one tenant; None if other workers have locked all of
+    them.
 
-    What was tried before goes behind what was not: a frame that kills its worker, or a machine
-    that dies again and again, must not hold up or use up the same job.
+    Jobs with fewer attempts come first, so that a job whose worker dies again and again does not
+    block others.
     """
-    asked = (
+    row = connection.execute(
         select(jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant)
         .where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS)
         .order_by(jobs.c.priority.desc(), jobs.c.attempts, jobs.c.number)
         .limit(1)
         .with_for_update(skip_locked=True)
-    )
-    found = connection.execute(asked).first()
-    return None if found is None else _place(found, turn)
+    ).first()
+    return None if row is None else _place(row, turn)
 
 
 def _first_of_few(connection: Connection, *due: ColumnElement[bool]) -> _Place | None:
-    """The first to be claimed of the due jobs of all tenants, each of which is looked at."""
-    asked = select(
+    """Return the first due job of all tenants; reads all due jobs."""
+    statement = select(
         jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant, *_turns_of(jobs.c.tenant)
     ).where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS)
-    rows = connection.execute(asked).all()
-    return min((_place(row, _latest(row.served, row.kept)) for row in rows), default=None)
+    rows = connection.execute(statement).all()
+    return min((_place(row, _latest(row.of_jobs, row.saved)) for row in rows), default=None)
 
 
 def _place(row: Row[*tuple[Any, ...]], turn: int) -> _Place:
@@ -364,19 +361,19 @@ def _latest(*turns: int | None) -> int:
 
 
 def _is_upkeep(tenant: str, priority: int) -> bool:
-    """Whether a job waits for all that somebody asked for."""
+    """Return whether a job waits for all jobs that users requested."""
     return tenant == NOBODY and priority <= UPKEEP
 
 
 def _turns_of(tenant: ColumnElement[str]) -> tuple[Label[int | None], Label[int | None]]:
-    """The latest turn of a tenant: of its jobs, and of those that were removed."""
-    served = select(func.max(_TURNS.c.turn)).where(_TURNS.c.tenant == tenant)
-    kept = select(tenants.c.turn).where(tenants.c.name == tenant)
-    return served.scalar_subquery().label("served"), kept.scalar_subquery().label("kept")
+    """Return the latest turns of a tenant: of its jobs, and of its removed jobs."""
+    of_jobs = select(func.max(_TURNS.c.turn)).where(_TURNS.c.tenant == tenant)
+    saved = select(tenants.c.turn).where(tenants.c.name == tenant)
+    return of_jobs.scalar_subquery().label("of_jobs"), saved.scalar_subquery().label("saved")
 
 
 class _TenantDue(NamedTuple):
-    """A tenant with a queued job that is due: the least is next."""
+    """A tenant with a due job: the least is next."""
 
     upkeep: bool
     turn: int  # its latest
@@ -385,9 +382,9 @@ class _TenantDue(NamedTuple):
 
 
 def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_TenantDue]:
-    """Tenants that have a queued job due, in the order of the next.
+    """Return the tenants with a due job, in the order of claims.
 
-    The index is asked once for each tenant with a queued job, however many jobs there are.
+    The index is read once for each tenant with a queued job, however many jobs there are.
     """
     names = (
         select(func.min(_FIRST.c.tenant).label("tenant"))
@@ -410,21 +407,21 @@ def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_Ten
         .scalar_subquery()
         .label("best")
     )
-    asked = select(names.c.tenant, best, *_turns_of(names.c.tenant)).where(
+    statement = select(names.c.tenant, best, *_turns_of(names.c.tenant)).where(
         names.c.tenant.is_not(None)
     )
-    rows = (row for row in connection.execute(asked) if row.best is not None)
+    rows = (row for row in connection.execute(statement) if row.best is not None)
     return sorted(
         _TenantDue(
-            _is_upkeep(row.tenant, row.best), _latest(row.served, row.kept), row.tenant, row.best
+            _is_upkeep(row.tenant, row.best), _latest(row.of_jobs, row.saved), row.tenant, row.best
         )
         for row in rows
     )
 
 
-def waits_before(connection: Connection, held: JobRow) -> bool:
-    """Whether a job waits that goes before another slice of this one, once that is put back: one of
-    another tenant, or of a higher priority.
+def has_waiting_before(connection: Connection, held: JobRow) -> bool:
+    """Return whether a job of another tenant, or of a higher priority, waits for this one's next
+    slice.
     """
     return any(
         one.tenant != held.tenant or one.priority > held.priority
@@ -434,37 +431,32 @@ def waits_before(connection: Connection, held: JobRow) -> bool:
 
 
 def _waiting(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
-    """Jobs that are due to be claimed."""
-    # "+ 0.0" keeps SQLite to the index that has the order: it would sort all that is due
+    """Return the conditions of queued jobs that are due."""
+    # "+ 0.0" makes SQLite use the index that has the order, instead of sorting all due jobs
     due_at = jobs.c.run_after + 0.0
     return jobs.c.state == JobState.QUEUED, or_(due_at <= at, due_at > at + LONGEST_PAUSE_S)
 
 
 def _last_turn(connection: Connection) -> int:
-    """The latest turn of any tenant."""
-    of_jobs, kept = select(func.max(jobs.c.turn)), select(func.max(tenants.c.turn))
-    asked = select(of_jobs.scalar_subquery(), kept.scalar_subquery())
-    return _latest(*connection.execute(asked).one())
+    """Return the latest turn of any tenant."""
+    of_jobs, saved = select(func.max(jobs.c.turn)), select(func.max(tenants.c.turn))
+    statement = select(of_jobs.scalar_subquery(), saved.scalar_subquery())
+    return _latest(*connection.execute(statement).one())
 
 
 def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
-    """Extend a lease.
-
-    Raises
-    ------
-    LostLease : the job has been given to another worker, or is over.
-    """
+    """Extend a lease; raise LostLease if another worker holds the job, or the job is over."""
     _hold(connection, held, leased_until=now(connection) + lease_s)
 
 
 def check_held(connection: Connection, held: JobRow) -> None:
-    """See that a claim is still the latest, in the transaction that stores a part of its work.
+    """Check that a claim is the latest, in the transaction that stores a part of its work.
 
     Raises
     ------
-    LostLease : as `renew`.
+    LostLease : see `renew`.
     """
-    # locked until the commit: else a claim might come in between where the lease is over
+    # locked until the commit, so that no worker claims the job meanwhile if the lease is over
     own = select(jobs.c.number).where(*_own(held)).with_for_update()
     if connection.execute(own).first() is None:
         raise _lost(held)
@@ -474,11 +466,11 @@ def finish(
     connection: Connection, held: JobRow, state: JobState, error: str | None = None,
     traceback: str | None = None, **values: object,
 ) -> None:  # fmt: skip
-    """End a job, in the transaction that stores what it made; `values`: of its other columns.
+    """End a job, in the transaction that stores its results; `values` are other columns.
 
     Raises
     ------
-    LostLease : as `renew`; the transaction must not be committed.
+    LostLease : see `renew`; the transaction must not be committed.
     """
     _hold(
         connection, held, state=state, error=error, traceback=traceback, leased_until=None,
@@ -486,20 +478,23 @@ def finish(
     )  # fmt: skip
 
 
-def go_on(
+def requeue_slice(
     connection: Connection, held: JobRow, progress: dict[str, Any], after_s: float = 0.0
 ) -> None:
-    """Queue a long job again after a part of it, behind those that wait.
+    """Queue a long job for its next slice, behind waiting jobs; the attempts start again.
 
-    However many tries it took, they count no more: it came further. It is not claimed within
-    `after_s` seconds.
+    Parameters
+    ----------
+    connection : writing transaction
+    progress : progress so far
+    after_s : seconds until the job is due
 
     Raises
     ------
-    LostLease : as `renew`.
+    LostLease : see `renew`.
     """
-    # one try, and not none: its number is less than that of all that came since, and it would
-    # go before them with every part
+    # one attempt, not zero: the job's number is lower than those of later jobs, and would put it
+    # before them again
     _hold(
         connection, held, state=JobState.QUEUED, attempts=1, failures=0,
         leased_until=None, worker=None, run_after=now(connection) + after_s, progress=progress,
@@ -507,15 +502,15 @@ def go_on(
 
 
 def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> JobState:
-    """Queue a job that broke down for another try, or let it be dead.
+    """Queue a failed job for another attempt, or declare it dead.
 
     Raises
     ------
-    LostLease : as `renew`.
+    LostLease : see `renew`.
     """
-    # not as it was claimed: an earlier worker may have died over the job since
-    known = select(jobs.c.failures).where(jobs.c.number == held.number)
-    failures = (connection.execute(known).scalar() or 0) + 1
+    # read again: the death of an earlier worker may have been counted since the claim
+    stored = select(jobs.c.failures).where(jobs.c.number == held.number)
+    failures = (connection.execute(stored).scalar() or 0) + 1
     if failures >= MAXIMUM_FAILURES or held.attempts >= MAXIMUM_ATTEMPTS:
         finish(connection, held, JobState.DEAD, error, traceback)
         return JobState.DEAD
@@ -527,21 +522,21 @@ def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> Jo
 
 
 def pause_s(failures: int) -> float:
-    """Seconds before the next try of a job that broke down so often."""
+    """Return the seconds before the next attempt of a job after a number of failures."""
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
-def give_back(connection: Connection, held: JobRow, after_s: float = 0.0) -> None:
-    """Queue a job again that was not begun, as if it had not been claimed.
+def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> None:
+    """Queue a job that was not started, as if it had not been claimed.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    after_s : seconds in which others go before it
+    connection : writing transaction
+    after_s : seconds until the job is due
 
     Raises
     ------
-    LostLease : as `renew`.
+    LostLease : see `renew`.
     """
     _hold(
         connection, held, state=JobState.QUEUED, attempts=held.attempts - 1,
@@ -550,19 +545,19 @@ def give_back(connection: Connection, held: JobRow, after_s: float = 0.0) -> Non
 
 
 def _hold(connection: Connection, held: JobRow, **values: object) -> None:
-    """Change a job while its claim is the latest."""
+    """Change a job if its claim is the latest; else raise LostLease."""
     changed = connection.execute(update(jobs).where(*_own(held)).values(**values))
     if changed.rowcount != 1:
         raise _lost(held)
 
 
 def _own(held: JobRow) -> tuple[ColumnElement[bool], ...]:
-    """What holds of a job while a claim on it does."""
+    """Return the conditions that a job is held by a claim."""
     return (
         jobs.c.number == held.number,
         jobs.c.token == held.token,
         jobs.c.state == JobState.RUNNING,
-        # a standby that lacked the claim, and was promoted, may have given its token to another
+        # a promoted standby that lacked the claim may have issued its token again
         jobs.c.worker == held.worker,
     )
 
@@ -574,71 +569,67 @@ def _lost(held: JobRow) -> LostLease:
     )
 
 
-# Jobs whose workers died over them.
-#
-# Who started the workers sees one die at once, and need not wait for its lease to run out.
-
-
-def is_given_up(connection: Connection) -> bool:
-    """Whether there is a job to `dead_letter`; costs no lock."""
-    asked = select(jobs.c.number).where(*_out_of_tries(now(connection))).limit(1)
-    return connection.execute(asked).first() is not None
+def has_exhausted(connection: Connection) -> bool:
+    """Return whether there is a job for `dead_letter`, without a lock."""
+    statement = select(jobs.c.number).where(*_out_of_tries(now(connection))).limit(1)
+    return connection.execute(statement).first() is not None
 
 
 def dead_letter(connection: Connection) -> list[JobRow]:
-    """Give up jobs whose workers fall silent again and again: a frame that kills its worker."""
+    """Declare jobs dead whose workers fall silent again and again, and return them."""
     at = now(connection)
     rows = connection.execute(
         update(jobs)
         .where(*_out_of_tries(at))
         .values(
             state=JobState.DEAD, finished_at=at, leased_until=None,
-            error=f"its worker fell silent, and {MAXIMUM_ATTEMPTS} tries are over",
+            error=f"its worker fell silent in the last of {MAXIMUM_ATTEMPTS} attempts",
         )
         .returning(jobs)
     ).mappings()  # fmt: skip
     return [job_row(row) for row in rows]
 
 
-def fail_of_dead(
+def fail_dead_worker(
     connection: Connection, job_id: str, token: int, error: str, traceback: str, *, counts: bool
 ) -> JobRow | None:
-    """Take a job from a worker that died over it: queued for another try, or dead.
+    """Take a job from a worker that died, without waiting for its lease: queue it again, or declare
+    it dead.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    job_id, token : of the dead worker's claim
-    error, traceback : what is known of its death
-    counts : whether the job may have been the cause; if not, it is an attempt and no failure
+    connection : writing transaction
+    job_id, token : claim of the dead worker
+    error, traceback : description of its death
+    counts : whether the job may have caused the death; if not, the attempt is no failure
 
     Returns
     -------
-    job : as it is now; None where the death changes nothing: the job is over, or is another
-        worker's, who took it when the lease of this one ran out, and may still do it
+    job : the job as it is now; None if nothing changed for its workers: the job is over, or another
+        worker claimed it when the lease ended
     """
-    # locked: a claim, which waits for no turn, may be about to take it
-    asked = select(jobs).where(jobs.c.id == job_id).with_for_update()
-    row = connection.execute(asked).mappings().first()
+    # locked, as claims wait for no turn
+    locked = select(jobs).where(jobs.c.id == job_id).with_for_update()
+    row = connection.execute(locked).mappings().first()
     if row is None or JobState(row["state"]).over:
         return None
     held = row["token"] == token and row["state"] == JobState.RUNNING
     if not held and (row["token"] == token or not counts):
         return None
     failures = row["failures"] + counts
-    known = {"failures": failures, "error": error, "traceback": traceback}
+    values = {"failures": failures, "error": error, "traceback": traceback}
     if failures >= MAXIMUM_FAILURES or (held and row["attempts"] >= MAXIMUM_ATTEMPTS):
-        known |= {"state": JobState.DEAD, "leased_until": None, "finished_at": now(connection)}
+        values |= {"state": JobState.DEAD, "leased_until": None, "finished_at": now(connection)}
     elif held:
         again = now(connection) + pause_s(max(failures, 1))
-        known |= {"state": JobState.QUEUED, "leased_until": None, "run_after": again}
-    change = update(jobs).where(jobs.c.number == row["number"]).values(**known).returning(jobs)
+        values |= {"state": JobState.QUEUED, "leased_until": None, "run_after": again}
+    change = update(jobs).where(jobs.c.number == row["number"]).values(**values).returning(jobs)
     job = job_row(connection.execute(change).mappings().one())
     return None if job.state == JobState.RUNNING else job
 
 
 def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
-    """What holds of a job that fell silent in the last of its tries."""
+    """Return the conditions of a job whose worker fell silent in the last attempt."""
     return (
         jobs.c.state == JobState.RUNNING,
         _lease_over(at),
@@ -646,15 +637,12 @@ def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
     )
 
 
-# What others than its worker do to a job: give it up, or have it tried once more.
-
-
 def cancel(connection: Connection, job: JobRow) -> None:
-    """Cancel a job; a worker that is at it learns so when it brings its result.
+    """Cancel a job; a worker that runs it learns so when it stores its result.
 
     Raises
     ------
-    JobOver : there is nothing left to cancel.
+    JobOver : the job is over.
     """
     if job.state.over:
         raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")
@@ -662,7 +650,7 @@ def cancel(connection: Connection, job: JobRow) -> None:
 
 
 def cancel_jobs(connection: Connection, *which: ColumnElement[bool]) -> None:
-    """Cancel those of some jobs that wait or run."""
+    """Cancel the queued and running jobs that meet some conditions."""
     connection.execute(
         update(jobs)
         .where(*which, jobs.c.state.in_(PENDING))
@@ -670,8 +658,8 @@ def cancel_jobs(connection: Connection, *which: ColumnElement[bool]) -> None:
     )
 
 
-def revive(connection: Connection, job: JobRow) -> None:
-    """Queue a job again that is over, with all its tries before it."""
+def requeue_job(connection: Connection, job: JobRow) -> None:
+    """Queue a finished job again, with all attempts."""
     connection.execute(
         update(jobs)
         .where(jobs.c.number == job.number)
@@ -682,9 +670,9 @@ def revive(connection: Connection, job: JobRow) -> None:
     )  # fmt: skip
 
 
-# What long jobs find and make: items, appended slice by slice, and files.
+# Results of long jobs: items, appended slice by slice, and files.
 
-#: Rows that are inserted at once.
+#: Number of rows to insert at once.
 _BLOCK = 500
 
 
@@ -694,8 +682,8 @@ class JobFile:
 
     Parameters
     ----------
-    name : such as mesh.ply, once a job
-    blob : that holds its bytes, and is there
+    name : unique name within the job, such as mesh.ply
+    blob : existing blob with the content
     bytes : size
     """
 
@@ -706,7 +694,7 @@ class JobFile:
 
 
 def append_items(connection: Connection, job_number: int, items: list[dict[str, Any]]) -> None:
-    """Add to what a job has found."""
+    """Append items to the results of a job."""
     first = count_rows(connection, job_items.c.job_number == job_number)
     for start in range(0, len(items), _BLOCK):
         rows = [
@@ -719,17 +707,18 @@ def append_items(connection: Connection, job_number: int, items: list[dict[str, 
 def items_of(
     connection: Connection, job_number: int, first: int = 0, limit: int | None = None
 ) -> list[dict[str, Any]]:
-    """Items of a job in the order in which they were found, from number `first` on."""
-    asked = (
+    """Return items of a job in order, from number `first`."""
+    statement = (
         select(job_items.c.data)
         .where(job_items.c.job_number == job_number, job_items.c.number >= first)
         .order_by(job_items.c.number)
+        .limit(limit)
     )
-    return list(connection.execute(asked if limit is None else asked.limit(limit)).scalars())
+    return list(connection.execute(statement).scalars())
 
 
 def add_files(connection: Connection, job_number: int, files: Iterable[JobFile]) -> None:
-    """Let a job have files; one of the same name gives way."""
+    """Add files to a job; they replace files of the same names."""
     for one in files:
         remove_parts(connection, job_number, items=False, files=[one.name])
         connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
@@ -738,53 +727,52 @@ def add_files(connection: Connection, job_number: int, files: Iterable[JobFile])
 
 
 def _count_archive(connection: Connection, job_number: int, size: int) -> None:
-    """Add the bytes of an archive to those that the map of its import holds."""
-    of_map: Any = select(jobs.c.map_number).where(jobs.c.number == job_number).scalar_subquery()
-    count_on(connection, of_map, 0, size)
+    """Add the bytes of an archive to the use of its import's map."""
+    own = select(jobs.c.map_number).where(jobs.c.number == job_number)
+    map_number: Any = own.scalar_subquery()
+    add_usage(connection, map_number, 0, size)
 
 
 def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
-    """Files of a job by their names."""
+    """Return the files of a job by their names."""
     c = job_files.c
-    asked = select(c.name, c.blob, c.bytes, c.media_type).where(c.job_number == job_number)
-    return {row.name: JobFile(*row) for row in connection.execute(asked.order_by(c.name))}
+    statement = select(c.name, c.blob, c.bytes, c.media_type).where(c.job_number == job_number)
+    return {row.name: JobFile(*row) for row in connection.execute(statement.order_by(c.name))}
 
 
 def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
-    """Jobs of a kind that have any file, the oldest first."""
-    having = select(job_files.c.job_number)
-    asked = select(jobs).where(jobs.c.number.in_(having), jobs.c.kind == kind)
-    return [job_row(row) for row in connection.execute(asked.order_by(jobs.c.number)).mappings()]
+    """Return the jobs of a kind that have any file, the oldest first."""
+    having = jobs.c.number.in_(select(job_files.c.job_number)), jobs.c.kind == kind
+    rows = connection.execute(select(jobs).where(*having).order_by(jobs.c.number)).mappings()
+    return [job_row(row) for row in rows]
 
 
 def finished_with_file(connection: Connection, name: str) -> list[int]:
-    """Return the numbers of the jobs that are over and still have a file of this name."""
-    asked = (
+    """Return the numbers of finished jobs that still have a file with a name."""
+    over = jobs.c.state.in_([state for state in JobState if state.over])
+    statement = (
         select(jobs.c.number)
         .join(job_files, job_files.c.job_number == jobs.c.number)
-        .where(
-            job_files.c.name == name,
-            jobs.c.state.in_([state for state in JobState if state.over]),
-        )
+        .where(job_files.c.name == name, over)
     )
-    return list(connection.execute(asked).scalars())
+    return list(connection.execute(statement).scalars())
 
 
 def remove_parts(
     connection: Connection, job_number: int, *, items: bool = True,
     files: Iterable[str] | None = None,
 ) -> list[str]:  # fmt: skip
-    """Forget what a job found and made.
+    """Remove items and files of a job.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    items : whether its items go
-    files : names of the files that go; default: all
+    connection : writing transaction
+    items : whether to remove the items
+    files : names of the files to remove; default: all
 
     Returns
     -------
-    blobs : that it referred to: sweep them when this is committed
+    blobs : blobs of the removed files; sweep them after the commit
     """
     if items:
         connection.execute(delete(job_items).where(job_items.c.job_number == job_number))
@@ -792,28 +780,28 @@ def remove_parts(
     if files is not None:
         own &= job_files.c.name.in_(list(files))
     c = job_files.c
-    found = connection.execute(select(c.name, c.blob, c.bytes).where(own)).all()
+    removed = connection.execute(select(c.name, c.blob, c.bytes).where(own)).all()
     connection.execute(delete(job_files).where(own))
-    for one in found:
+    for one in removed:
         if one.name == ARCHIVE:
             _count_archive(connection, job_number, -one.bytes)
-    return [one.blob for one in found]
+    return [one.blob for one in removed]
 
 
 def replace_result(connection: Connection, job: JobRow, result: dict[str, Any]) -> JobRow:
-    """Return a job that is over with what it came to corrected."""
+    """Correct the result of a finished job, and return the job."""
     own = update(jobs).where(jobs.c.number == job.number).values(result=result)
     return job_row(connection.execute(own.returning(jobs)).mappings().one())
 
 
 def remove_job(connection: Connection, job: JobRow) -> list[str]:
-    """Forget a job with all that it found; a worker that is at it finds its lease lost.
+    """Remove a job with its items and files; a worker that runs it loses its lease.
 
     Returns
     -------
-    blobs : that it referred to: sweep them when this is committed
+    blobs : blobs of the removed files; sweep them after the commit
     """
     blobs = remove_parts(connection, job.number)
-    keep_turns(connection, job.tenant)
+    save_turns(connection, job.tenant)
     connection.execute(delete(jobs).where(jobs.c.number == job.number))
     return blobs

@@ -1,7 +1,4 @@
-"""A database opened to be looked at: nothing is written, where SQLite allows not even beside it.
-
-URL  --look_at-->  Database, of which `read` works
-"""
+"""Databases and blobs opened for inspection: nothing is written or created."""
 
 from __future__ import annotations
 
@@ -26,14 +23,14 @@ from sceneprint.store.sqlite import begin_sqlite
 
 
 @contextmanager
-def look_at(url: str) -> Iterator[Database]:
-    """Open a database that may be in use, and change nothing: no schema, no log, no lock left.
+def inspect_database(url: str) -> Iterator[Database]:
+    """Open a database that may be in use without changing it: no schema, log or lock stays behind.
 
     Raises
     ------
-    UnusableStore : there is none; of an older schema; or, at the end, one that nobody used at
-        the beginning was written meanwhile: what was read may be wrong.
-    NewerSchema : a later version of sceneprint wrote it.
+    UnusableStore : there is no database, or its schema is older; or, at the end, a process wrote to
+        an unlocked file meanwhile, so that the read data may be wrong.
+    NewerSchema : a later version of sceneprint wrote the database.
     """
     parsed = database_url(url)
     path = _file_of(parsed) if parsed.get_backend_name() == "sqlite" else None
@@ -42,7 +39,7 @@ def look_at(url: str) -> Iterator[Database]:
     elif parsed.get_backend_name() == "sqlite":
         engine, alone = create_engine(parsed), False
     else:
-        engine, alone = open_postgres(parsed), False  # of which `read` alone is asked
+        engine, alone = open_postgres(parsed), False  # callers only `read`
     before = None if path is None else _state(path)
     database = Database(engine)
     try:
@@ -52,38 +49,38 @@ def look_at(url: str) -> Iterator[Database]:
         database.close()
         if alone and path is not None and _state(path) != before:
             raise UnusableStore(
-                f"{path} was written while it was looked at, which nobody did at first: what was "
-                "found may be wrong. Run it again."
+                f"{path} was written while it was read without locks, so the results may be wrong. "
+                "Run it again."
             )
 
 
 def require_present_schema(database: Database) -> None:
-    """See that a database has the schema that this version works with; it is not brought there.
+    """Check that a database has the schema of this version, without a migration.
 
     Raises
     ------
-    UnusableStore, NewerSchema : it has another.
+    UnusableStore, NewerSchema : the database has another schema.
     """
     head, _ = known_revisions()
     with database.read() as connection:
-        found = current_revision(connection)
-    if found != head:
+        revision = current_revision(connection)
+    if revision != head:
         raise UnusableStore(
-            f"{database.shown} has schema {found}, and this version works with {head}. Any "
-            "other use of it, such as `sceneprint serve`, brings it there."
+            f"{database.shown} has schema {revision}, and this version works with {head}. "
+            "`sceneprint migrate` brings it there."
         )
 
 
 def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
-    """An engine that writes nothing; and whether the file is read as if nobody could change it."""
+    """Return an engine that writes nothing, and whether it reads the file without locks."""
     if not path.is_file():
         raise UnusableStore(
-            f"{path}: there is no database. Name the data folder with --data, or see that "
-            "SCENEPRINT_DATABASE_URL is right."
+            f"{path}: there is no database. Name the data folder with --data, or check "
+            "SCENEPRINT_DATABASE_URL."
         )
     wal, shm = _beside(path, "-wal"), _beside(path, "-shm")
-    # without a log nobody has it open, and the file is all there is. A log whose index is gone
-    # cannot be read without making that
+    # without a log, no process has the file open. A log whose index is missing cannot be read
+    # without creating the index
     alone = not wal.exists()
     how = "&immutable=1" if alone else "&readonly_shm=1" if shm.exists() else ""
 
@@ -100,7 +97,7 @@ def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
 
 
 def _file_of(url: URL) -> Path | None:
-    """File of a SQLite URL; None: in memory."""
+    """Return the file of a SQLite URL; None: the database is in memory."""
     name = url.database or ""
     if name.startswith("file:"):
         name = unquote(urlsplit(name).path)
@@ -108,29 +105,26 @@ def _file_of(url: URL) -> Path | None:
 
 
 def _state(path: Path) -> tuple[object, ...]:
-    found = path.stat()
-    return _beside(path, "-wal").exists(), found.st_mtime_ns, found.st_size, found.st_ino
+    status = path.stat()
+    return _beside(path, "-wal").exists(), status.st_mtime_ns, status.st_size, status.st_ino
 
 
 def _beside(path: Path, end: str) -> Path:
     return path.with_name(path.name + end)
 
 
-# Blobs opened for maintenance: what is missing is not made.
-
-
 @contextmanager
-def opened_blobs(place: Path | str, database: Database) -> Iterator[Blobs]:
-    """Open the blobs of a database.
+def inspect_blobs(place: Path | str, database: Database) -> Iterator[Blobs]:
+    """Open the blobs of a database without creating a missing folder or claiming a prefix.
 
     Parameters
     ----------
     place : folder, or URL of an object store
-    database : whose they are
+    database : database that refers to the blobs
 
     Raises
     ------
-    UnusableStore : there is no such folder, or they are another database's.
+    UnusableStore : the folder is missing, or the blobs belong to another database.
     """
     if isinstance(place, Path):
         require_folder(place)
@@ -141,14 +135,14 @@ def opened_blobs(place: Path | str, database: Database) -> Iterator[Blobs]:
 
 
 def require_folder(place: Path) -> None:
-    """See that a folder of blobs is there: a disk that is not mounted is not made up for.
+    """Check that a folder of blobs exists: its disk may not be mounted.
 
     Raises
     ------
-    UnusableStore : it is not.
+    UnusableStore : the folder is missing.
     """
     if not place.is_dir():
         raise UnusableStore(
-            f"{place}: there is no such folder. Name the data folder with --data, see that its "
+            f"{place}: there is no such folder. Name the data folder with --data, check that its "
             "disk is mounted, or restore a backup."
         )

@@ -1,7 +1,7 @@
-"""Rows of a re-encoding: which frames lack the next model, which are queued, and the switch.
+"""Rows of a re-encoding: frames without a signature of the next model, their jobs, and the switch.
 
-Until the switch every frame keeps the signature that is searched; each gets a second one beside
-it. What was made for a model that a map no longer has, or never came to have, is removed in blocks.
+Until the switch, each frame's present signature is searched, and one of the next model is stored
+beside it. Signatures and jobs of models that a map does not use are removed in blocks.
 """
 
 from __future__ import annotations
@@ -18,24 +18,23 @@ from sceneprint.store.queue import PENDING, UPKEEP, enqueue, read_clock
 from sceneprint.store.tables import MapRow, frames, jobs, maps, signatures
 from sceneprint_client.api import FrameState, JobState
 
-#: Kind of the jobs that sign an indexed frame once more.
+#: Kind of the jobs that sign an indexed frame with the next model.
 REENCODE = "reencode"
-#: After what robots send, and after what heals.
 PRIORITY = UPKEEP
-#: Rows that one transaction handles, so that writers wait for tenths of a second at most.
+#: Rows that one transaction changes, so that writers wait for tenths of a second at most.
 QUEUED_AT_ONCE, REMOVED_AT_ONCE = 2000, 50
 
 
 @dataclass(frozen=True)
 class SwitchProgress:
-    """How far a map has come.
+    """The progress of a map's re-encoding, in frames.
 
     Parameters
     ----------
-    done : frames that have a signature of the next model
-    left : that wait for one
-    failed : in which the next model finds nothing to sign: rejected at the switch
-    dead : whose jobs broke down in every try: the switch waits for them
+    done : signed with the next model
+    left : waiting for a signature
+    failed : without anything that the next model could sign; they are rejected at the switch
+    dead : with a dead job; the switch waits for them
     """
 
     done: int
@@ -44,22 +43,22 @@ class SwitchProgress:
     dead: int
 
 
-def begin(connection: Connection, row: MapRow, model_id: str) -> None:
-    """Let a map be signed with another model as well, which is kept."""
+def begin_reencoding(connection: Connection, row: MapRow, model_id: str) -> None:
+    """Start the re-encoding of a map with a stored model."""
     connection.execute(
         update(maps).where(maps.c.number == row.number).values(next_model_id=model_id)
     )
     record_event(connection, "map.reencoding", row.name, model=model_id)
 
 
-def give_up(connection: Connection, row: MapRow) -> None:
-    """Let a map keep the model it has."""
+def cancel_reencoding(connection: Connection, row: MapRow) -> None:
+    """Cancel the re-encoding of a map."""
     connection.execute(update(maps).where(maps.c.number == row.number).values(next_model_id=None))
     record_event(connection, "map.reencoding_cancelled", row.name, model=row.next_model_id)
 
 
 def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
-    """How far a map has come that has a next model."""
+    """Return the progress of a map's re-encoding."""
     lacks = and_(_indexed(row), ~_signed(row.next_model_id))
 
     def count(*conditions: ColumnElement[bool]) -> int:
@@ -68,8 +67,8 @@ def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
 
     def over(state: JobState, *conditions: ColumnElement[bool]) -> int:
         ended = select(frames.c.number).join(jobs, jobs.c.frame_number == frames.c.number)
-        found = ended.where(jobs.c.state == state, _for_next(row), lacks, *conditions).distinct()
-        return len(connection.execute(found).all())  # few, and found by their state
+        own = ended.where(jobs.c.state == state, _for_next(row), lacks, *conditions).distinct()
+        return len(connection.execute(own).all())  # few rows, which an index finds by state
 
     every, lacking = count(_indexed(row)), count(lacks)
     failed = over(JobState.FAILED)
@@ -78,33 +77,32 @@ def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
 
 
 def is_pending(connection: Connection, row: MapRow) -> bool:
-    """Whether a job for the next model of a map waits or runs; cheap while many do."""
-    found = connection.execute(
+    """Return whether a job for the next model of a map waits or runs; cheap if many do."""
+    statement = (
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
         .where(_for_next(row), jobs.c.state.in_(PENDING), frames.c.map_number == row.number)
         .limit(1)
     )
-    return found.first() is not None
+    return connection.execute(statement).first() is not None
 
 
-def unqueued(connection: Connection, row: MapRow, after: int, *, again: bool = False) -> list[int]:
-    """Numbers of the next frames that lack a signature of the next model, and a job for one.
+def unqueued_frames(
+    connection: Connection, row: MapRow, after: int, *, again: bool = False
+) -> list[int]:
+    """Return the numbers of the next frames without a signature of the next model or a job for it.
 
     Parameters
     ----------
     after : number of a frame
-    again : also those whose jobs broke down in every try
+    again : whether to include frames with a dead job
     """
-    had = (*PENDING, JobState.FAILED, *(() if again else (JobState.DEAD,)))
-    found = connection.execute(
-        select(frames.c.number)
-        .where(_indexed(row), frames.c.number > after, ~_signed(row.next_model_id),
-               ~_has_job(row, had))
-        .order_by(frames.c.number)
-        .limit(QUEUED_AT_ONCE)
-    )  # fmt: skip
-    return list(found.scalars())
+    states = (*PENDING, JobState.FAILED, *(() if again else (JobState.DEAD,)))
+    lacks = ~_signed(row.next_model_id), ~_has_job(row, states)
+    statement = select(frames.c.number).where(_indexed(row), frames.c.number > after, *lacks)
+    return list(
+        connection.execute(statement.order_by(frames.c.number).limit(QUEUED_AT_ONCE)).scalars()
+    )
 
 
 def enqueue_all(connection: Connection, row: MapRow, numbers: list[int]) -> None:
@@ -124,25 +122,23 @@ def enqueue_all(connection: Connection, row: MapRow, numbers: list[int]) -> None
 
 
 def is_complete(connection: Connection, row: MapRow) -> bool:
-    """Whether every frame that can be found is signed by the next model, or cannot be."""
+    """Return whether every indexed frame has a signature of the next model, or a failed job."""
     lacking = exists().where(
         _indexed(row), ~_signed(row.next_model_id), ~_has_job(row, (JobState.FAILED,))
     )
     return not connection.execute(select(lacking)).scalar_one()
 
 
-def signed_up_to(connection: Connection, row: MapRow, revision: int) -> list[int]:
-    """Numbers of indexed frames, as of a revision, that have a signature of the next model."""
-    found = connection.execute(
-        select(frames.c.number).where(
-            _indexed(row), frames.c.revision <= revision, _signed(row.next_model_id)
-        )
+def frames_signed_by(connection: Connection, row: MapRow, revision: int) -> list[int]:
+    """Return the numbers of frames indexed by a revision with a signature of the next model."""
+    statement = select(frames.c.number).where(
+        _indexed(row), frames.c.revision <= revision, _signed(row.next_model_id)
     )
-    return list(found.scalars())
+    return list(connection.execute(statement).scalars())
 
 
-def touch(connection: Connection, row: MapRow, numbers: list[int]) -> None:
-    """Give indexed frames the next revisions of their map, so that indexes learn of them."""
+def raise_revisions(connection: Connection, row: MapRow, numbers: list[int]) -> None:
+    """Give indexed frames the next revisions of their map, so that indexes read them again."""
     for number in numbers:
         revision = next_revision(connection, row.number)
         connection.execute(
@@ -151,16 +147,15 @@ def touch(connection: Connection, row: MapRow, numbers: list[int]) -> None:
 
 
 def switch_model(connection: Connection, row: MapRow) -> list[str]:
-    """Let the next model be the model of a map whose frames are complete.
+    """Let the next model replace the model of a map whose frames are complete.
 
-    Frames in which it finds nothing to sign are rejected. Those that the former model rejected are
-    to be signed: what it made of them says nothing of the next.
+    Frames with a failed job are rejected. Frames that the former model rejected are signed again.
 
     Returns
     -------
-    rejected : ids of frames
+    rejected : ids of the rejected frames
     """
-    earlier = connection.execute(
+    former = connection.execute(
         select(frames.c.number, frames.c.id).where(
             frames.c.map_number == row.number, frames.c.state == FrameState.REJECTED
         )
@@ -175,10 +170,10 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
     rejected = {one.number: one for one in failed}
     for number, one in rejected.items():
         set_state(connection, number, FrameState.REJECTED, one.error)
-        # readers and indexes that hold it, of a time when the map had this model, learn of it
-        touch(connection, row, [number])
+        # readers and indexes may hold the frame from when the map had this model before
+        raise_revisions(connection, row, [number])
         record_event(connection, "frame.rejected", row.name, one.id, one.job_id)
-    for number, frame_id in earlier:
+    for number, frame_id in former:
         set_state(connection, number, FrameState.RECEIVED)
         job = enqueue(connection, "sign", number, PRIORITY)
         record_event(connection, "frame.received", row.name, frame_id, job.id)
@@ -194,7 +189,7 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
 
 
 def models_of(row: MapRow) -> tuple[str, ...]:
-    """The models whose signatures a map keeps."""
+    """Return the models whose signatures a map stores."""
     return (row.model_id,) if row.next_model_id is None else (row.model_id, row.next_model_id)
 
 
@@ -213,7 +208,7 @@ def _for_next(row: MapRow) -> ColumnElement[bool]:
 
 
 def _has_job(row: MapRow, states: tuple[JobState, ...]) -> ColumnElement[bool]:
-    own = jobs.alias("own")  # the query around it may speak of jobs too
+    own = jobs.alias("own")  # the surrounding query may use `jobs` as well
     return exists().where(
         own.c.frame_number == frames.c.number, own.c.kind == REENCODE,
         own.c.model_id == row.next_model_id, own.c.state.in_(states),

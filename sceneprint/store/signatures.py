@@ -1,4 +1,4 @@
-"""Signatures, and what changed for searching since a revision of the map."""
+"""Signatures, and changes to the searched frames since a revision of the map."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ from sceneprint_client.api import FrameState, JobState
 
 @dataclass(frozen=True)
 class StoredSignature:
-    """What a worker made of a frame.
+    """The results of signing a frame.
 
     Parameters
     ----------
-    model_id : of the model that made it
-    vector : the signature's bytes
+    model_id : model that signed the frame
+    vector : bytes of the signature
     geometry : blob of the artifact
-    n_patches, n_pairs : of each level
+    n_patches, n_pairs : counts per level
     """
 
     model_id: str
@@ -64,9 +64,10 @@ class StoredSignature:
 
 @dataclass(frozen=True)
 class SignatureChange:
-    """A frame that was indexed, or is searched no more; `vector` is None then, or is damaged.
+    """A frame that was indexed, or that is no longer searched.
 
-    `deleted` says that it was deleted, or rejected by a model that its map came to have.
+    `vector` is None if the frame is not searched, or if its signature is damaged. `deleted` is True
+    for deleted frames, and for frames that a new model of the map rejected.
     """
 
     number: int
@@ -76,10 +77,10 @@ class SignatureChange:
     deleted: bool = False
 
 
-def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) -> int:
-    """Store a signature and let queries find the frame; returns the map's revision."""
-    # a map that goes back to a model may still have what that model once made of the frame
-    _write_signature(connection, frame, made)
+def index_frame(connection: Connection, frame: FrameRow, signature: StoredSignature) -> int:
+    """Store a signature and index its frame; return the map's revision."""
+    # a map that returns to a former model may still have its signature
+    _write_signature(connection, frame, signature)
     mark_edited(connection, frame.number)  # it may have been indexed before
     revision = next_revision(connection, frame.map_number)
     moved = root_columns(connection, frame)
@@ -89,45 +90,41 @@ def index_frame(connection: Connection, frame: FrameRow, made: StoredSignature) 
         update(frames)
         .where(frames.c.number == frame.number)
         .values(
-            state=FrameState.INDEXED,
-            reason=None,
-            indexed_at=time.time(),
-            revision=revision,
+            state=FrameState.INDEXED, reason=None, indexed_at=time.time(), revision=revision,
             **moved,
         )
-    )
+    )  # fmt: skip
     return revision
 
 
 def index_claimed_frame(
-    connection: Connection, job: JobRow, frame: FrameRow, map_name: str, made: StoredSignature
+    connection: Connection, job: JobRow, frame: FrameRow, map_name: str, signature: StoredSignature
 ) -> bool:
-    """End a job and index its frame in one statement, as most signatures are on PostgreSQL: the
-    map's other writers wait for each round trip.
+    """End a job and index its frame in one statement, which saves round trips on PostgreSQL.
 
     Parameters
     ----------
-    connection : of a writing transaction of the frame's map
-    job : as it was claimed, of that frame
-    frame, made : see `index_frame`
-    map_name : of the frame's map
+    connection : writing transaction of the frame's map
+    job : job as claimed, for the frame
+    frame, signature : see `index_frame`
+    map_name : name of the frame's map
 
     Returns
     -------
-    done : False, and nothing was written, on SQLite; where the job is not held any more; where
-        the map has another model, or is to have one, or joined the frame's parent frame: then what
-        else has to be done must be found
+    done : False, and nothing was written, on SQLite, and if the job is no longer held, the map has
+        or gets another model, or the frame's parent frame is joined: the caller must check which
     """
     if connection.dialect.name == "sqlite":
         return False
-    told = event_values("frame.indexed", map_name, frame.id, job.id, {})
+    event = event_values("frame.indexed", map_name, frame.id, job.id, {})
     values = {
         "job": job.number, "token": job.token, "worker": job.worker, "map_number": frame.map_number,
-        "frame": frame.number, "model": made.model_id, "vector": made.vector,
-        "checksum": crc32(made.vector), "geometry": made.geometry,
-        "n_patches": json.dumps(list(made.n_patches)), "n_pairs": json.dumps(list(made.n_pairs)),
-        "indexed_at": time.time(), "parent": frame.pose_parent, **told,
-        "data": json.dumps(told["data"]),
+        "frame": frame.number, "model": signature.model_id, "vector": signature.vector,
+        "checksum": crc32(signature.vector), "geometry": signature.geometry,
+        "n_patches": json.dumps(list(signature.n_patches)),
+        "n_pairs": json.dumps(list(signature.n_pairs)),
+        "indexed_at": time.time(), "parent": frame.pose_parent, **event,
+        "data": json.dumps(event["data"]),
     }  # fmt: skip
     statement = _index_claimed(events_table(connection).name)
     return connection.execute(statement, values).first() is not None
@@ -162,11 +159,11 @@ def _index_claimed(events_name: str) -> TextClause:
                 n_patches = EXCLUDED.n_patches, n_pairs = EXCLUDED.n_pairs
         ), edited AS (
             UPDATE surface_frames SET changed = true FROM revised WHERE frame_number = :frame
-        ), found AS (
+        ), indexed AS (
             UPDATE frames SET state = '{FrameState.INDEXED}', reason = NULL,
                 indexed_at = :indexed_at, revision = revised.revision
             FROM revised WHERE number = :frame
-        ), told AS (
+        ), reported AS (
             INSERT INTO {events_name} (at, kind, map, frame_id, job_id, data)
             SELECT :at, :kind, :map, :frame_id, :job_id, cast(:data AS json) FROM revised
         )
@@ -175,26 +172,28 @@ def _index_claimed(events_name: str) -> TextClause:
     )
 
 
-def replace_signature(connection: Connection, frame: FrameRow, made: StoredSignature) -> bool:
-    """Store what was made of an indexed frame once more, in place of what is damaged or missing.
+def replace_signature(connection: Connection, frame: FrameRow, signature: StoredSignature) -> bool:
+    """Replace a damaged or missing signature of an indexed frame, which stays searched meanwhile.
 
-    The frame stays found all the while. Where the bytes of the map's own signatures change, it
-    takes the map's next revision, so that readers and indexes learn of it.
+    If the bytes of the map's own signatures change, the frame gets the map's next revision, so that
+    readers and indexes read it again.
 
     Returns
     -------
-    changed : whether the stored bytes were others
+    changed : whether the stored bytes changed
     """
-    own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
-    known = connection.execute(select(signatures.c.vector, signatures.c.checksum).where(own))
-    before = known.first()
-    _write_signature(connection, frame, made)
+    own = (signatures.c.frame_number == frame.number) & (
+        signatures.c.model_id == signature.model_id
+    )
+    stored = connection.execute(select(signatures.c.vector, signatures.c.checksum).where(own))
+    before = stored.first()
+    _write_signature(connection, frame, signature)
     searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
-    is_searched = connection.execute(searched).scalar_one() == made.model_id
+    is_searched = connection.execute(searched).scalar_one() == signature.model_id
     if is_searched:  # its artifact may have been lost
         note_edit(connection, frame.number, frame.map_number)
-    # a checksum that does not fit made readers pass the frame over, whatever its bytes
-    if before is not None and tuple(before) == (made.vector, crc32(made.vector)):
+    # readers skipped the frame if its checksum was wrong, whatever its bytes
+    if before is not None and tuple(before) == (signature.vector, crc32(signature.vector)):
         return False
     if is_searched:
         revision = next_revision(connection, frame.map_number)
@@ -204,22 +203,24 @@ def replace_signature(connection: Connection, frame: FrameRow, made: StoredSigna
     return True
 
 
-def _write_signature(connection: Connection, frame: FrameRow, made: StoredSignature) -> None:
-    """Store a signature in place of the one that the model made before."""
-    own = (signatures.c.frame_number == frame.number) & (signatures.c.model_id == made.model_id)
+def _write_signature(connection: Connection, frame: FrameRow, signature: StoredSignature) -> None:
+    """Store a signature in place of the model's former one."""
+    own = (signatures.c.frame_number == frame.number) & (
+        signatures.c.model_id == signature.model_id
+    )
     connection.execute(delete(signatures).where(own))
-    put_signatures(connection, [(frame.number, made)])
+    put_signatures(connection, [(frame.number, signature)])
 
 
-def put_signatures(connection: Connection, made: Sequence[tuple[int, StoredSignature]]) -> None:
-    """Store signatures of frames, by their numbers, that have none of these models."""
+def put_signatures(connection: Connection, new: Sequence[tuple[int, StoredSignature]]) -> None:
+    """Store signatures by the numbers of frames, which must have none of these models."""
     rows = [
         {
             "frame_number": number, "model_id": one.model_id, "vector": one.vector,
             "checksum": crc32(one.vector), "geometry": one.geometry,
             "n_patches": list(one.n_patches), "n_pairs": list(one.n_pairs),
         }
-        for number, one in made
+        for number, one in new
     ]  # fmt: skip
     connection.execute(insert(signatures), rows)
 
@@ -227,9 +228,11 @@ def put_signatures(connection: Connection, made: Sequence[tuple[int, StoredSigna
 def changes_since(
     connection: Connection, row: MapRow, revision: int, limit: int = 256
 ) -> Iterator[list[SignatureChange]]:
-    """What was indexed and deleted after a revision, in order, in blocks of at most `limit`."""
+    """Yield the frames that were indexed or deleted after a revision, in order, in blocks of
+    `limit`.
+    """
     while True:
-        found = connection.execute(
+        rows = connection.execute(
             select(frames.c.number, frames.c.id, frames.c.revision, frames.c.state,
                    signatures.c.vector, signatures.c.checksum)
             .outerjoin(
@@ -241,10 +244,10 @@ def changes_since(
             .order_by(frames.c.revision)
             .limit(limit)
         ).all()  # fmt: skip
-        if not found:
+        if not rows:
             return
-        yield [_change(*one) for one in found]
-        revision = found[-1].revision
+        yield [_change(*one) for one in rows]
+        revision = rows[-1].revision
 
 
 def _change(
@@ -260,7 +263,7 @@ def _change(
 def count_indexed(
     connection: Connection, map_number: int, revision: int, most: int | None = None
 ) -> int:
-    """How many frames of a map were indexed after a revision, counted no farther than `most`."""
+    """Return the number of frames of a map that were indexed after a revision, at most `most`."""
     newer = (
         select(frames.c.number)
         .where(
@@ -274,13 +277,13 @@ def count_indexed(
 
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:
-    """Numbers of the frames of a map that are searched no more since a revision."""
+    """Return the numbers of frames of a map that ceased to be searched after a revision."""
     gone = select(frames.c.number).where(*_gone(map_number, revision))
     return frozenset(connection.execute(gone).scalars())
 
 
 def count_gone(connection: Connection, map_number: int, revision: int) -> int:
-    """How many frames of a map are searched no more since a revision."""
+    """Return the number of frames of a map that ceased to be searched after a revision."""
     return count_rows(connection, *_gone(map_number, revision))
 
 
@@ -293,52 +296,49 @@ def _gone(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
-    """The signature of a frame, or None where it has none.
-
-    Raises
-    ------
-    DamagedSignature : its bytes are not those that were stored.
-    """
+    """Return the signature of a frame, or None; raise DamagedSignature if the checksum is wrong."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
-    asked = select(signatures.c.vector, signatures.c.checksum).where(own)
-    found = connection.execute(asked).first()
-    if found is None:
+    statement = select(signatures.c.vector, signatures.c.checksum).where(own)
+    row = connection.execute(statement).first()
+    if row is None:
         return None
-    if crc32(found.vector) != found.checksum:
+    if crc32(row.vector) != row.checksum:
         raise DamagedSignature(
-            "The signature of the frame is damaged: its checksum does not fit. It is made again "
-            "from its upload while a worker runs; `sceneprint fsck` says whether that can be done."
+            "The signature of the frame is damaged: its checksum is wrong. A worker computes it "
+            "again from the upload; `sceneprint fsck` says whether that is possible."
         )
-    return bytes(found.vector)
+    return bytes(row.vector)
 
 
 def patch_counts(
     connection: Connection, number: int, model_id: str
 ) -> tuple[list[int], list[int]] | None:
-    """Patches and ordered pairs of each level of a signature, the finest first, if known."""
-    asked = select(signatures.c.n_patches, signatures.c.n_pairs).where(
+    """Return the numbers of patches and ordered pairs per level, the finest first; None without
+    signature.
+    """
+    statement = select(signatures.c.n_patches, signatures.c.n_pairs).where(
         signatures.c.frame_number == number, signatures.c.model_id == model_id
     )
-    found = connection.execute(asked).first()
-    return None if found is None else (found.n_patches, found.n_pairs)
+    row = connection.execute(statement).first()
+    return None if row is None else (row.n_patches, row.n_pairs)
 
 
 def stored_signatures(
     connection: Connection, numbers: Iterable[int], model_id: str
 ) -> dict[int, bytes]:
-    """Signatures of frames; those that have none, or a damaged one, are left out."""
-    asked = select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum)
-    own = asked.where(signatures.c.model_id == model_id)
+    """Return signatures by the numbers of frames, without missing or damaged ones."""
+    statement = select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum)
+    own = statement.where(signatures.c.model_id == model_id)
     rows = rows_among(connection, own, signatures.c.frame_number, numbers)
     return {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
 
 
-# What is left of the models that a map no longer has, nor is to have.
+# Signatures and jobs of models that a map neither has nor will have.
 
 
 def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tuple[int, str]]:
-    """The next signatures of a map that are of neither of its models: frame, model."""
-    found = connection.execute(
+    """Return frame and model of the next signatures that belong to neither of a map's models."""
+    rows = connection.execute(
         select(signatures.c.frame_number, signatures.c.model_id)
         .join(frames, frames.c.number == signatures.c.frame_number)
         .where(
@@ -348,11 +348,11 @@ def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tu
         .order_by(frames.c.number)
         .limit(reencoding_rows.REMOVED_AT_ONCE)
     )  # fmt: skip
-    return [(number, model_id) for number, model_id in found]
+    return [(number, model_id) for number, model_id in rows]
 
 
 def remove_signature(connection: Connection, number: int, model_id: str) -> list[str]:
-    """Forget what a model made of a frame; returns the blobs that it referred to."""
+    """Remove a model's signature of a frame; return the blobs that it referred to."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     blobs = list(connection.execute(select(signatures.c.geometry).where(own)).scalars())
     connection.execute(delete(signatures).where(own))
@@ -360,8 +360,8 @@ def remove_signature(connection: Connection, number: int, model_id: str) -> list
 
 
 def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
-    """Some jobs that wait or run for a model that is neither of a map's."""
-    found = connection.execute(
+    """Return the numbers of some unfinished jobs for a model that is neither of a map's models."""
+    numbers = connection.execute(
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
         .where(
@@ -371,4 +371,4 @@ def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
         )
         .limit(reencoding_rows.QUEUED_AT_ONCE)
     )  # fmt: skip
-    return list(found.scalars())
+    return list(numbers.scalars())

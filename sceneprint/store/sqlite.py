@@ -1,4 +1,4 @@
-"""How SQLite is set up: what a connection is told when it opens, and how a transaction begins."""
+"""SQLite: how connections are configured, how transactions begin, and how writers wait."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ from sqlalchemy.exc import ArgumentError, OperationalError
 from sceneprint.atomic_files import PRIVATE_FILE
 from sceneprint.errors import ReadOnlyStore, UnusableStore
 
-# A SQLite file that may be read and not written: on a read-only disk, or of another user.
+# A read-only SQLite file: on a read-only disk, or of another user.
 #
-# SQLite reads a database with a log (`-wal`) only together with the log's index (`-shm`), which it
-# cannot make here. Without a log the file is all there is, and is read as it lies, without locks.
-# That would be wrong where somebody can write it after all, as through another mount: whether the
-# file stayed as it was is looked at after every transaction.
+# SQLite reads a database with a log (`-wal`) only with the log's index (`-shm`), which it cannot
+# create here. Without a log, the file is complete and read without locks. Another process may still
+# write to it, such as through another mount, so the file is checked after every transaction.
 
 
 def read_only_file(url: URL) -> Path | None:
-    """The file of a SQLite database, if it is there and it, or what is beside it, is read-only."""
+    """Return the file of a SQLite database if it exists, and it or its folder is read-only."""
     name = url.database or ""
     if url.get_backend_name() != "sqlite" or name in ("", ":memory:") or name.startswith("file:"):
         return None
@@ -37,7 +36,7 @@ def read_only_file(url: URL) -> Path | None:
 
 
 def is_read_only(url: str) -> bool:
-    """Whether a database may be read alone; False for what is none."""
+    """Return whether a URL is that of a read-only SQLite file."""
     try:
         return read_only_file(make_url(url)) is not None
     except (ArgumentError, ValueError):
@@ -45,59 +44,59 @@ def is_read_only(url: str) -> bool:
 
 
 class ReadOnlyFile:
-    """Reads such a file."""
+    """Reads a read-only SQLite file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def connect(self) -> sqlite3.Connection:
-        """Open it in the way that is right at this moment.
+        """Open the file, with or without locks as its log requires.
 
         Raises
         ------
-        UnusableStore : it was not closed, and cannot be recovered without writing.
+        UnusableStore : the file was not closed, and cannot be recovered without writing.
         """
         has_log, has_index = self._log(), self._beside("-shm").exists()
         if (has_log and not has_index) or self._beside("-journal").exists():
             raise UnusableStore(
                 f"{self._path} was not closed, and on a read-only disk it cannot be recovered. "
-                "Open the data folder once where it may be written, or use a copy."
+                "Open the data folder once from a writable disk, or use a copy."
             )
         how = "mode=ro" if has_log else "mode=ro&immutable=1"
         return sqlite3.connect(f"{self._path.as_uri()}?{how}", uri=True, check_same_thread=False)
 
     def state(self) -> tuple[object, ...]:
-        """What must be the same before and after a transaction."""
+        """Return values that must be equal before and after a transaction."""
         if self._log():
             return ()  # SQLite's own locks tell one transaction from another
         try:
-            found = self._path.stat()
+            status = self._path.stat()
         except OSError:
             return ("gone",)
-        return found.st_mtime_ns, found.st_size, found.st_ino
+        return status.st_mtime_ns, status.st_size, status.st_ino
 
     def check(self, before: object) -> None:
-        """See at the end of a transaction that nobody has written meanwhile.
+        """Check at the end of a transaction that no process has written meanwhile.
 
         Raises
         ------
-        UnusableStore : somebody has.
+        UnusableStore : a process has.
         """
         if self.state() != before:
             raise UnusableStore(
-                f"{self._path} was written by somebody else while it was read as unchanging. "
-                "Ask again."
+                f"{self._path} was written by another process while it was read without locks. "
+                "Try again."
             )
 
     def refusal(self) -> ReadOnlyStore:
-        """What a writer is told."""
+        """Return the error for writers."""
         return ReadOnlyStore(
-            f"{self._path} or its folder is read-only: it is read, and nothing can be stored. "
-            "Make both writable for this user, and start again."
+            f"{self._path} or its folder is read-only, so nothing can be stored. Make both "
+            "writable for this user, and start again."
         )
 
     def _log(self) -> bool:
-        """Whether there is a log with something in it, or one that somebody has just begun."""
+        """Return whether the log has content, or was just created."""
         try:
             size = self._beside("-wal").stat().st_size
         except OSError:
@@ -108,23 +107,23 @@ class ReadOnlyFile:
         return self._path.with_name(self._path.name + end)
 
 
-#: Seconds a writer waits for another, and waits after somebody has waited so long in vain.
+#: Seconds that a writer waits for another, and that it waits after one has timed out.
 BUSY_S, HELD_S = 10.0, 0.1
-#: Seconds between two looks for the lock, and for which a process waits until it is first in line.
+#: Seconds between two attempts to take the lock, and maximum seconds in line for it.
 LOOK_S, LINE_S = 0.0005, 1.0
-#: Seconds for which emptying the log waits for readers: writers wait for it meanwhile.
+#: Seconds that emptying the log waits for readers; writers wait for it meanwhile.
 SHRINKING_S = 0.5
 
 
 def open_sqlite(url: URL) -> tuple[Engine, ReadOnlyFile | None]:
-    """An engine whose connections are told what all are told, and where the file is read alone."""
+    """Return a configured engine, and the file if it is read-only."""
     path, sealed = read_only_file(url), None
     if path is not None:
         sealed = ReadOnlyFile(path)
-        # each transaction opens the file in the way that is right then
+        # each transaction opens the file anew, with or without locks
         engine = create_engine(url, creator=sealed.connect, poolclass=NullPool)
     else:
-        # SQLite waits for a writer itself, fairly enough; readers never wait in WAL
+        # in WAL mode, readers never wait
         engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16, max_overflow=-1)
         event.listen(engine, "do_connect", _create_file)
     event.listen(engine, "connect", configure_sqlite if sealed is None else configure_read_only)
@@ -133,25 +132,26 @@ def open_sqlite(url: URL) -> tuple[Engine, ReadOnlyFile | None]:
 
 
 def _create_file(_dialect: Any, _record: Any, arguments: list[Any], _named: Any) -> None:
-    """Create a file that is missing, which SQLite would let others read; its log is as its file.
+    """Create a missing file, as SQLite would make it readable for others; the log gets the same
+    mode.
 
-    It is not opened: closing it would release the locks that this process has on it.
+    It is not opened: closing it would release this process's locks on it.
     """
     path = arguments[0] if arguments else ""
     if path in ("", ":memory:") or path.startswith("file:"):
         return
-    with suppress(OSError):  # it is there; or it cannot be made, and SQLite says so
+    with suppress(OSError):  # it exists, or SQLite reports that it cannot be created
         os.mknod(path, stat.S_IFREG | PRIVATE_FILE)
 
 
 def configure_sqlite(connection: Any, _record: Any) -> None:
-    """Tell a connection that may write what all of them are told."""
+    """Configure a connection that may write."""
     connection.isolation_level = None  # transactions begin where `begin_sqlite` says
     for pragma in (
         "journal_mode = WAL",
-        "synchronous = FULL",  # a commit that was acknowledged survives the power
+        "synchronous = FULL",  # an acknowledged commit survives a power failure
         "foreign_keys = ON",
-        "secure_delete = ON",  # what is deleted is written over, in pages that are given up too
+        "secure_delete = ON",  # overwrites deleted data, in free pages as well
         f"busy_timeout = {_milliseconds(BUSY_S)}",
         "cache_size = -32000",
     ):
@@ -159,9 +159,9 @@ def configure_sqlite(connection: Any, _record: Any) -> None:
 
 
 def shrink_log(connection: Any) -> bool:
-    """Empty the log when all that is in it is in the file; False where somebody is in the way.
+    """Empty the log after a checkpoint; return False if another process prevents it.
 
-    Else pages as they once were stay in it for as long as nothing is written over them.
+    Otherwise former versions of pages stay in it until they are overwritten.
     """
     connection.execute(f"PRAGMA busy_timeout = {_milliseconds(SHRINKING_S)}").close()
     try:
@@ -172,26 +172,26 @@ def shrink_log(connection: Any) -> bool:
 
 
 def configure_read_only(connection: Any, _record: Any) -> None:
-    """Tell a connection to a file that may be read alone."""
+    """Configure a connection to a read-only file."""
     connection.isolation_level = None
 
 
 def begin_sqlite(connection: Connection) -> None:
-    """Begin a transaction: of a writer at once with the lock, for which it waits so long."""
+    """Begin a transaction; a writer takes the lock at once, or waits for it."""
     wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
     if wait_s is None:
         connection.exec_driver_sql("BEGIN")
         return
     if connection.get_execution_options().get("sceneprint_unchecked"):
-        connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # within a transaction it is late
-    # a reader that turns writer half way would fail where another wrote in between
+        connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # no effect within a transaction
+    # a transaction that reads first and writes later would fail if another wrote in between
     line: WriterLine | None = connection.get_execution_options().get("sceneprint_line")
     with nullcontext() if line is None else line.first(min(wait_s, LINE_S)):
         _begin_immediate(connection, wait_s)
 
 
 def _begin_immediate(connection: Connection, wait_s: float) -> None:
-    """Take the lock. SQLite itself would look for it less and less often, up to 0.1 s apart."""
+    """Take the lock. SQLite itself would try less and less often, up to 0.1 s apart."""
     until = time.monotonic() + wait_s
     connection.exec_driver_sql("PRAGMA busy_timeout = 0")
     try:
@@ -210,15 +210,14 @@ def _begin_immediate(connection: Connection, wait_s: float) -> None:
 
 
 class WriterLine:
-    """Where processes that want to write stand in line: one at a time waits for SQLite's lock.
+    """The line of processes that wait to write: only the first one waits for SQLite's lock.
 
-    Else that would go to whoever looks at the right moment: to a service that writes without a
-    pause, and a worker would wait for seconds. What a process does that knows no line is right,
-    and not fair.
+    Otherwise a service that writes without a pause would usually get the lock, and a worker would
+    wait for seconds. Processes without a line are safe, but not fair.
 
     Parameters
     ----------
-    folder : of the database; its lock is the place at the head of the line
+    folder : folder of the database; its lock is the first place in the line
     """
 
     def __init__(self, folder: Path) -> None:
@@ -227,7 +226,7 @@ class WriterLine:
 
     @contextmanager
     def first(self, longest_s: float) -> Iterator[None]:
-        """Be the first in line, or have waited so long: the first may have been stopped."""
+        """Wait to be the first in line, or for `longest_s`: the first one may have been stopped."""
         descriptor = self._open()
         if descriptor is None or not _locked(descriptor, longest_s):
             yield
@@ -238,16 +237,16 @@ class WriterLine:
             fcntl.flock(descriptor, fcntl.LOCK_UN)
 
     def close(self) -> None:
-        """Leave the folder."""
+        """Close the folder."""
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)
 
     def _open(self) -> int | None:
         if self._descriptor is None:
-            with suppress(OSError):  # without a line it works too
-                how = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-                self._descriptor = os.open(self._folder, how)
+            with suppress(OSError):  # the line is optional
+                flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+                self._descriptor = os.open(self._folder, flags)
         return self._descriptor
 
 

@@ -1,4 +1,4 @@
-"""Counts over the whole store that are cheap enough to be asked for often."""
+"""Counts over the whole store that are cheap enough for frequent calls, and processes' samples."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from sceneprint_client.api import JobState
 
 
 def count_maps(connection: Connection) -> int:
-    """How many maps there are."""
+    """Return the number of maps."""
     return int(connection.execute(select(func.count()).select_from(maps)).scalar_one())
 
 
 def oldest_waiting(connection: Connection, map_number: int | None = None) -> float | None:
-    """When the job was made that waits for longest, seconds since 1970; None: none waits.
+    """Return the creation time of the oldest queued job, seconds since 1970; None if none is
+    queued.
 
-    The one with the least number: the index that claims are made by has all that it takes.
+    It is the job with the least number, which the index of claims contains.
     """
     first = select(func.min(jobs.c.number)).where(jobs.c.state == JobState.QUEUED)
     if map_number is not None:
@@ -30,13 +31,13 @@ def oldest_waiting(connection: Connection, map_number: int | None = None) -> flo
     number = connection.execute(first).scalar()
     if number is None:
         return None
-    asked = select(jobs.c.created_at).where(jobs.c.number == number)
-    found: float | None = connection.execute(asked).scalar()
-    return found
+    statement = select(jobs.c.created_at).where(jobs.c.number == number)
+    created_at: float | None = connection.execute(statement).scalar()
+    return created_at
 
 
-def at_work(connection: Connection, now: float) -> dict[str, str]:
-    """Job in hand of each worker that has one, by the worker's name."""
+def running_jobs(connection: Connection, now: float) -> dict[str, str]:
+    """Return the id of the running job of each worker, by the worker's name."""
     rows = connection.execute(
         select(jobs.c.worker, jobs.c.id).where(
             jobs.c.state == JobState.RUNNING, jobs.c.leased_until >= now
@@ -49,21 +50,21 @@ def count_events(
     connection: Connection, kinds: Sequence[str], at: float, width_s: float,
     map_name: str | None = None,
 ) -> Counter[tuple[int, str]]:  # fmt: skip
-    """How many events of some kinds there were in each interval since a time.
+    """Count the events of some kinds in each interval since a time.
 
     Parameters
     ----------
-    kinds : those of `KINDS` of the API
-    at : when the first interval begins, seconds since 1970
-    width_s : of an interval, seconds
-    map_name : only of this map
+    kinds : some of `KINDS` of the API
+    at : start of the first interval, seconds since 1970
+    width_s : length of an interval, seconds
+    map_name : only map; default: all maps
 
     Returns
     -------
-    counts : by the number of the interval and the kind
+    counts : counts by number of the interval and kind
     """
     interval = (events.c.at - at) // width_s
-    asked = (
+    statement = (
         select(interval, events.c.kind, func.count())
         .where(
             events.c.number >= _first_since(connection, at),
@@ -73,48 +74,46 @@ def count_events(
         .group_by(interval, events.c.kind)
     )
     if map_name is not None:
-        asked = asked.where(events.c.map == map_name)
-    return Counter({(int(row[0]), row[1]): row[2] for row in connection.execute(asked)})
+        statement = statement.where(events.c.map == map_name)
+    return Counter({(int(row[0]), row[1]): row[2] for row in connection.execute(statement)})
 
 
 def _first_since(connection: Connection, at: float) -> int:
-    """Number from which on events are of that time or later: they are in the order of time.
+    """Return the number of the first event at or after a time, as events are sorted by time.
 
-    Found by halving: there is no index of times, and none is needed.
+    A binary search needs no index of times.
     """
     low = int(connection.execute(select(func.min(events.c.number))).scalar() or 0)
     high = int(connection.execute(select(func.max(events.c.number))).scalar() or 0) + 1
     while low < high:
         middle = (low + high) // 2
-        found = connection.execute(
+        row = connection.execute(
             select(events.c.number, events.c.at)
             .where(events.c.number >= middle)
             .order_by(events.c.number)
             .limit(1)
         ).first()
-        if found is None or found.at >= at:
+        if row is None or row.at >= at:
             high = middle
         else:
-            low = int(found.number) + 1
+            low = int(row.number) + 1
     return low
 
 
-# Samples: what each process counted in the last seconds, for a short history of all of them.
+# Samples: counts of each process over the last seconds, for a short history.
 
-#: Seconds that samples are kept.
+#: Seconds after which samples are removed.
 KEPT_S = 7200.0
-#: Samples removed with one that is added: more than are ever added at once.
-_SWEPT = 100
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What one process counted.
+    """The counts of one process.
 
     Parameters
     ----------
-    at : end of the time in which it was counted, seconds since 1970
-    data : by kind
+    at : end of the counted interval, seconds since 1970
+    data : counts, by kind
     """
 
     at: float
@@ -122,25 +121,25 @@ class Sample:
 
 
 def add_sample(connection: Connection, kind: str, process: str, data: dict[str, Any]) -> None:
-    """Keep a sample, and remove some of its kind that are older than KEPT_S."""
+    """Store a sample, and remove up to 100 of its kind that are older than KEPT_S."""
     now = time.time()
     old = (
         select(samples.c.number)
         .where(samples.c.kind == kind, samples.c.at < now - KEPT_S)
         .order_by(samples.c.number)
-        .limit(_SWEPT)
-        .with_for_update(skip_locked=True)  # writers of samples wait for no turn, nor each other
+        .limit(100)
+        .with_for_update(skip_locked=True)  # writers of samples take no turns
     )
     connection.execute(delete(samples).where(samples.c.number.in_(old)))
     connection.execute(insert(samples).values(at=now, process=process, kind=kind, data=data))
 
 
 def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
-    """Samples of all processes from a time on, the oldest first."""
+    """Return the samples of all processes since a time, the oldest first."""
     of_kind = select(samples.c.at, samples.c.data).where(samples.c.kind == kind, samples.c.at >= at)
     return [Sample(*row) for row in connection.execute(of_kind.order_by(samples.c.at))]
 
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:
-    """How many samples of a kind there are from a time on."""
+    """Return the number of samples of a kind since a time."""
     return count_rows(connection, samples.c.kind == kind, samples.c.at >= at)

@@ -1,7 +1,7 @@
-"""Surfaces of maps: their tiles, the frames that are fused in them, and what is left to do.
+"""Surfaces of maps: their tiles, the frames fused in them, and pending work.
 
-Which frame touches which tile is a row each. So a frame that is gone or was edited costs the tiles
-it touches, and those are made anew from the other frames that touch them.
+A row links each frame to each tile that it touches. When a frame is deleted or edited, the tiles
+that it touches are rebuilt from the other frames that touch them.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from sceneprint.store.tables import (
     MapRow,
     among,
     blocks,
+    count_rows,
     frames,
     map_row,
     maps,
@@ -44,13 +45,10 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState
 
-#: Scale of a tile that is to be given out again.
+#: Scale of a tile that must be published again.
 NO_SCALE = -1
-#: Columns of a frame that its share of a surface depends on.
+#: Columns of a frame that its contribution to a surface depends on.
 FUSED_COLUMNS = frozenset(("pose", "pose_parent", "session", "captured_at"))
-
-
-# The surface of a map as a whole.
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class SurfaceRow:
     updated_at: float | None
 
     def is_current(self, row: MapRow) -> bool:
-        """Whether nothing came, went or was edited since its last job was over."""
+        """Return whether the map is unchanged since the surface's last job ended."""
         return (
             self.revision == row.revision
             and self.edits == self.pose_edits
@@ -84,14 +82,14 @@ class SurfaceRow:
 
 
 def find_surface(connection: Connection, map_number: int) -> SurfaceRow | None:
-    """The surface of a map; None where none was ever begun."""
-    asked = select(surfaces).where(surfaces.c.map_number == map_number)
-    row = connection.execute(asked).mappings().first()
+    """Return the surface of a map; None if none was ever started."""
+    statement = select(surfaces).where(surfaces.c.map_number == map_number)
+    row = connection.execute(statement).mappings().first()
     return None if row is None else SurfaceRow(**row)
 
 
 def add_surface(connection: Connection, row: MapRow) -> SurfaceRow:
-    """A surface of no model yet: its first job sets that."""
+    """Insert a surface without a model, which its first job sets."""
     new = SurfaceRow(
         map_number=row.number, model_id="", cell_m=0.0, wanted=True, job_number=None,
         revision=-1, edits=0, pose_edits=0, scale=0, taken_from=None, taken_step_s=1.0,
@@ -109,34 +107,32 @@ def write_surface(connection: Connection, map_number: int, **values: object) -> 
 
 
 def note_edit(connection: Connection, frame_number: int, map_number: int) -> None:
-    """Let the surface learn that a frame was edited, in the transaction that does so."""
+    """Mark a fused frame as edited, in the transaction of the edit, and count the edit."""
     mark_edited(connection, frame_number)
     _count_edit(connection, map_number)
 
 
-def note_moved(connection: Connection, numbers: Sequence[int], map_number: int) -> None:
-    """As `note_edit`, of many frames at once."""
-    for some in blocks(numbers):
-        own = among(connection, surface_frames.c.frame_number, some)
+def note_edits(connection: Connection, numbers: Sequence[int], map_number: int) -> None:
+    """Mark many frames; see `note_edit`."""
+    for block in blocks(numbers):
+        own = among(connection, surface_frames.c.frame_number, block)
         connection.execute(update(surface_frames).where(own).values(changed=True))
     _count_edit(connection, map_number)
 
 
 def _count_edit(connection: Connection, map_number: int) -> None:
-    of_map = surfaces.c.map_number == map_number
-    counted = update(surfaces).where(of_map).values(pose_edits=surfaces.c.pose_edits + 1)
-    connection.execute(counted)
+    write_surface(connection, map_number, pose_edits=surfaces.c.pose_edits + 1)
 
 
 def mark_edited(connection: Connection, frame_number: int) -> None:
-    """As `note_edit`, of a frame that takes a revision of its map with it."""
+    """Mark a frame that gets a new revision of its map; see `note_edit`."""
     own = surface_frames.c.frame_number == frame_number
     connection.execute(update(surface_frames).where(own).values(changed=True))
 
 
-def maps_to_look_at(connection: Connection) -> list[tuple[MapRow, SurfaceRow | None]]:
-    """Maps whose surfaces may lack something, or that have none."""
-    asked = (
+def maps_to_update(connection: Connection) -> list[tuple[MapRow, SurfaceRow | None]]:
+    """Return the maps without a surface, or with one that may be out of date."""
+    statement = (
         select(maps, surfaces)
         .join(surfaces, surfaces.c.map_number == maps.c.number, isouter=True)
         .where(
@@ -147,35 +143,34 @@ def maps_to_look_at(connection: Connection) -> list[tuple[MapRow, SurfaceRow | N
         )
         .order_by(maps.c.number)
     )
-    found = []
-    for values in connection.execute(asked):
-        of_map = dict(zip((c.name for c in maps.c), values, strict=False))
+    pairs = []
+    for values in connection.execute(statement):
+        row = dict(zip((c.name for c in maps.c), values, strict=False))
         own = dict(zip((c.name for c in surfaces.c), values[len(maps.c) :], strict=True))
         surface = None if own["map_number"] is None else SurfaceRow(**own)
-        found.append((map_row(of_map), surface))  # type: ignore[arg-type]
-    return found
+        pairs.append((map_row(row), surface))  # type: ignore[arg-type]
+    return pairs
 
 
 def count_unfinished(connection: Connection, surface: SurfaceRow) -> int:
-    """How many tiles are to be made anew, or given out again."""
+    """Return the number of tiles to rebuild or to publish again."""
     c = surface_tiles.c
     lacking = c.rebuilt_to.is_not(None) | ((c.level == 0) & (c.scale != surface.scale))
-    asked = select(func.count()).where(c.map_number == surface.map_number, lacking)
-    return int(connection.execute(asked).scalar_one())
+    return count_rows(connection, c.map_number == surface.map_number, lacking)
 
 
-# Frames: those that are fused, that are to be, and that are no more.
+# Frames to add, fused frames, and frames to remove.
 
 
 @dataclass(frozen=True)
 class FusedFrame:
-    """A posed frame with all that its share of a surface depends on.
+    """A posed frame with the values that its contribution to a surface depends on.
 
     Parameters
     ----------
-    parent, pose : T_parent_sensor, 4 rows of 4, and where it leads
-    session, captured_at : as far as is known
-    geometry : blob of its artifact
+    parent, pose : parent frame, and T_parent_sensor in 4 rows of 4
+    session, captured_at : run and time, if known
+    geometry : blob of the artifact
     """
 
     number: int
@@ -187,7 +182,7 @@ class FusedFrame:
 
 
 def _posed(map_number: int, model_id: str) -> Select[Any]:
-    """Numbers of the frames that a surface is made of, in order."""
+    """Select the numbers of the frames that a surface contains."""
     c = frames.c
     return (
         select(c.number)
@@ -206,7 +201,7 @@ def _unfused(surface: SurfaceRow) -> Select[Any]:
     return _posed(surface.map_number, surface.model_id).where(~fused.exists())
 
 
-def _fused_no_more(surface: SurfaceRow) -> Select[Any]:
+def _outdated(surface: SurfaceRow) -> Select[Any]:
     gone: ColumnElement[bool] = or_(
         surface_frames.c.changed,
         frames.c.state != FrameState.INDEXED,
@@ -220,59 +215,58 @@ def _fused_no_more(surface: SurfaceRow) -> Select[Any]:
 
 
 def count_posed(connection: Connection, row: MapRow) -> int:
-    """How many frames of a map a surface would be made of."""
-    asked = select(func.count()).select_from(_posed(row.number, row.model_id).subquery())
-    return int(connection.execute(asked).scalar_one())
+    """Return the number of frames of a map that a surface would contain."""
+    return _count(connection, _posed(row.number, row.model_id))
+
+
+def _count(connection: Connection, statement: Select[Any]) -> int:
+    return connection.execute(select(func.count()).select_from(statement.subquery())).scalar_one()
 
 
 def count_fused(connection: Connection, map_number: int) -> dict[str, int]:
-    """How many frames are fused, by parent frame."""
+    """Return the number of fused frames by parent frame."""
     c = surface_frames.c
-    asked = select(c.parent, func.count()).where(c.map_number == map_number).group_by(c.parent)
-    return {row[0]: row[1] for row in connection.execute(asked)}
+    counts = select(c.parent, func.count()).where(c.map_number == map_number).group_by(c.parent)
+    return {row[0]: row[1] for row in connection.execute(counts)}
 
 
 def count_left(connection: Connection, surface: SurfaceRow) -> int:
-    """How many frames are to be added, or taken out."""
-    parts = (_unfused(surface), _fused_no_more(surface))
-    return sum(
-        int(connection.execute(select(func.count()).select_from(one.subquery())).scalar_one())
-        for one in parts
-    )
+    """Return the number of frames to add or to remove."""
+    return _count(connection, _unfused(surface)) + _count(connection, _outdated(surface))
 
 
 def frames_to_fuse(
     connection: Connection, surface: SurfaceRow, after: int, limit: int
 ) -> list[FusedFrame]:
-    """The next frames that are not fused yet, from behind a number on."""
-    asked = _unfused(surface).where(frames.c.number > after)
-    numbers = connection.execute(asked.order_by(frames.c.number).limit(limit)).scalars().all()
+    """Return the next frames to add, after a number."""
+    unfused = _unfused(surface).where(frames.c.number > after)
+    numbers = connection.execute(unfused.order_by(frames.c.number).limit(limit)).scalars().all()
     return fused_frames(connection, surface, numbers)
 
 
 def frames_to_remove(connection: Connection, surface: SurfaceRow, limit: int) -> list[int]:
-    """Numbers of fused frames that are gone or were edited."""
-    asked = _fused_no_more(surface).order_by(surface_frames.c.frame_number).limit(limit)
-    return list(connection.execute(asked).scalars())
+    """Return the numbers of fused frames that were deleted or edited."""
+    outdated = _outdated(surface).order_by(surface_frames.c.frame_number).limit(limit)
+    return list(connection.execute(outdated).scalars())
 
 
 def fused_frames(
     connection: Connection, surface: SurfaceRow, numbers: Iterable[int]
 ) -> list[FusedFrame]:
-    """Frames by their numbers, in order; without those that have no pose or no artifact now."""
+    """Return frames by their numbers, in order, without those that lack a pose or an artifact."""
     c = frames.c
-    asked = (
+    statement = (
         _posed(surface.map_number, surface.model_id)
         .with_only_columns(
             c.number, c.pose_parent, c.pose, c.session, c.captured_at, signatures.c.geometry
         )
         .order_by(c.number)
     )
-    return [FusedFrame(*row) for row in rows_among(connection, asked, c.number, numbers)]
+    return [FusedFrame(*row) for row in rows_among(connection, statement, c.number, numbers)]
 
 
 def add_fused(connection: Connection, surface: SurfaceRow, fused: Sequence[FusedFrame]) -> None:
-    """Note frames as fused; those that were edited since they were read are noted as such."""
+    """Record frames as fused, and mark those that were edited since they were read."""
     now = {
         one.number: one for one in fused_frames(connection, surface, [one.number for one in fused])
     }
@@ -286,36 +280,31 @@ def add_fused(connection: Connection, surface: SurfaceRow, fused: Sequence[Fused
 
 
 def taken_range(connection: Connection, surface: SurfaceRow) -> tuple[float, float] | None:
-    """The first and the last time at which frames of a surface were taken, fused ones or not."""
-    at = frames.c.captured_at
-    asked = _posed(surface.map_number, surface.model_id)
-    asked = asked.with_only_columns(func.min(at), func.max(at))
-    row = connection.execute(asked).one()
-    return None if row[0] is None else (row[0], row[1])
+    """Return the first and last capture time of a surface's frames, fused or not."""
+    at, posed = frames.c.captured_at, _posed(surface.map_number, surface.model_id)
+    first, last = connection.execute(posed.with_only_columns(func.min(at), func.max(at))).one()
+    return None if first is None else (first, last)
 
 
 def fused_range(connection: Connection, map_number: int) -> tuple[float | None, float | None]:
-    """The first and the last time at which the fused frames of a map were taken."""
+    """Return the first and last capture time of a map's fused frames."""
     at = frames.c.captured_at
-    asked = (
+    statement = (
         select(func.min(at), func.max(at))
         .join(surface_frames, surface_frames.c.frame_number == frames.c.number)
         .where(surface_frames.c.map_number == map_number)
     )
-    first, last = connection.execute(asked).one()
+    first, last = connection.execute(statement).one()
     return first, last
 
 
 def spread_fused(connection: Connection, map_number: int, parent: str, most: int) -> list[int]:
-    """Numbers of fused frames of a parent frame, evenly taken."""
+    """Return the numbers of evenly spaced fused frames of a parent frame."""
     c = surface_frames.c
     own = (c.map_number == map_number) & (c.parent == parent)
-    numbers = connection.execute(select(c.frame_number).where(own).order_by(c.frame_number))
-    found = list(numbers.scalars())
-    return found[:: max(len(found) // most, 1)]
-
-
-# Tiles.
+    statement = select(c.frame_number).where(own).order_by(c.frame_number)
+    numbers = list(connection.execute(statement).scalars())
+    return numbers[:: max(len(numbers) // most, 1)]
 
 
 @dataclass(frozen=True)
@@ -344,51 +333,48 @@ class TileRow:
 
     @property
     def place(self) -> TilePlace:
-        """Column, row and floor."""
+        """Column, row and floor of the tile."""
         return self.tile_x, self.tile_y, self.tile_z
 
 
 def tiles_at(
     connection: Connection, map_number: int, parent: str, level: int, places: Iterable[TilePlace]
 ) -> dict[TilePlace, TileRow]:
-    """Tiles of a parent frame and level by their places; those that are not there are left out."""
+    """Return existing tiles of a parent frame and level by their places."""
     c = surface_tiles.c
-    wanted = set(places)
-    # those of each floor and row together: no database takes lists of many tuples well
+    # one statement per row and floor, as lists of many tuples are slow
     columns: dict[tuple[int, int], list[int]] = {}
-    for x, y, z in sorted(wanted):
+    for x, y, z in sorted(set(places)):
         columns.setdefault((y, z), []).append(x)
-    found = {}
+    tiles: dict[TilePlace, TileRow] = {}
     for (y, z), xs in columns.items():
-        asked = select(surface_tiles).where(
+        statement = select(surface_tiles).where(
             c.map_number == map_number, c.parent == parent, c.level == level, c.tile_y == y,
             c.tile_z == z, c.tile_x.in_(xs),
         )  # fmt: skip
-        for row in connection.execute(asked).mappings():
-            tile = TileRow(**row)
-            found[tile.place] = tile
-    return found
+        tiles |= {tile.place: tile for tile in _tiles(connection, statement)}
+    return tiles
+
+
+def _tiles(connection: Connection, statement: Select[Any]) -> list[TileRow]:
+    return [TileRow(**row) for row in connection.execute(statement).mappings()]
 
 
 def tile_of_digest(connection: Connection, map_number: int, digest: str) -> TileRow | None:
-    """A tile that has been made, by what the outside knows."""
+    """Return a published tile by its digest, or None."""
     c = surface_tiles.c
-    asked = select(surface_tiles).where(
-        c.map_number == map_number, c.digest == digest, c.blob.is_not(None)
-    )
-    row = connection.execute(asked.limit(1)).mappings().first()
-    return None if row is None else TileRow(**row)
+    own = c.map_number == map_number, c.digest == digest, c.blob.is_not(None)
+    return next(iter(_tiles(connection, select(surface_tiles).where(*own).limit(1))), None)
 
 
 def tile_of_number(connection: Connection, number: int) -> TileRow | None:
-    """A tile by its number; None where it was removed."""
-    asked = select(surface_tiles).where(surface_tiles.c.number == number)
-    row = connection.execute(asked).mappings().first()
-    return None if row is None else TileRow(**row)
+    """Return a tile by its number; None if it was removed."""
+    own = surface_tiles.c.number == number
+    return next(iter(_tiles(connection, select(surface_tiles).where(own))), None)
 
 
-def spoil_tile(connection: Connection, tile: TileRow) -> None:
-    """Have a tile made again whose bytes are lost: from its frames, or from finer tiles."""
+def schedule_rebuild(connection: Connection, tile: TileRow) -> None:
+    """Schedule the rebuilding of a tile whose bytes are lost, from frames or finer tiles."""
     own = surface_tiles.c.number == tile.number
     doom(connection, [blob for blob in (tile.blob, tile.draft) if blob])
     if tile.level == 0:
@@ -397,30 +383,29 @@ def spoil_tile(connection: Connection, tile: TileRow) -> None:
     else:
         connection.execute(delete(surface_tiles).where(own))
         forget_scale(connection, tile.map_number, tile.parent, tile.place, FACTOR**tile.level)
-    of_map = surfaces.c.map_number == tile.map_number
-    counted = update(surfaces).where(of_map).values(pose_edits=surfaces.c.pose_edits + 1)
-    connection.execute(counted)
+    _count_edit(connection, tile.map_number)
 
 
 def list_tiles(
     connection: Connection, map_number: int, parent: str, level: int,
     beyond: TilePlace | None = None, limit: int | None = None,
 ) -> list[TileRow]:  # fmt: skip
-    """Tiles that have been made, by column, row and floor, from behind a place on."""
+    """Return published tiles by column, row and floor, after a place."""
     c = surface_tiles.c
     place = (c.tile_x, c.tile_y, c.tile_z)
-    asked = select(surface_tiles).where(
+    statement = select(surface_tiles).where(
         c.map_number == map_number, c.parent == parent, c.level == level, c.blob.is_not(None)
     )
     if beyond is not None:
-        asked = asked.where(tuple_(*place) > tuple_(*beyond))
-    found = connection.execute(asked.order_by(*place).limit(limit)).mappings()
-    return [TileRow(**row) for row in found]
+        statement = statement.where(tuple_(*place) > tuple_(*beyond))
+    return _tiles(connection, statement.order_by(*place).limit(limit))
 
 
 @dataclass(frozen=True)
 class LevelTotals:
-    """Tiles of a parent frame and level together; low and high: (3,) box of their cells."""
+    """Totals of the tiles of a parent frame and level; low and high: (3,) corners of the cells'
+    box.
+    """
 
     parent: str
     level: int
@@ -431,11 +416,11 @@ class LevelTotals:
 
 
 def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
-    """Sums over the tiles that have been made, by parent frame and level."""
+    """Return totals of the published tiles by parent frame and level."""
     c = surface_tiles.c
     lows = [func.min(one) for one in (c.low_x, c.low_y, c.low_z)]
     highs = [func.max(one) for one in (c.high_x, c.high_y, c.high_z)]
-    asked = (
+    statement = (
         select(c.parent, c.level, func.count(), func.sum(c.cells), *lows, *highs)
         .where(c.map_number == map_number, c.blob.is_not(None))
         .group_by(c.parent, c.level)
@@ -443,46 +428,39 @@ def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
     )
     return [
         LevelTotals(row[0], row[1], row[2], int(row[3]), tuple(row[4:7]), tuple(row[7:10]))
-        for row in connection.execute(asked)
+        for row in connection.execute(statement)
     ]
 
 
 def tiles_to_rebuild(connection: Connection, map_number: int, most: int) -> list[TileRow]:
-    """Some tiles that are made anew and have come equally far, those nearest to the end first."""
+    """Return tiles under reconstruction with equal progress, those with the most progress first."""
     c = surface_tiles.c
-    asked = (
-        select(surface_tiles)
-        .where(c.map_number == map_number, c.rebuilt_to.is_not(None))
-        .order_by(c.rebuilt_to.desc(), c.number)
-        .limit(most)
-    )
-    found = [TileRow(**row) for row in connection.execute(asked).mappings()]
-    return [one for one in found if one.rebuilt_to == found[0].rebuilt_to]
+    own = c.map_number == map_number, c.rebuilt_to.is_not(None)
+    statement = select(surface_tiles).where(*own).order_by(c.rebuilt_to.desc(), c.number)
+    tiles = _tiles(connection, statement.limit(most))
+    return [tile for tile in tiles if tile.rebuilt_to == tiles[0].rebuilt_to]
 
 
 def tiles_of_other_scale(connection: Connection, surface: SurfaceRow, most: int) -> list[TileRow]:
-    """Some tiles of the finest level that were given out with other times."""
+    """Return some tiles of the finest level that were published with another scale of time."""
     c = surface_tiles.c
-    asked = select(surface_tiles).where(
+    statement = select(surface_tiles).where(
         c.map_number == surface.map_number, c.level == 0, c.scale != surface.scale,
         c.rebuilt_to.is_(None),
     )  # fmt: skip
-    return [
-        TileRow(**row)
-        for row in connection.execute(asked.order_by(c.number).limit(most)).mappings()
-    ]
+    return _tiles(connection, statement.order_by(c.number).limit(most))
 
 
 def forget_scale(
     connection: Connection, map_number: int, parent: str, place: TilePlace, factor: int
 ) -> None:
-    """Have the tiles given out again that lie in one of a coarser level, which is lost.
+    """Schedule publishing of the finest tiles within a lost coarser one.
 
     Parameters
     ----------
     connection, map_number, parent : see `tiles_at`
-    place : of the coarser tile
-    factor : how many times as wide it is
+    place : place of the coarser tile
+    factor : ratio of the widths of the tiles
     """
     c = surface_tiles.c
     within = [
@@ -497,45 +475,41 @@ def write_tile(
     connection: Connection, map_number: int, parent: str, level: int, place: TilePlace,
     values: dict[str, Any],
 ) -> tuple[int, list[str]]:  # fmt: skip
-    """Make or change a tile.
+    """Insert or change a tile.
 
     Returns
     -------
-    number : of the tile
-    blobs : that it refers to no more
+    number : number of the tile
+    blobs : blobs that it no longer refers to
     """
     c = surface_tiles.c
     before = tiles_at(connection, map_number, parent, level, [place]).get(place)
     if before is None:
         x, y, z = place
-        blank = dict.fromkeys(("low_x", "low_y", "low_z", "high_x", "high_y", "high_z"), 0.0) | {
-            "cells": 0,
-            "digest": "",
-            "scale": NO_SCALE,
-        }
-        made = insert(surface_tiles).values(
+        blank: dict[str, Any] = {"cells": 0, "digest": "", "scale": NO_SCALE}
+        blank |= dict.fromkeys(("low_x", "low_y", "low_z", "high_x", "high_y", "high_z"), 0.0)
+        new = insert(surface_tiles).values(
             map_number=map_number, parent=parent, level=level, tile_x=x, tile_y=y, tile_z=z,
             **(blank | values),
         )  # fmt: skip
-        return int(connection.execute(made.returning(c.number)).scalar_one()), []
+        return int(connection.execute(new.returning(c.number)).scalar_one()), []
     connection.execute(update(surface_tiles).where(c.number == before.number).values(**values))
-    new = {values.get(name, getattr(before, name)) for name in ("blob", "draft")}
-    return before.number, [one for one in (before.blob, before.draft) if one and one not in new]
+    left = {values.get(name, getattr(before, name)) for name in ("blob", "draft")}
+    return before.number, [one for one in (before.blob, before.draft) if one and one not in left]
 
 
 def remove_tiles(connection: Connection, tiles: Sequence[TileRow]) -> list[str]:
-    """Remove tiles, with which frames touch them; returns blobs that they referred to."""
-    for some in blocks(one.number for one in tiles):
-        own = among(connection, surface_touches.c.tile_number, some)
-        connection.execute(delete(surface_touches).where(own))
-        connection.execute(
-            delete(surface_tiles).where(among(connection, surface_tiles.c.number, some))
-        )
-    return [blob for one in tiles for blob in (one.blob, one.draft) if blob]
+    """Remove tiles and their links to frames; return the blobs that they referred to."""
+    for block in blocks(tile.number for tile in tiles):
+        touches = among(connection, surface_touches.c.tile_number, block)
+        connection.execute(delete(surface_touches).where(touches))
+        own = among(connection, surface_tiles.c.number, block)
+        connection.execute(delete(surface_tiles).where(own))
+    return [blob for tile in tiles for blob in (tile.blob, tile.draft) if blob]
 
 
 def add_touches(connection: Connection, touches: Iterable[tuple[int, int]]) -> None:
-    """Note that frames touch tiles: numbers of tile and frame."""
+    """Link frames to tiles, by the numbers of tile and frame."""
     rows = [{"tile_number": tile, "frame_number": frame} for tile, frame in sorted(touches)]
     if rows:
         connection.execute(insert(surface_touches), rows)
@@ -544,74 +518,66 @@ def add_touches(connection: Connection, touches: Iterable[tuple[int, int]]) -> N
 def frames_touching(
     connection: Connection, tiles: Sequence[int], after: int, limit: int
 ) -> list[int]:
-    """Numbers of frames that touch any of some tiles, in order from behind a number on."""
+    """Return the numbers of frames that touch any of some tiles, in order, after a number."""
     c = surface_touches.c
-    asked = (
+    statement = (
         select(c.frame_number)
         .where(among(connection, c.tile_number, tiles), c.frame_number > after)
         .distinct()
         .order_by(c.frame_number)
         .limit(limit)
     )
-    return list(connection.execute(asked).scalars())
+    return list(connection.execute(statement).scalars())
 
 
-def take_out(connection: Connection, numbers: Sequence[int]) -> None:
-    """Take frames out: the tiles they touch are to be made anew."""
+def remove_fused(connection: Connection, numbers: Sequence[int]) -> None:
+    """Remove fused frames, and schedule the tiles that they touch for rebuilding."""
     c = surface_touches.c
     own = among(connection, c.frame_number, numbers)
     tiles = list(connection.execute(select(c.tile_number).where(own).distinct()).scalars())
-    for some in blocks(tiles):
-        connection.execute(
-            update(surface_tiles)
-            .where(among(connection, surface_tiles.c.number, some))
-            .values(rebuilt_to=0)
-        )
+    for block in blocks(tiles):
+        touched = among(connection, surface_tiles.c.number, block)
+        connection.execute(update(surface_tiles).where(touched).values(rebuilt_to=0))
     connection.execute(delete(surface_touches).where(own))
-    connection.execute(
-        delete(surface_frames).where(among(connection, surface_frames.c.frame_number, numbers))
-    )
+    fused = among(connection, surface_frames.c.frame_number, numbers)
+    connection.execute(delete(surface_frames).where(fused))
 
 
-# All of it removed.
-
-#: Tiles and frames that are removed in one commit.
+#: Tiles to remove in one commit, and a tenth of the frames.
 _AT_ONCE = 50
 
 
-def remove_some(connection: Connection, map_number: int) -> tuple[list[str], bool]:
-    """Remove some tiles and frames of a surface.
+def remove_block(connection: Connection, map_number: int) -> tuple[list[str], bool]:
+    """Remove a block of tiles and frames of a surface.
 
     Returns
     -------
-    blobs : that are doomed: sweep them when this is committed
+    blobs : doomed blobs; sweep them after the commit
     over : whether nothing is left
     """
     c = surface_tiles.c
-    asked = select(surface_tiles).where(c.map_number == map_number).limit(_AT_ONCE)
-    tiles = [TileRow(**row) for row in connection.execute(asked).mappings()]
+    own = c.map_number == map_number
+    tiles = _tiles(connection, select(surface_tiles).where(own).limit(_AT_ONCE))
     blobs = remove_tiles(connection, tiles)
     doom(connection, blobs)
     if len(tiles) == _AT_ONCE:
         return blobs, False
-    own = surface_frames.c.map_number == map_number
-    numbers = list(
-        connection.execute(
-            select(surface_frames.c.frame_number).where(own).limit(10 * _AT_ONCE)
-        ).scalars()
-    )
-    connection.execute(
-        delete(surface_frames).where(among(connection, surface_frames.c.frame_number, numbers))
-    )
+    f = surface_frames.c
+    statement = select(f.frame_number).where(f.map_number == map_number).limit(10 * _AT_ONCE)
+    numbers = list(connection.execute(statement).scalars())
+    fused = among(connection, f.frame_number, numbers)
+    connection.execute(delete(surface_frames).where(fused))
     return blobs, len(numbers) < 10 * _AT_ONCE
 
 
-# Frames by where they were taken, or what they touch.
+# Frames by their position, or by the tiles that they touch.
 
 
 @dataclass(frozen=True)
 class SightingFrame:
-    """A frame as a list of sightings has it; `square`: of its distance from the spot, metres."""
+    """A frame of a list of sightings; `square` is its squared distance from the spot, square
+    metres.
+    """
 
     number: int
     id: str
@@ -629,15 +595,15 @@ def frames_seeing(
     connection: Connection, surface: SurfaceRow, parent: str, places: Iterable[TilePlace],
     spot: Sequence[float], beyond: tuple[float, int] | None, limit: int,
 ) -> list[SightingFrame]:  # fmt: skip
-    """Frames that touch any of some tiles, the nearest to a spot first.
+    """Return frames that touch any of some tiles, the nearest to a spot first.
 
     Parameters
     ----------
-    surface, parent : whose
-    places : of tiles of the finest level
+    surface, parent : surface and parent frame
+    places : places of tiles of the finest level
     spot : x, y, z, metres
-    beyond : square of the distance, and number, of the last frame before
-    limit : most frames
+    beyond : squared distance and number of the last frame of the previous page
+    limit : maximum number of frames
     """
     tiles = tiles_at(connection, surface.map_number, parent, 0, places)
     touching = select(surface_touches.c.frame_number).where(
@@ -653,7 +619,9 @@ def frames_taken_in(
     connection: Connection, surface: SurfaceRow, parent: str, low: Sequence[float],
     high: Sequence[float], beyond: tuple[float, int] | None, limit: int,
 ) -> list[SightingFrame]:  # fmt: skip
-    """Frames taken in a box, the nearest to its middle first; parameters as of `frames_seeing`."""
+    """Return frames taken in a box, the nearest to its centre first; parameters as in
+    `frames_seeing`.
+    """
     sides = [
         getattr(frames.c, f"pose_{axis}").between(a, b)
         for axis, a, b in zip("xyz", low, high, strict=True)
@@ -670,26 +638,31 @@ def _sightings(
     c = frames.c
     apart = [getattr(c, f"pose_{axis}") - at for axis, at in zip("xyz", spot, strict=True)]
     square = apart[0] * apart[0] + apart[1] * apart[1] + apart[2] * apart[2]
-    asked = _posed(surface.map_number, surface.model_id).with_only_columns(
+    statement = _posed(surface.map_number, surface.model_id).with_only_columns(
         c.number, c.id, c.name, c.intrinsics, c.cloud, c.robot, c.session, c.captured_at, c.pose,
         signatures.c.geometry, square.label("square"),
     ).where(*conditions)  # fmt: skip
     if beyond is not None:
-        asked = asked.where(
+        statement = statement.where(
             or_(square > beyond[0], and_(square == beyond[0], c.number > beyond[1]))
         )
-    found = connection.execute(asked.order_by(square, c.number).limit(limit))
+    rows = connection.execute(statement.order_by(square, c.number).limit(limit))
     return [
         SightingFrame(
             row.number, row.id, row.name, row.cloud is not None, row.robot, row.session,
             row.captured_at, row.pose, row.geometry, row.square,
         )
-        for row in found
+        for row in rows
     ]  # fmt: skip
 
 
 def living_surface(connection: Connection, name: str) -> tuple[MapRow, SurfaceRow | None]:
-    """A map and its surface; None where none was begun, or it was deleted. UnknownMap."""
+    """Return a map and its surface; None if it was never started, or was deleted.
+
+    Raises
+    ------
+    UnknownMap : the map does not exist.
+    """
     row = find_map(connection, name)
     surface = find_surface(connection, row.number)
     return row, surface if surface is not None and surface.wanted else None

@@ -1,8 +1,7 @@
-"""The tables, and what their rows are in Python. `migrations/` makes them; a test holds the two
-together.
+"""The tables and the types of their rows. `create_schema` in `database` creates them.
 
-Times are seconds since 1970. `number` orders rows as they came and is never given out twice;
-`id` is what the outside knows.
+Times are seconds since 1970. `number` is in the order of insertion and never reused; `id` is
+public.
 """
 
 from __future__ import annotations
@@ -44,15 +43,16 @@ from sqlalchemy import (
     literal_column,
     select,
 )
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.types import TypeEngine
 
 from sceneprint.process import current_actor, current_tenant, request_id
 from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.api.frames import Kind
 
-#: Numbers: SQLite's have 64 bits anyway, and only what it calls INTEGER numbers rows there.
+#: Integers of 64 bits. SQLite's always are, and only its type INTEGER can number rows.
 WHOLE = BigInteger().with_variant(Integer, "sqlite")
-#: Texts in the order of their code points, as in SQLite, whatever the server's language is.
+#: Texts that sort by code points, as in SQLite, whatever the server's language.
 TEXT = Text().with_variant(Text(collation="C"), "postgresql")
 
 
@@ -74,7 +74,7 @@ models = Table(
     metadata,
     Column("id", _string(64), primary_key=True),
     Column("name", _string(64), nullable=False),
-    Column("content", LargeBinary, nullable=False),  # the model file: a node needs no other copy
+    Column("content", LargeBinary, nullable=False),  # the model file
     Column("created_at", Float, nullable=False),
 )
 
@@ -85,18 +85,18 @@ maps = Table(
     Column("name", _string(63), nullable=False, unique=True),
     Column("title", _string(200)),
     Column("model_id", _string(64), ForeignKey("models.id"), nullable=False),
-    Column("next_model_id", _string(64)),  # its frames are being signed with this one as well
-    # counts what changes for searching; set on a frame in the commit that indexes or deletes it
+    Column("next_model_id", _string(64)),  # of a re-encoding
+    # number of changes to the searched frames; a frame gets it when it is indexed or deleted
     Column("revision", WHOLE, nullable=False),
     Column("created_at", Float, nullable=False),
-    Column("quota_frames", BigInteger),  # null: as many frames as there is room for
-    Column("quota_bytes", BigInteger),  # of their uploads
-    Column("retention_days", Float),  # after which a frame is deleted; null: never
-    # what it holds: frames that are neither deleted nor redundant, and bytes of their uploads
+    Column("quota_frames", BigInteger),  # null: unlimited
+    Column("quota_bytes", BigInteger),  # of uploads
+    Column("retention_days", Float),  # age at which frames are deleted; null: never
+    # use: frames that are neither deleted nor redundant, and bytes of their uploads
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
     Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: learnt
-    # greatest revision of a deleted frame whose row is gone: who stands before it must begin anew
+    # greatest revision of a removed row: readers behind it must start again
     Column("pruned_revision", WHOLE, nullable=False, server_default="0"),
     sqlite_autoincrement=True,
 )
@@ -105,11 +105,11 @@ frames = Table(
     "frames",
     metadata,
     Column("number", WHOLE, primary_key=True),
-    Column("id", _string(64), nullable=False),  # one that is deleted may give it up to another
+    Column("id", _string(64), nullable=False),  # a deleted frame may lose it to another
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("state", _string(16), nullable=False),
     Column("reason", TEXT),
-    Column("content_id", _string(64)),  # null when deleted: the same frame may come again
+    Column("content_id", _string(64)),  # null when deleted: the content may be uploaded again
     Column("blob", _string(64), nullable=False),
     Column("bytes", WHOLE, nullable=False),
     Column("intrinsics", JSON, nullable=False),  # JSON's null of a cloud
@@ -121,33 +121,33 @@ frames = Table(
     Column("tags", JSON, nullable=False),
     Column("pose_parent", _string(128)),
     Column("pose", JSON(none_as_null=True)),  # T_parent_sensor, 4 rows of 4
-    Column("pose_x", Float),  # its translation, metres, to be searched for
+    Column("pose_x", Float),  # translation of the pose, metres
     Column("pose_y", Float),
     Column("pose_z", Float),
-    # where a join moved the pose: its parent frame and its matrix as they were sent
+    # parent frame and pose as sent, if a join moved the pose
     Column("sent_parent", _string(128)),
     Column("sent_pose", JSON(none_as_null=True)),
     Column("base_frame", _string(128)),
     Column("base", JSON(none_as_null=True)),  # T_base_sensor, 4 rows of 4
-    Column("novelty", Float),  # kept only if the nearest frame is farther, as a share of d0
+    Column("novelty", Float),  # minimum distance from the nearest frame, as a share of d0
     Column("received_at", Float, nullable=False),
     Column("indexed_at", Float),
     Column("revision", WHOLE),
-    Column("cloud", JSON(none_as_null=True)),  # what its points are; null: it is a depth image
+    Column("cloud", JSON(none_as_null=True)),  # description of the points; null: a depth image
     Column("up", JSON(none_as_null=True)),  # unit vector in the sensor's axes
     Column("name", _string(255)),  # of the original file or message; a label, never a path
-    Column("sequence", WHOLE),  # place within the session
-    Column("samples", JSON(none_as_null=True)),  # how far away they are, and whether trusted
-    Column("ended_at", Float),  # when it was deleted, or found redundant
+    Column("sequence", WHOLE),  # position within the session
+    Column("samples", JSON(none_as_null=True)),  # ranges of the samples, and whether trusted
+    Column("ended_at", Float),  # time of the deletion, or when the frame became redundant
     # of a tombstone, a deleted frame that can be restored: the first revision of its deletion
     Column("deletion", WHOLE),
-    Column("deleted_from", _string(16)),  # its state before; null: another frame has its id now
-    Column("deleted_content", _string(64)),  # its content_id before
+    Column("deleted_from", _string(16)),  # state before; null: another frame has the id now
+    Column("deleted_content", _string(64)),  # content_id before
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
     Index(None, "map_number", "number"),
-    Index(  # all that a filter asks about: rows need not be read for it
+    Index(  # covers filters, so that they read no rows
         "ix_frames_searched",
         "map_number",
         "state",
@@ -170,14 +170,14 @@ Index(
     "ix_frames_tombstones", frames.c.map_number, frames.c.deletion, frames.c.number,
     sqlite_where=frames.c.deletion.is_not(None), postgresql_where=frames.c.deletion.is_not(None),
 )  # fmt: skip
-#: The oldest frames of a map that are still there: rows of deleted ones stay for some days.
+#: Existing frames of a map, the oldest first.
 Index(
     "ix_frames_aging", frames.c.map_number, frames.c.received_at,
     sqlite_where=frames.c.state != "deleted", postgresql_where=frames.c.state != "deleted",
 )  # fmt: skip
 
-#: Frames whose rows go in the end. As the index says it: of values that are bound to a statement no
-#: planner knows that they are these.
+#: Condition of frames whose rows are removed in the end. The values are literals, as planners do
+#: not match bound values to a partial index.
 ENDED: ColumnElement[bool] = frames.c.state.in_(
     [literal_column("'deleted'"), literal_column("'redundant'")]
 )
@@ -186,20 +186,22 @@ Index(
     sqlite_where=ENDED, postgresql_where=ENDED,
 )  # fmt: skip
 
-#: Joins of parent frames: poses sent in `parent` are stored in the root that its joins lead to.
+#: Joins of parent frames: poses sent in `parent` are stored in the root where its joins end.
 parent_joins = Table(
     "parent_joins",
     metadata,
     Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
     Column("parent", _string(128), primary_key=True),
-    Column("towards", _string(128), primary_key=True),  # a root then, and joined itself by now
+    Column(
+        "towards", _string(128), primary_key=True
+    ),  # a root when joined, which may be joined itself since
     Column("transform", JSON, nullable=False),  # T_towards_parent, 4 rows of 4
-    Column("job_id", _string(32), nullable=False),  # association that found it
+    Column("job_id", _string(32), nullable=False),  # association that proposed it
     Column("joined_at", Float, nullable=False),
-    Column("undone_at", Float),  # null: it stands, and no other that stands leads from `parent`
+    Column("undone_at", Float),  # null: in effect, the only one of `parent`
 )
 
-#: `frames.tags` once more, a row each, to be searched for.
+#: `frames.tags` as rows, for searches.
 frame_tags = Table(
     "frame_tags",
     metadata,
@@ -227,17 +229,17 @@ jobs = Table(
     Column("number", WHOLE, primary_key=True),
     Column("id", _string(32), nullable=False, unique=True),
     Column("kind", _string(16), nullable=False),
-    Column("frame_number", WHOLE, ForeignKey("frames.number")),  # null: of no single frame
-    Column("map_number", WHOLE, ForeignKey("maps.number")),  # null: of no map
-    Column("model_id", _string(64)),  # to sign with; null: the map's own
-    Column("data", JSON(none_as_null=True)),  # what was asked for, by the kind
-    Column("progress", JSON(none_as_null=True)),  # done, total, and how the next slice goes on
-    Column("result", JSON(none_as_null=True)),  # what came of it, in short
+    Column("frame_number", WHOLE, ForeignKey("frames.number")),  # null: not about a single frame
+    Column("map_number", WHOLE, ForeignKey("maps.number")),  # null: not about a map
+    Column("model_id", _string(64)),  # model to sign with; null: the map's own
+    Column("data", JSON(none_as_null=True)),  # parameters, by kind
+    Column("progress", JSON(none_as_null=True)),  # done, total, and state of the next slice
+    Column("result", JSON(none_as_null=True)),  # summary
     Column("state", _string(16), nullable=False),
     Column("priority", WHOLE, nullable=False),
     Column("attempts", WHOLE, nullable=False),
-    Column("failures", WHOLE, nullable=False),  # of the attempts, those that broke down
-    Column("token", WHOLE, nullable=False),  # fencing: grows with every claim
+    Column("failures", WHOLE, nullable=False),  # failed attempts
+    Column("token", WHOLE, nullable=False),  # fencing token: grows with every claim
     Column("run_after", Float, nullable=False),
     Column("leased_until", Float),
     Column("worker", _string(128)),
@@ -246,8 +248,8 @@ jobs = Table(
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
-    Column("tenant", _string(128), nullable=False, server_default=""),  # who asked; "": nobody
-    Column("turn", WHOLE),  # number of its latest claim: each is greater than those before
+    Column("tenant", _string(128), nullable=False, server_default=""),  # requester; "": none
+    Column("turn", WHOLE),  # number of the latest claim, which increases across all jobs
     Index(None, "state", "run_after"),
     Index(None, "frame_number"),
     Index(None, "map_number", "number"),
@@ -255,13 +257,13 @@ jobs = Table(
     Index(None, "tenant", "turn"),
     sqlite_autoincrement=True,
 )
-#: The order in which the jobs of a tenant are claimed.
+#: Jobs of a tenant in the order of claims.
 Index(
     "ix_jobs_claimed", jobs.c.state, jobs.c.tenant, jobs.c.priority.desc(), jobs.c.attempts,
     jobs.c.number,
 )  # fmt: skip
 
-#: What a long job found, appended slice by slice.
+#: Results of a long job, appended slice by slice.
 job_items = Table(
     "job_items",
     metadata,
@@ -270,7 +272,7 @@ job_items = Table(
     Column("data", JSON, nullable=False),
 )
 
-#: What a job works on, or made.
+#: Inputs and outputs of a job.
 job_files = Table(
     "job_files",
     metadata,
@@ -282,7 +284,7 @@ job_files = Table(
     Index(None, "blob"),
 )
 
-#: Name of the file of an import that is its archive; it counts against the quota of the map.
+#: Name of the uploaded archive of an import; it counts against the quota of the map.
 ARCHIVE = "archive"
 
 keys = Table(
@@ -295,69 +297,62 @@ keys = Table(
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
     Column("tenant", _string(128), nullable=False, server_default=""),
-    # of the secret before the last rotation, which works until then
+    # of the secret before the last rotation, which is valid until `previous_until`
     Column("previous_digest", _string(64), index=True),
     Column("previous_until", Float),
     Column("last_used_at", Float),
     Index(None, "tenant"),
 )
 
-#: Who pays: keys belong to tenants.
+#: Owners of keys, who pay.
 tenants = Table(
     "tenants",
     metadata,
     Column("name", _string(128), primary_key=True),
     Column("created_at", Float, nullable=False),
-    Column("turn", WHOLE, nullable=False, server_default="0"),  # the latest of jobs removed since
+    Column("turn", WHOLE, nullable=False, server_default="0"),  # the latest of removed jobs
 )
 
-events = Table(
-    "events",
-    metadata,
-    Column("number", WHOLE, primary_key=True),
-    Column("at", Float, nullable=False),
-    Column("kind", _string(32), nullable=False),
-    Column("map", _string(63)),
-    Column("frame_id", _string(64)),
-    Column("job_id", _string(32)),
-    Column("data", JSON, nullable=False),
-    Index(None, "map", "number"),
-    sqlite_autoincrement=True,
-)
-#: Where the events of a former map of a name end.
+
+def _event_table(name: str, *indexes: Index) -> Table:
+    return Table(
+        name,
+        metadata,
+        Column("number", WHOLE, primary_key=True),
+        Column("at", Float, nullable=False),
+        Column("kind", _string(32), nullable=False),
+        Column("map", _string(63)),
+        Column("frame_id", _string(64)),
+        Column("job_id", _string(32)),
+        Column("data", JSON, nullable=False),
+        *indexes,
+        sqlite_autoincrement=True,
+    )
+
+
+events = _event_table("events", Index(None, "map", "number"))
+#: Events of writers of single maps on PostgreSQL, which commit in any order: `number_events` moves
+#: them into `events`, with numbers in commit order.
+pending_events = _event_table("pending_events")
+#: Last events of former maps.
 Index(
     "ix_events_map_number_deleted", events.c.map, events.c.number,
     sqlite_where=events.c.kind == "map.deleted", postgresql_where=events.c.kind == "map.deleted",
 )  # fmt: skip
 
-#: Events of writers of single maps of PostgreSQL, which commit in any order: `number_events` moves
-#: them into `events`, with numbers in the order of commits.
-pending_events = Table(
-    "pending_events",
-    metadata,
-    Column("number", WHOLE, primary_key=True),
-    Column("at", Float, nullable=False),
-    Column("kind", _string(32), nullable=False),
-    Column("map", _string(63)),
-    Column("frame_id", _string(64)),
-    Column("job_id", _string(32)),
-    Column("data", JSON, nullable=False),
-    sqlite_autoincrement=True,
-)
-
-#: What was done under an `Idempotency-Key`, for a day.
+#: Results of requests with an `Idempotency-Key`, for a day.
 idempotency = Table(
     "idempotency",
     metadata,
     Column("actor", _string(128), primary_key=True),  # name of the caller's key, or ""
     Column("key", _string(255), primary_key=True),
     Column("fingerprint", _string(64), nullable=False),  # of route and payload
-    Column("data", JSON, nullable=False),  # ids of what was made
+    Column("data", JSON, nullable=False),  # ids of the result
     Column("created_at", Float, nullable=False),
     Index(None, "created_at"),
 )
 
-#: Who changed what, a line for each change; append-only.
+#: Lines of the audit log.
 audit = Table(
     "audit",
     metadata,
@@ -382,21 +377,21 @@ schema_range = Table(
     Column("least_revision", _string(32), primary_key=True),
 )
 
-#: One row: how far stored bytes have been read to see that they are sound.
+#: One row: progress of the scrub, which reads stored bytes to check them.
 scrubs = Table(
     "scrubs",
     metadata,
     Column("number", WHOLE, primary_key=True, autoincrement=False),
-    Column("position", WHOLE, nullable=False),  # number of the last frame that was read
-    Column("next_at", Float, nullable=False),  # when somebody may go on, by the database's clock
+    Column("position", WHOLE, nullable=False),  # number of the last read frame
+    Column("next_at", Float, nullable=False),  # earliest time to continue, by the database's clock
     Column("began_at", Float, nullable=False),  # of this pass
-    Column("finished_at", Float),  # the last whole pass; null: there was none
-    Column("blobs", BigInteger, nullable=False),  # these and the next: of this pass, or the last
+    Column("finished_at", Float),  # of the last whole pass; null: there was none
+    Column("blobs", BigInteger, nullable=False),  # counts of this pass, or the last
     Column("bytes", BigInteger, nullable=False),
     Column("damaged", BigInteger, nullable=False),
 )
 
-#: Figures of processes, a few times a minute, for an hour or two.
+#: Counts of processes, a few times a minute, for two hours.
 samples = Table(
     "samples",
     metadata,
@@ -409,7 +404,7 @@ samples = Table(
     sqlite_autoincrement=True,
 )
 
-#: Names of maps that are gone: the last event of each, and the quota that the next one inherits.
+#: Former maps: last event, and quota for the next map with the name.
 former_maps = Table(
     "former_maps",
     metadata,
@@ -420,18 +415,18 @@ former_maps = Table(
     Index(None, "number"),
 )
 
-#: Queries and their outcomes, for some time, and their answers while there is room.
+#: Queries and their outcomes for some time, and their answers while there is room.
 queries = Table(
     "queries",
     metadata,
     Column("number", WHOLE, primary_key=True),
     Column("id", _string(32), nullable=False, unique=True),  # of the answer
-    Column("at", Float, nullable=False),  # when the query came
+    Column("at", Float, nullable=False),  # arrival of the query
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
-    Column("maps", JSON(none_as_null=True)),  # names of all maps searched; null: this one alone
+    Column("maps", JSON(none_as_null=True)),  # names of all searched maps; null: only this one
     Column("robot", _string(128)),
     Column("session", _string(128)),
-    Column("key_id", _string(32)),  # of the key that the request came with
+    Column("key_id", _string(32)),  # key of the request
     Column("status", _string(16), nullable=False),
     Column("cause", _string(64)),
     Column("reason", TEXT, nullable=False),
@@ -444,8 +439,8 @@ queries = Table(
     Column("kind", _string(8)),
     Column("frame_map", _string(63)),  # the stored frame that was the query
     Column("frame_id", _string(64)),
-    Column("listed", Boolean, nullable=False),  # false: stored only to look at its answer
-    Column("kept_at", Float),  # since when the answer is kept; null: it expires
+    Column("listed", Boolean, nullable=False),  # false: stored only to view its answer
+    Column("kept_at", Float),  # time since which the answer is kept; null: it expires
     Column("title", _string(200)),  # of a kept answer
     Column("shown", JSON(none_as_null=True)),  # numbers of the frames that the answer shows
     Column("bytes", BigInteger, nullable=False),  # of the answer; 0: it is not stored
@@ -467,27 +462,29 @@ Index(
     postgresql_where=literal_column("kept_at IS NOT NULL"),
 )  # fmt: skip
 
-#: The fused surface of a map: where its making stands.
+#: The fused surface of a map, and its progress.
 surfaces = Table(
     "surfaces",
     metadata,
     Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
-    Column("model_id", _string(64), nullable=False),  # whose artifacts are fused
+    Column("model_id", _string(64), nullable=False),  # model of the fused artifacts
     Column("cell_m", Float, nullable=False),  # of the finest level
-    Column("wanted", Boolean, nullable=False),  # false: it was deleted, and nobody asked again
-    Column("job_number", WHOLE),  # of its latest job, which may have been removed since
-    # revision and edits of the map up to which nothing is left to do
+    Column("wanted", Boolean, nullable=False),  # false: it was deleted
+    Column("job_number", WHOLE),  # latest job, which may have been removed since
+    # revision and edits of the map that the surface includes
     Column("revision", WHOLE, nullable=False),
     Column("edits", WHOLE, nullable=False),
-    Column("pose_edits", WHOLE, nullable=False),  # counts edits of what is fused
-    # of times in the tiles that are given out; `scale` counts how often it was changed
+    Column("pose_edits", WHOLE, nullable=False),  # number of edits of fused frames
+    # scale of times in published tiles; `scale` counts its changes
     Column("scale", WHOLE, nullable=False),
     Column("taken_from", Float),
     Column("taken_step_s", Float, nullable=False),
     Column("first_taken", Float),
     Column("last_taken", Float),
     Column("sessions", JSON, nullable=False),
-    Column("parents", JSON, nullable=False),  # those of most frames: name, frames, up, axes
+    Column(
+        "parents", JSON, nullable=False
+    ),  # parent frames with the most frames: name, frames, up, axes
     Column("updated_at", Float),
 )
 
@@ -504,9 +501,9 @@ surface_tiles = Table(
     Column("tile_z", WHOLE, nullable=False),
     Column("cells", WHOLE, nullable=False),
     Column("blob", _string(64)),  # sums of the finest level, cells of the others; null: none yet
-    Column("digest", _string(64), nullable=False),  # of the cells, as the outside knows them
-    Column("scale", WHOLE, nullable=False),  # by which its times are told
-    # of a tile that is made anew: the last frame in `draft`, 0 at first; null: it is up to date
+    Column("digest", _string(64), nullable=False),  # of the published cells
+    Column("scale", WHOLE, nullable=False),  # scale of its times
+    # of a tile under reconstruction: the last frame in `draft`, 0 at first; null: it is up to date
     Column("rebuilt_to", WHOLE),
     Column("draft", _string(64)),
     Column("low_x", Float, nullable=False),  # box of its cells, metres
@@ -525,18 +522,18 @@ surface_tiles = Table(
     sqlite_autoincrement=True,
 )
 
-#: Frames that are fused.
+#: Fused frames.
 surface_frames = Table(
     "surface_frames",
     metadata,
     Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("parent", _string(128), nullable=False),
-    Column("changed", Boolean, nullable=False),  # edited since: to be taken out, and fused anew
+    Column("changed", Boolean, nullable=False),  # edited since: must be removed, and fused again
     Index(None, "map_number", "parent", "changed"),
 )
 
-#: Which tiles of the finest level they are fused into.
+#: Tiles of the finest level that contain fused frames.
 surface_touches = Table(
     "surface_touches",
     metadata,
@@ -545,7 +542,7 @@ surface_touches = Table(
     Index(None, "frame_number"),
 )
 
-#: Blobs of what was deleted, until somebody has seen that they are removed.
+#: Blobs of deleted rows, until they have been removed.
 doomed = Table(
     "doomed",
     metadata,
@@ -553,7 +550,7 @@ doomed = Table(
     Column("at", Float, nullable=False),
 )
 
-#: Made with the database, and never told: see `opaque_ids`.
+#: Secrets of the database, which never leave it: see `opaque_ids`.
 secrets = Table(
     "secrets",
     metadata,
@@ -562,19 +559,19 @@ secrets = Table(
 )
 
 
-# Asking for rows: how many there are, and those of many numbers.
+# Statements: counts, and rows of many numbers.
 
-#: Numbers in one list: SQLite takes 32,766 values.
+#: Maximum length of a list of numbers: SQLite allows 32,766 parameters.
 MOST_ROWS = 10_000
 
 
 def count_rows(connection: Connection, *conditions: ColumnElement[bool]) -> int:
-    """How many rows of a table meet some conditions."""
+    """Return the number of rows that meet some conditions."""
     return int(connection.execute(select(func.count()).where(*conditions)).scalar_one())
 
 
 def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
-    """The numbers, at most `MOST_ROWS` at a time; no list where there are none."""
+    """Yield the numbers in lists of at most `MOST_ROWS`."""
     left = iter(numbers)
     while block := list(islice(left, MOST_ROWS)):
         yield block
@@ -583,9 +580,9 @@ def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
 def among(
     connection: Connection, column: Column[int], numbers: Sequence[int]
 ) -> ColumnElement[bool]:
-    """That a number is one of a block; for PostgreSQL they are one value, however many they are.
+    """Return the condition that a column is one of some numbers.
 
-    As 10,000 values of a statement they would take ten times as long to be read.
+    PostgreSQL gets them as one array: 10,000 parameters would take ten times as long.
     """
     if connection.dialect.name == "postgresql":
         return column == any_(literal(list(numbers), ARRAY(BigInteger)))
@@ -593,38 +590,40 @@ def among(
 
 
 def rows_among(
-    connection: Connection, asked: Select[Any], column: Column[int], numbers: Iterable[int]
+    connection: Connection, statement: Select[Any], column: Column[int], numbers: Iterable[int]
 ) -> Iterator[Any]:
-    """Rows that a statement finds where a column is one of some numbers, however many."""
-    for some in blocks(numbers):
-        yield from connection.execute(asked.where(among(connection, column, some)))
+    """Yield the rows of a statement whose column is one of some numbers, however many."""
+    for block in blocks(numbers):
+        yield from connection.execute(statement.where(among(connection, column, block)))
 
 
 def rows_of_statement(
     connection: Connection, statement: Callable[[str], Select[Any]], numbers: Iterable[int],
     **values: object,
 ) -> Iterator[Any]:  # fmt: skip
-    """As `rows_among`, by a statement that is built once.
+    """Yield the rows of a cached statement; see `rows_among`.
 
     Parameters
     ----------
-    statement : makes it for a dialect, with `among_numbers`, and returns the same one each time
-    numbers : however many
-    values : its other parameters
+    statement : function that returns the cached statement of a dialect, with `among_numbers`
+    numbers : numbers, however many
+    values : other parameters of the statement
     """
-    asked = statement(connection.dialect.name)
-    for some in blocks(numbers):
-        yield from connection.execute(asked, {"numbers": some, **values})
+    cached = statement(connection.dialect.name)
+    for block in blocks(numbers):
+        yield from connection.execute(cached, {"numbers": block, **values})
 
 
 def among_numbers(dialect: str, column: Column[int]) -> ColumnElement[bool]:
-    """As `among`, for the parameter `numbers` of a statement that is executed more than once."""
+    """Return the condition of `among` for the parameter `numbers` of a cached statement."""
     if dialect == "postgresql":
         return column == any_(bindparam("numbers", type_=ARRAY(BigInteger)))
     return column.in_(bindparam("numbers", expanding=True))
 
 
-# Rows as the rest of the package sees them.
+def dialect_insert(connection: Connection, table: Table) -> Any:
+    """Return an INSERT of the database's dialect, which can resolve conflicts."""
+    return (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(table)
 
 
 @dataclass(frozen=True)
@@ -691,7 +690,7 @@ class FrameRow:
 
     @property
     def kind(self) -> Kind:
-        """A depth image or a point cloud."""
+        """Whether the frame is a depth image or a point cloud."""
         return "depth" if self.cloud is None else "cloud"
 
 
@@ -726,26 +725,26 @@ class JobRow:
 
     @property
     def frame(self) -> int:
-        """Number of the frame that a job of a single frame is about."""
+        """Number of the frame of a job about a single frame."""
         if self.frame_number is None:
-            raise ValueError(f"job {self.id} of kind {self.kind} is of no single frame")
+            raise ValueError(f"job {self.id} of kind {self.kind} is not about a single frame")
         return self.frame_number
 
 
 def map_row(row: RowMapping) -> MapRow:
-    """A row of the table `maps`."""
+    """Return a row of the table `maps`."""
     return MapRow(**row)
 
 
 def frame_row(row: RowMapping) -> FrameRow:
-    """A row of the table `frames`."""
+    """Return a row of the table `frames`."""
     return FrameRow(**{**row, "state": FrameState(row["state"])})
 
 
-def frame_rows(found: Iterable[Row[Any]]) -> list[FrameRow]:
-    """Rows of `FRAME_COLUMNS`; by their places, which costs a third of `frame_row`."""
+def frame_rows(selected: Iterable[Row[Any]]) -> list[FrameRow]:
+    """Return rows of `FRAME_COLUMNS`, by position, which costs a third of `frame_row`."""
     rows = []
-    for row in found:
+    for row in selected:
         values = list(row)
         values[_FRAME_STATE] = FrameState(values[_FRAME_STATE])
         rows.append(FrameRow(*values))
@@ -753,12 +752,12 @@ def frame_rows(found: Iterable[Row[Any]]) -> list[FrameRow]:
 
 
 def job_row(row: RowMapping) -> JobRow:
-    """A row of the table `jobs`."""
+    """Return a row of the table `jobs`."""
     return JobRow(**{**row, "state": JobState(row["state"])})
 
 
 def job_of_columns(row: Sequence[Any]) -> JobRow:
-    """A row that begins with `JOB_COLUMNS`."""
+    """Return a job from a row that begins with `JOB_COLUMNS`."""
     values = list(row[: len(JOB_COLUMNS)])
     values[_JOB_STATE] = JobState(values[_JOB_STATE])
     return JobRow(*values)
@@ -772,19 +771,16 @@ _FRAME_STATE = [column.name for column in FRAME_COLUMNS].index("state")
 _JOB_STATE = [column.name for column in JOB_COLUMNS].index("state")
 
 
-# The clock by which leases end and jobs are due: of the database, as those of its hosts differ.
-#
-# A SQLite file has one host, and so one clock.
+# The clock of leases and jobs is that of the database, as the clocks of hosts differ. A SQLite file
+# has one host.
 
-
-#: Seconds since 1970 at a statement of PostgreSQL: the transaction may have waited for its turn
-#: since it began. Not clock_timestamp(), which is another time for each row, so that no index would
-#: be used.
+#: Start of a PostgreSQL statement, seconds since 1970: the transaction may have waited for its turn
+#: since it began, and clock_timestamp() differs by row, so that no index could be used.
 STATEMENT_TIME: ColumnElement[float] = cast(extract("epoch", func.statement_timestamp()), Float(53))
 
 
 def now(connection: Connection) -> ColumnElement[float]:
-    """The time of the statement it is part of, seconds since 1970."""
+    """Return the time of a statement, seconds since 1970."""
     if connection.dialect.name == "sqlite":
         return literal(time.time())
     return STATEMENT_TIME
@@ -794,19 +790,18 @@ def job_values(
     connection: Connection, kind: str, priority: int, model_id: str | None = None,
     data: dict[str, Any] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Columns of a job that is queued now, but for what it is about: see `enqueue`."""
-    made = now(connection)
-    if data is None:
-        data = request_data()
+    """Return the columns of a job that is queued now, except its subject: see `enqueue`."""
+    at = now(connection)
     return {
-        "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id, "data": data,
-        "state": JobState.QUEUED, "priority": priority, "attempts": 0, "failures": 0, "token": 0,
-        "run_after": made, "created_at": made, "tenant": current_tenant(),
+        "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id,
+        "data": request_data() if data is None else data, "state": JobState.QUEUED,
+        "priority": priority, "attempts": 0, "failures": 0, "token": 0, "run_after": at,
+        "created_at": at, "tenant": current_tenant(),
     }  # fmt: skip
 
 
 def request_data() -> dict[str, Any] | None:
-    """Return what a job keeps of the request that queues it; None outside of one."""
+    """Return the data of a job from the request that queues it; None outside a request."""
     if request_id() is None:
         return None
     return {"request_id": request_id()}  # the worker's log lines name it
@@ -815,9 +810,9 @@ def request_data() -> dict[str, Any] | None:
 def audit_values(
     action: str, map_name: str | None, target: str | None, data: dict[str, Any]
 ) -> dict[str, Any] | None:
-    """Return the columns of a line of the audit log for a change by the current actor.
+    """Return the columns of an audit line for a change by the current actor.
 
-    None of a worker: what it carries out has a line from when it was requested.
+    None for a worker: a line records the request that it carries out.
     """
     actor = current_actor()
     if actor is None:
@@ -832,7 +827,7 @@ def audit_values(
 def event_values(
     kind: str, map_name: str | None, frame_id: str | None, job_id: str | None, data: dict[str, Any]
 ) -> dict[str, Any]:
-    """Columns of an event that happens now."""
+    """Return the columns of an event that happens now."""
     return {
         "at": time.time(), "kind": kind, "map": map_name, "frame_id": frame_id, "job_id": job_id,
         "data": data,

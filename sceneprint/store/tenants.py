@@ -1,4 +1,4 @@
-"""Tenants: who pays. Keys belong to tenants, and so do the jobs that are queued with them."""
+"""Tenants, who pay. Keys belong to tenants, and so do the jobs that are queued with these keys."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from sqlalchemy import Connection, delete, func, insert, select, update
 from sceneprint.errors import Conflict, UnknownTenant
 from sceneprint.store.tables import jobs, keys, tenants
 
-# The table.
-
 
 @dataclass(frozen=True)
 class TenantRow:
@@ -19,9 +17,9 @@ class TenantRow:
 
     Parameters
     ----------
-    name : unique
+    name : unique name
     created_at : seconds since 1970
-    keys : how many it has
+    keys : number of keys
     """
 
     name: str
@@ -30,34 +28,34 @@ class TenantRow:
 
 
 def list_tenants(connection: Connection) -> list[TenantRow]:
-    """All tenants by name."""
+    """Return all tenants, sorted by name."""
     held = (
         select(func.count()).where(keys.c.tenant == tenants.c.name).scalar_subquery().label("keys")
     )
-    asked = select(tenants.c.name, tenants.c.created_at, held).order_by(tenants.c.name)
-    return [TenantRow(*row) for row in connection.execute(asked)]
+    statement = select(tenants.c.name, tenants.c.created_at, held).order_by(tenants.c.name)
+    return [TenantRow(*row) for row in connection.execute(statement)]
 
 
 def has_tenant(connection: Connection, name: str) -> bool:
-    """Whether there is a tenant of that name."""
-    asked = select(tenants.c.name).where(tenants.c.name == name)
-    return connection.execute(asked).first() is not None
+    """Return whether a tenant exists."""
+    statement = select(tenants.c.name).where(tenants.c.name == name)
+    return connection.execute(statement).first() is not None
 
 
 def create_tenant(connection: Connection, name: str) -> None:
-    """Create a tenant without keys; Conflict where there is one of that name."""
+    """Create a tenant without keys; raise Conflict if the name is in use."""
     if has_tenant(connection, name):
         raise Conflict(f"There is a tenant named {name!r:.80}. Choose another name.")
     connection.execute(insert(tenants).values(name=name, created_at=time.time()))
 
 
 def delete_tenant(connection: Connection, name: str) -> None:
-    """Delete a tenant that has no key; its jobs that wait keep their turn.
+    """Delete a tenant without keys; its queued jobs keep their place.
 
     Raises
     ------
-    UnknownTenant : there is none of that name.
-    Conflict : it has a key.
+    UnknownTenant : the tenant does not exist.
+    Conflict : the tenant has a key.
     """
     if not has_tenant(connection, name):
         raise unknown_tenant(name)
@@ -70,11 +68,11 @@ def delete_tenant(connection: Connection, name: str) -> None:
 
 
 def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> str:
-    """The tenant of a new key: the one that is named, or one of the key's own name.
+    """Return the tenant of a new key: the named one, or one with the key's own name.
 
     Raises
     ------
-    UnknownTenant : there is none of the name that was given.
+    UnknownTenant : the named tenant does not exist.
     """
     if tenant is not None:
         if not has_tenant(connection, tenant):
@@ -86,24 +84,24 @@ def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> st
 
 
 def leave_tenant(connection: Connection, key_name: str, tenant: str) -> None:
-    """Delete the tenant that came with a revoked key, unless another key has it."""
+    """Delete the tenant that was created with a revoked key, if it has no other key."""
     if tenant == key_name and _first_key(connection, tenant) is None:
         delete_tenant(connection, tenant)
 
 
 def unknown_tenant(name: str) -> UnknownTenant:
-    """That there is no tenant of a name."""
+    """Return the error for a tenant that does not exist."""
     return UnknownTenant(
         f"There is no tenant named {name!r:.80}. Create it with `sceneprint keys --create-tenant "
         "NAME`; list them with `sceneprint keys --list-tenants`."
     )
 
 
-def keep_turns(connection: Connection, *names: str) -> None:
-    """Keep the latest turns of some tenants at the workers, or of all where none is named; call it
-    before jobs are removed.
+def save_turns(connection: Connection, *names: str) -> None:
+    """Store the latest turns of some tenants, or of all, in the table of tenants.
 
-    Else whoever deletes its maps again and again would always come first.
+    Call this before jobs are removed: otherwise a tenant that deletes its maps would always be
+    served first.
     """
     last = (
         select(func.max(jobs.c.turn))
@@ -111,10 +109,9 @@ def keep_turns(connection: Connection, *names: str) -> None:
         .correlate(tenants)
         .scalar_subquery()
     )
-    which = [tenants.c.name.in_(names)] if names else []
-    connection.execute(update(tenants).where(tenants.c.turn < last, *which).values(turn=last))
+    named = [tenants.c.name.in_(names)] if names else []
+    connection.execute(update(tenants).where(tenants.c.turn < last, *named).values(turn=last))
 
 
 def _first_key(connection: Connection, tenant: str) -> str | None:
-    asked = select(keys.c.name).where(keys.c.tenant == tenant).limit(1)
-    return connection.execute(asked).scalar()
+    return connection.execute(select(keys.c.name).where(keys.c.tenant == tenant).limit(1)).scalar()

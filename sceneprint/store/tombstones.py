@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from sqlalchemy import ColumnElement, Connection, exists, func, select, update
 
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import count_on, next_revision, require_room
+from sceneprint.store.maps import add_usage, next_revision, require_room
 from sceneprint.store.queue import enqueue
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames, now, signatures
 from sceneprint_client.api import FrameState
@@ -23,13 +23,13 @@ _SEARCHED = (FrameState.INDEXED, FrameState.RECEIVED, FrameState.SIGNING)
 
 @dataclass(frozen=True)
 class Deletion:
-    """Frames of a map that were deleted by one call, as far as they can be restored.
+    """The restorable frames of a map that one call deleted.
 
     Parameters
     ----------
-    number : revision of the map at which it began
-    at : when it began, seconds since 1970, by the clock of the database
-    frames : how many can be restored
+    number : revision of the map at which the deletion began
+    at : start of the deletion, seconds since 1970, by the clock of the database
+    frames : number of restorable frames
     """
 
     number: int
@@ -40,7 +40,7 @@ class Deletion:
 def _restorable(
     connection: Connection, map_number: int, seconds: float
 ) -> list[ColumnElement[bool]]:
-    """Conditions of the tombstones of a map that can be restored for so long."""
+    """Return the conditions of the tombstones that can be restored for so many seconds."""
     c = frames.c
     return [
         c.map_number == map_number, c.deletion.is_not(None), c.deleted_from.is_not(None),
@@ -51,13 +51,13 @@ def _restorable(
 def list_deletions(
     connection: Connection, map_number: int, seconds: float, limit: int, before: int | None = None
 ) -> list[Deletion]:
-    """Return deletions of a map that can be undone, the newest first.
+    """Return the deletions of a map that can be undone, the newest first.
 
     Parameters
     ----------
-    seconds : for which deleted frames can be restored
+    seconds : period after a deletion in which frames can be restored
     limit : maximum number
-    before : number of the deletion that the page before ended with
+    before : number of the last deletion of the previous page
     """
     c = frames.c
     statement = select(c.deletion, func.min(c.ended_at), func.count()).where(
@@ -65,41 +65,41 @@ def list_deletions(
     )
     if before is not None:
         statement = statement.where(c.deletion < before)
-    found = statement.group_by(c.deletion).order_by(c.deletion.desc()).limit(limit)
-    return [Deletion(*row) for row in connection.execute(found)]
+    groups = statement.group_by(c.deletion).order_by(c.deletion.desc()).limit(limit)
+    return [Deletion(*row) for row in connection.execute(groups)]
 
 
 def find_deletion(
     connection: Connection, map_number: int, seconds: float, number: int
 ) -> Deletion | None:
-    """Return the deletion of a number if it can be undone; parameters as of `list_deletions`."""
-    found = list_deletions(connection, map_number, seconds, 1, number + 1)
-    return next((one for one in found if one.number == number), None)
+    """Return a deletion if it can be undone; parameters as in `list_deletions`."""
+    deletions = list_deletions(connection, map_number, seconds, 1, number + 1)
+    return next((one for one in deletions if one.number == number), None)
 
 
 def tombstones_of(
     connection: Connection, map_number: int, seconds: float, deletion: int, after: int, limit: int
 ) -> list[FrameRow]:
-    """Return the tombstones of a deletion that can be restored, in the order they came.
+    """Return the restorable tombstones of a deletion, in the order in which they were received.
 
     Parameters
     ----------
     connection, map_number, seconds, limit : see `list_deletions`
     deletion : number of the deletion
-    after : number of the last frame before
+    after : number of the last frame of the previous page
     """
     statement = select(frames).where(
         *_restorable(connection, map_number, seconds), frames.c.deletion == deletion,
         frames.c.number > after,
     )  # fmt: skip
-    found = connection.execute(statement.order_by(frames.c.number).limit(limit)).mappings()
-    return [frame_row(one) for one in found]
+    rows = connection.execute(statement.order_by(frames.c.number).limit(limit)).mappings()
+    return [frame_row(row) for row in rows]
 
 
 def find_tombstone(
     connection: Connection, map_number: int, seconds: float, frame_id: str
 ) -> FrameRow | None:
-    """Return the tombstone of an id if it can be restored; see `list_deletions`."""
+    """Return the tombstone with an id if it can be restored; see `list_deletions`."""
     own = _restorable(connection, map_number, seconds)
     statement = select(frames).where(*own, frames.c.id == frame_id)
     row = connection.execute(statement).mappings().first()
@@ -107,7 +107,7 @@ def find_tombstone(
 
 
 def successor_of(connection: Connection, frame: FrameRow) -> str | None:
-    """Return the id of a frame with the same content that came after a tombstone's deletion."""
+    """Return the id of a frame with the same content that was received after the deletion."""
     c = frames.c
     statement = select(c.id).where(
         c.map_number == frame.map_number, c.content_id == frame.deleted_content,
@@ -117,19 +117,19 @@ def successor_of(connection: Connection, frame: FrameRow) -> str | None:
 
 
 def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
-    """Make a tombstone the frame that it was; it is signed only if its map has another model now.
+    """Turn a tombstone back into its frame; it is signed only if the map's model has changed.
 
     Parameters
     ----------
-    connection : of a writing transaction of the map
-    frame : a tombstone whose content has not come again
+    connection : writing transaction of the map
+    frame : tombstone whose content was not uploaded again
 
     Raises
     ------
     QuotaExceeded : the map may hold no more frames.
     """
     require_room(connection, row, 0)
-    count_on(connection, row.number, 1, 0)
+    add_usage(connection, row.number, 1, 0)
     values: dict[str, object] = {
         "state": frame.deleted_from, "content_id": frame.deleted_content, "ended_at": None,
         "deletion": None, "deleted_from": None, "deleted_content": None,
@@ -145,6 +145,6 @@ def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
             job = enqueue(connection, "sign", frame.number)
             values |= {"state": FrameState.RECEIVED, "reason": None, "indexed_at": None}
             if frame.deleted_from == FrameState.INDEXED:
-                values["novelty"] = None  # the map has accepted it before
+                values["novelty"] = None  # the map has accepted the frame before
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**values))
     record_event(connection, "frame.restored", row.name, frame.id, None if job is None else job.id)

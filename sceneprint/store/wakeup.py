@@ -1,9 +1,8 @@
-"""The bell: who commits a job wakes the workers that wait, as SQLite tells nobody (PostgreSQL
-does: NOTIFY rings it there, and who waits has asked to LISTEN).
+"""Wake waiting workers when a job is committed: through FIFOs beside SQLite, NOTIFY on PostgreSQL.
 
-Every waiting worker makes a FIFO in a folder, and who rings writes one byte to each. It is a hint
-and never the truth: where none can be made, or the other is on another machine, workers look
-again after a while. So nothing here raises, and no upload fails for it.
+Each waiting worker creates a FIFO in a folder, and a ring writes one byte to each. Rings are only
+hints: workers also poll, as a FIFO may be impossible, or the other process on another machine. So
+nothing here raises errors, and no upload fails for it.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ import stat
 import threading
 import time
 import uuid
-from contextlib import AbstractContextManager, closing, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -30,72 +30,73 @@ if TYPE_CHECKING:
     import psycopg
 
 
-#: Seconds after which a FIFO that nobody reads is removed, and between two signs of life.
+#: Seconds after which an abandoned FIFO is removed, and interval at which a FIFO in use is touched.
 STALE_S, ALIVE_S = 300.0, 60.0
-#: Longest wait of a worker that has no FIFO, seconds.
+#: Longest wait of a worker without a FIFO, seconds.
 DEAF_S = 0.25
-#: Longest wait that the system knows of, milliseconds.
+#: Longest timeout of poll(2), milliseconds.
 MOST_MS = 2**31 - 1
-#: Characters of a host's name that its processes are called by, the last ones: a server cuts
-#: names of connections, and clouds name hosts alike at their beginning.
+#: Number of last characters of the host in a process's name: servers cut names of connections, and
+#: hosts in clouds often differ only at the end.
 HOST = 44
 
 
 class Listening(Protocol):
-    """Who has asked to be woken."""
+    """A process that waits for rings."""
 
     def wait(self, timeout_s: float, *others: int) -> bool:
-        """Until it rings, one of other descriptors is readable, or the time is over.
+        """Wait for a ring, for one of other descriptors to be readable, or for the timeout.
 
         Returns
         -------
-        whether it rang, or may have rung while it could not be heard
+        rung : whether it rang, or may have rung while this was disconnected
         """
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
 
 
 def process_name() -> str:
-    """What this process is called among those of all hosts: `host:pid`."""
+    """Return the name of this process among those of all hosts: `host:pid`."""
     return f"{socket.gethostname()[-HOST:]}:{os.getpid()}"
 
 
 def wait_for(timeout_s: float, *descriptors: int) -> set[int]:
-    """Those of some descriptors that are readable, waited for so long; negative ones are none."""
+    """Return the descriptors that are readable within the timeout; negative ones are ignored."""
     waiting = select.poll()
     for descriptor in descriptors:
         if descriptor >= 0:
             waiting.register(descriptor, select.POLLIN)
-    return {one for one, _ in waiting.poll(min(max(1e3 * timeout_s, 0.0), MOST_MS))}
+    events = waiting.poll(min(max(1e3 * timeout_s, 0.0), MOST_MS))
+    return {descriptor for descriptor, _ in events}
 
 
 class Wakeup:
-    """A folder of FIFOs.
+    """Wake workers of this machine through a folder of FIFOs.
 
     Parameters
     ----------
-    folder : made by the first who listens
+    folder : folder that the first listener creates
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def ring(self) -> None:
-        """Wake who waits; after the commit, so that they find what they are woken for."""
+        """Wake waiting workers; call it after the commit, so that they see the change."""
         try:
             names = os.listdir(self._folder)  # noqa: PTH208  (a path for each would cost)
         except OSError:
-            return  # nobody has ever listened
+            return  # no process has ever listened
         for name in names:
             self._ring(self._folder / name)
 
     def listeners(self, _connection: Connection | None = None) -> list[str]:
-        """Host and process id, as `host:pid`, of every process of this machine that listens.
+        """Return `host:pid` of every listening process of this machine.
 
         Parameters
         ----------
-        _connection : of the database, where there is one at hand: a server knows who listens
+        _connection : connection to the database, which PostgreSQL's subclass uses
         """
         try:
             names = sorted(os.listdir(self._folder))  # noqa: PTH208
@@ -105,41 +106,41 @@ class Wakeup:
         return [":".join(name.rsplit("-", 2)[:2]) for name in read]
 
     def listen(self) -> AbstractContextManager[Listening]:
-        """Be woken from now on; what is rung before the wait begins ends it at once."""
+        """Listen for rings; one that arrives before the wait ends the wait at once."""
         return closing(Listener(self._folder))
 
     def close(self) -> None:
-        """Ring no more."""
+        """Stop ringing."""
 
     def _is_read(self, path: Path) -> bool:
-        """Whether somebody has a FIFO open: one that was left behind cannot be written to."""
-        try:
-            opened = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
-        except OSError:
-            return False
-        try:
-            return stat.S_ISFIFO(os.fstat(opened).st_mode)
-        finally:
-            os.close(opened)
+        """Return whether a process has a FIFO open for reading: else opening it fails."""
+        with suppress(OSError), _opened(path) as descriptor:
+            return stat.S_ISFIFO(os.fstat(descriptor).st_mode)
+        return False
 
     def _ring(self, path: Path) -> None:
         try:
-            opened = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
-        except OSError:  # nobody reads it: just made, or left behind by the dead
+            with _opened(path) as descriptor:
+                if stat.S_ISFIFO(os.fstat(descriptor).st_mode):
+                    with suppress(OSError):  # full: its reader is about to wake
+                        os.write(descriptor, b"!")
+        except OSError:  # no reader: the FIFO is new, or its process died
             with suppress(OSError):
                 if path.is_fifo() and time.time() - path.stat().st_mtime > STALE_S:
                     path.unlink()
-            return
-        try:
-            if stat.S_ISFIFO(os.fstat(opened).st_mode):
-                with suppress(OSError):  # full: it is awake, or about to be
-                    os.write(opened, b"!")
-        finally:
-            os.close(opened)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 class Listener:
-    """One FIFO, open; made by `Wakeup.listen`."""
+    """An open FIFO; see `Wakeup.listen`."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / f"{process_name().replace(':', '-')}-{uuid.uuid4().hex[:8]}"
@@ -157,11 +158,11 @@ class Listener:
                 while os.read(self._fifo, 4096):
                     pass
         if time.monotonic() - self._alive > ALIVE_S:
-            self._stay()
+            self._refresh()
         return rung
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         with suppress(OSError):
             self._path.unlink()
         if self._fifo >= 0:
@@ -173,13 +174,13 @@ class Listener:
         try:
             make_folder(self._path.parent)
             os.mkfifo(self._path, 0o600)
-            # to write as well: without a writer it would be at its end, and always readable
+            # opened for writing as well: without a writer it would be at its end, thus readable
             self._fifo = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
         except OSError:
             self._fifo = -1
 
-    def _stay(self) -> None:
-        """Show that the FIFO is not left behind; one that was removed is made anew."""
+    def _refresh(self) -> None:
+        """Show that the FIFO is in use; create it again if it was removed."""
         self._alive = time.monotonic()
         try:
             os.utime(self._path)
@@ -188,25 +189,24 @@ class Listener:
             self._open()
 
 
-# The bell of a database that has many hosts. As with FIFOs, this is a hint and never the truth:
-# where the server is away, or a pooler in between forgets who listens, workers look again later.
+# Rings through PostgreSQL, for several hosts. They are hints as well: if the server is away, or a
+# pooler drops listeners, workers poll.
 
 log = logging.getLogger(__name__)
 
 CHANNEL = "sceneprint"
-#: What connections that listen are called, before the name of their process: others are called
-#: `sceneprint` alone.
+#: Prefix of the names of listening connections, before the name of the process.
 LISTENS = "sceneprint "
-#: Seconds between two rings: of a crowd of uploads one is enough.
+#: Seconds between two rings, as one is enough for many uploads.
 REST_S = 0.02
-#: Seconds that closing waits for a ring under way: to a server that does not answer it takes long.
+#: Seconds that closing waits for a ring in progress: the server may not answer.
 CLOSING_S = 2.0
-#: Seconds after which who could not connect tries again.
+#: Seconds between two attempts to connect.
 AGAIN_S = 2.0
 
 
 class Notices(Wakeup):
-    """The bell of a PostgreSQL database."""
+    """Wake workers of all hosts through NOTIFY and LISTEN of PostgreSQL."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -215,31 +215,33 @@ class Notices(Wakeup):
         self._ringer: threading.Thread | None = None
 
     def ring(self) -> None:
-        """Wake who waits, on every host; this thread waits for nothing."""
+        """Wake waiting workers on every host, from another thread."""
         with self._lock:
             if self._ringer is None and not self._closed:
-                self._ringer = threading.Thread(target=self._keep_ringing, name="bell", daemon=True)
+                self._ringer = threading.Thread(
+                    target=self._keep_ringing, name="wakeup", daemon=True
+                )
                 self._ringer.start()
         self._rung.set()
 
     def listeners(self, connection: Connection | None = None) -> list[str]:
-        """Host and process id, as `host:pid`, of every process that listens, on every host."""
+        """Return `host:pid` of every listening process, on every host."""
         if connection is None:
             with self._database.read() as own:
                 return self.listeners(own)
-        asked = text(
+        statement = text(
             "SELECT application_name FROM pg_stat_activity WHERE datname = current_database() "
             "AND application_name LIKE :like ORDER BY application_name"
         )
-        found = connection.execute(asked, {"like": f"{LISTENS}%"}).scalars()
-        return [name.removeprefix(LISTENS) for name in found]
+        names = connection.execute(statement, {"like": f"{LISTENS}%"}).scalars()
+        return [name.removeprefix(LISTENS) for name in names]
 
     def listen(self) -> AbstractContextManager[Listening]:
         """See `Wakeup.listen`."""
-        return closing(Ear(self._database))
+        return closing(NoticeListener(self._database))
 
     def close(self) -> None:
-        """Ring no more."""
+        """Stop ringing."""
         with self._lock:
             self._closed = True
             ringer, self._ringer = self._ringer, None
@@ -248,29 +250,29 @@ class Notices(Wakeup):
             ringer.join(CLOSING_S)
 
     def _keep_ringing(self) -> None:
-        """Tell the server of what was rung, over one connection."""
+        """Send a NOTIFY after each ring, over one connection."""
         connection: psycopg.Connection[Any] | None = None
         while self._rung.wait() and not self._closed:
             self._rung.clear()
-            for _ in range(2):  # the server may have closed the one that was good the last time
+            for _ in range(2):  # the server may have closed the connection since the last ring
                 try:
                     if connection is None:
                         connection = self._database.driver_connection()
-                        # nothing is lost with a ring: it need not wait for disk and standby
+                        # a ring may be lost, so it need not wait for disk and standby
                         connection.execute("SET synchronous_commit = off")
                     with self._database.explained():
                         connection.execute(f"NOTIFY {CHANNEL}")
                     break
                 except SceneprintError as error:
-                    log.debug("not rung", extra={"error": str(error)})
+                    log.debug("wakeup not sent", extra={"error": str(error)})
                     _close(connection)
                     connection = None
             time.sleep(REST_S)
         _close(connection)
 
 
-class Ear:
-    """One connection that listens; made by `Notices.listen`."""
+class NoticeListener:
+    """A connection that listens; see `Notices.listen`."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -290,10 +292,10 @@ class Ear:
             wait_for(timeout_s, *others)
             return False
         own = self._connection.fileno()
-        return own in wait_for(timeout_s, own, *others) and self._heard()
+        return own in wait_for(timeout_s, own, *others) and self._has_rung()
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         _close(self._connection)
         self._connection = None
 
@@ -305,33 +307,33 @@ class Ear:
         try:
             connection = self._database.driver_connection()
             with self._database.explained():
-                named = "SELECT set_config('application_name', %s, false)"
-                connection.execute(named, [LISTENS + process_name()])
+                statement = "SELECT set_config('application_name', %s, false)"
+                connection.execute(statement, [LISTENS + process_name()])
                 connection.execute(f"LISTEN {CHANNEL}")
         except SceneprintError as error:
-            log.debug("the bell cannot be heard", extra={"error": str(error)})
+            log.debug("wakeup unavailable", extra={"error": str(error)})
             _close(connection)
             return
         self._connection, self._missed = connection, True
 
-    def _heard(self) -> bool:
-        """Whether what came is a ring, and not the end of the connection."""
+    def _has_rung(self) -> bool:
+        """Return whether the input is a ring, and not the end of the connection."""
         if self._connection is None:
             return False
-        heard = False
+        rung = False
         try:
             with self._database.explained():
                 self._connection.pgconn.consume_input()
                 while self._connection.pgconn.notifies() is not None:
-                    heard = True
+                    rung = True
         except SceneprintError as error:
-            log.debug("the bell cannot be heard", extra={"error": str(error)})
+            log.debug("wakeup unavailable", extra={"error": str(error)})
             self.close()
-            self._again_at = time.monotonic()  # it may be back, or elsewhere
-        return heard
+            self._again_at = time.monotonic()  # another server may have taken over
+        return rung
 
 
 def _close(connection: psycopg.Connection[Any] | None) -> None:
     if connection is not None:
-        with suppress(Exception):  # whatever it was, nobody has it any more
+        with suppress(Exception):
             connection.close()

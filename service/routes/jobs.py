@@ -14,7 +14,7 @@ from fastapi import Header, Query, Request, Response
 
 from sceneprint.engine.admin.operations import MOST_KINDS, event_record
 from sceneprint.engine.jobs import lifecycle
-from sceneprint.store.events import Wanted
+from sceneprint.store.events import EventFilter
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage, RetriedJobs
@@ -175,7 +175,7 @@ async def events(
     seals, place = here.engine.store.seals, "after" if last_event_id is None else "Last-Event-ID"
     last = after if last_event_id is None else last_event_id
 
-    def asked() -> tuple[Wanted, int | None]:
+    def asked() -> tuple[EventFilter, int | None]:
         seals.row("event", cursor)  # a stream has no pages; what is wrong is told all the same
         wanted = _wanted(here, asking, map_name, kind)
         return wanted, None if last is None else seals.event(last, place)
@@ -199,7 +199,7 @@ async def events(
     return await to_thread.run_sync(page)
 
 
-def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str]) -> Wanted:
+def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str]) -> EventFilter:
     if map_name is not None:
         asking.require(map_name, "read")
     wanted = here.engine.operations.wanted(map_name, kinds)
@@ -227,7 +227,7 @@ def _still(request: Request, here: Context, asking: Caller) -> Callable[[], bool
 
 
 async def _told(
-    feed: Feed, seals: OpaqueIds, wanted: Wanted, after: int | None, still: Callable[[], bool]
+    feed: Feed, seals: OpaqueIds, wanted: EventFilter, after: int | None, still: Callable[[], bool]
 ) -> AsyncGenerator[bytes, None]:
     yield BEGIN
     async with aclosing(feed.batches(wanted, after, still)) as batches:

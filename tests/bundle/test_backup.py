@@ -382,7 +382,7 @@ def test_where_there_is_no_room(master, place, tmp_path, sceneprint, longest_fil
     """In a part, in a blob that is restored, and in the database; then there is."""
     longest_file(40_000)
     said = sceneprint("snapshot", "--data", master, "--to", tmp_path / "place", expect=2)
-    assert "has no room" in said.stderr
+    assert "The store is full" in said.stderr
     assert names_in(tmp_path / "place" / "bundles") == []
     for size in (40_000, max(map(len, parts_in(Path(place)).values()))):
         longest_file(size)

@@ -227,7 +227,7 @@ def test_a_mount_is_filled_and_never_moved(place, tmp_path):
     first, second, third = done.stdout.splitlines()
     assert first == "['blobs', 'lost+found', 'sceneprint.db']"
     assert "small: what is in the bundle takes" in second
-    assert "has no room" in third
+    assert "The store is full" in third
 
 
 # servers
@@ -375,12 +375,12 @@ def test_a_prefix_is_not_shared_with_the_store_that_was_copied(place, postgres, 
     restore_to_server(place, first)
     mark = json.loads(marks.get("sceneprint.json"))
     assert mark.keys() == {"kind", "store"}
-    with pytest.raises(UnusableStore, match="of the store that the snapshot was taken of"):
+    with pytest.raises(UnusableStore, match="belong to the store that the snapshot was taken of"):
         restore_to_server(place, second)
     assert rows_in(second.database) == 0
     marks.put("sceneprint.json", json.dumps(mark | {"restoring": True}).encode())
     restore_to_server(place, second)  # as after one that was killed half way
     assert rows_in(second.database) == rows_in(first.database)
     assert json.loads(marks.get("sceneprint.json")) == mark
-    with pytest.raises(UnusableStore, match="of another database"):
+    with pytest.raises(UnusableStore, match="belong to another database"):
         BucketOwner(marks).begin("0" * 32, "1" * 32)

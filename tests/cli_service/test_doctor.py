@@ -256,7 +256,7 @@ def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
         ("sqlite:///file:x?mode=memory&uri=true", "WRONG", "is an in-memory database"),
         ("postgresql://me:p@ss:hidden@host/db", "WRONG", "the port is not a number"),
         ("nonsense", "WRONG", "not an SQLAlchemy URL"),
-        ("nosuch://host/db", "WRONG", "'nosuch' is no database that is known"),
+        ("nosuch://host/db", "WRONG", "'nosuch' is not a supported database"),
     ],
 )
 def test_addresses_of_databases(

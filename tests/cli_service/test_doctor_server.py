@@ -58,7 +58,7 @@ def test_a_service_does_not_take_the_server_for_a_file(postgres_url: str, tmp_pa
     ("url", "said"),
     [
         ("postgresql://me:hidden@127.0.0.1:1/maps", "postgresql://me@127.0.0.1:1/maps: "),
-        ("mysql://me:hidden@host/maps", "'mysql' is no database that is known"),
+        ("mysql://me:hidden@host/maps", "'mysql' is not a supported database"),
     ],
 )
 def test_a_server_that_cannot_be_asked(url: str, said: str) -> None:

@@ -239,7 +239,7 @@ def each_slice_lost_once(due_now: Callable[[Engine], None]) -> Callable[..., int
             assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
             second = products.run_slice(again, lambda: True)
             assert asdict(first) == asdict(second)
-            engine.tasks._keep(again, second)
+            engine.tasks._store_result(again, second)
             slices += 1
             progress = products.get("hall", job_id).progress
             assert progress is not None

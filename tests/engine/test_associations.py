@@ -334,7 +334,7 @@ def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]
     handler = engine.associations.run_slice
     task = engine.claim("w")
     assert isinstance(task, LongJob)
-    engine.tasks._keep(task, handler(task, lambda: True))
+    engine.tasks._store_result(task, handler(task, lambda: True))
     name = begun.job_id
     before = engine.associations.edges("hall", name).items
     assert before
@@ -430,7 +430,7 @@ def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine: Engine) ->
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     handler = engine.associations.run_slice
-    engine.tasks._keep(task, handler(task, lambda: True))
+    engine.tasks._store_result(task, handler(task, lambda: True))
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     engine.delete_map("hall")

@@ -22,7 +22,7 @@ from sceneprint.engine.products.map_coverage import frames_to_query
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownMap
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
-from sceneprint.store.frame_queries import stops_of
+from sceneprint.store.frame_queries import path_frames
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import events, job_items, jobs
 from sceneprint.types import Floats
@@ -226,7 +226,7 @@ def test_every_nth_frame_and_at_most_so_many(engine: Engine) -> None:
         with engine.store.database.read() as connection:
             row = find_map(connection, "hall")
             numbers = frames_to_query(connection, row, NewMapCoverage.model_validate(asked))
-            stops = stops_of(connection, numbers)
+            stops = path_frames(connection, numbers)
         return [stops[number].id for number in numbers]
 
     assert chosen() == order
@@ -267,7 +267,7 @@ def test_an_upload_goes_before_the_next_slice(
     handler = engine.coverage.run_slice
     task = engine.claim("w")
     assert isinstance(task, LongJob)
-    engine.tasks._keep(task, handler(task, at_once))
+    engine.tasks._store_result(task, handler(task, at_once))
     engine.add_frame("pair", uploads[9].data, uploads[9].meta, -10)  # of the least priority
     frame = engine.claim("w")
     assert isinstance(frame, Work)
@@ -329,7 +329,7 @@ def test_frames_that_went_meanwhile_are_skipped(
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     handler = engine.coverage.run_slice
-    engine.tasks._keep(task, handler(task, at_once))
+    engine.tasks._store_result(task, handler(task, at_once))
     last = [one for one in engine.list_frames("hall").items if one.session == "c"][-1]
     engine.delete_frame("hall", last.frame_id)
     due_now(engine)

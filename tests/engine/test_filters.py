@@ -286,15 +286,15 @@ def test_frames_between_view_and_filter_do_no_harm(
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="depth"))
     frames = fill(engine, 20, 6)
-    passing, gone = retrieval.passing, frames[3]
+    passing, gone = retrieval.passing_frames, frames[3]
 
     def late(*given: Any) -> Any:
-        monkeypatch.setattr(retrieval, "passing", passing)
+        monkeypatch.setattr(retrieval, "passing_frames", passing)
         engine.delete_frame("hall", gone.id)
         fill(engine, 5, 7)
         return passing(*given)
 
-    monkeypatch.setattr(retrieval, "passing", late)
+    monkeypatch.setattr(retrieval, "passing_frames", late)
     answer = ask(engine, frames[0], Filter())
     left = [one for one in frames if one is not gone]
     assert [m.frame_id for m in answer.matches] == [i for i, _ in ranked(left, frames[0], Filter())]
@@ -305,7 +305,7 @@ def test_frames_between_view_and_filter_do_no_harm(
         engine.delete_frame("hall", frames[4].id)
         return numbers
 
-    monkeypatch.setattr(retrieval, "passing", early)
+    monkeypatch.setattr(retrieval, "passing_frames", early)
     answer = ask(engine, frames[0], Filter())
     assert frames[4].id not in {m.frame_id for m in answer.matches}  # though it was compared
     assert len(answer.matches) == 22

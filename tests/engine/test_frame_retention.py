@@ -12,7 +12,7 @@ from sceneprint.engine.upkeep import purge
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.errors import InvalidRequest, StoreLocked
 from sceneprint.store.deletion import DAY_S, old_frames
-from sceneprint.store.events import Wanted, list_events, number_events
+from sceneprint.store.events import EventFilter, list_events, number_events
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap
@@ -50,7 +50,7 @@ def test_what_is_too_old_goes_with_its_bytes(aged, ids, uploads, monkeypatch):
     assert aged.view("hall")[2].size == 7
     number_events(aged.store.database)
     with aged.store.database.read() as connection:
-        last = list_events(connection, Wanted(), after=0, newest_first=True, limit=5)
+        last = list_events(connection, EventFilter(), after=0, newest_first=True, limit=5)
         assert [(one.kind, one.frame_id, one.data) for one in reversed(last)] == [
             ("frame.deleted", name, {"reason": "retention"}) for name in names[:5]
         ]

@@ -15,7 +15,7 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine import Engine
 from sceneprint.engine.engine import stored_maps
 from sceneprint.engine.jobs import signature_job as working
-from sceneprint.engine.jobs.signature_job import look
+from sceneprint.engine.jobs.signature_job import find_nearest
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.errors import InvalidRequest
 from sceneprint.pipeline import Signature, Signer
@@ -181,13 +181,13 @@ def test_of_two_that_are_signed_at_once_one_is_kept(
     looked = threading.Barrier(2)
 
     def together(*given: Any) -> Any:
-        seen = look(*given)
+        seen = find_nearest(*given)
         assert seen is not None
         assert seen.nearest is None
         looked.wait(PATIENCE_S)
         return seen
 
-    monkeypatch.setattr(working, "look", together)
+    monkeypatch.setattr(working, "find_nearest", together)
     claims = [engine.claim(f"w{i}") for i, engine in enumerate(engines)]
     states: list[JobState | None] = []
     threads = [
@@ -216,12 +216,12 @@ def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
     looks = []
 
     def interrupted(*given: Any) -> Any:
-        looks.append(look(*given))
+        looks.append(find_nearest(*given))
         if len(looks) == 1:
             empty.delete_frame("hall", nearest.frame_id)
         return looks[-1]
 
-    monkeypatch.setattr(working, "look", interrupted)
+    monkeypatch.setattr(working, "find_nearest", interrupted)
     frame = send(empty, 3, limit)
     assert len(looks) == 2
     if left == 1:
@@ -240,11 +240,11 @@ def test_signatures_of_another_model_are_not_compared(
     vector = prepared[1][0].vector.tobytes()
     made = StoredSignature(row.model_id, vector, "00" * 32, [1], [1])
     database, readers = empty.store.database, empty._readers
-    seen = look(database, readers, row, made)
+    seen = find_nearest(database, readers, row, made)
     assert seen is not None
     assert seen.nearest is not None
-    assert look(database, readers, row, replace(made, model_id="ab" * 32)) is None
-    assert look(database, readers, replace(row, number=99), made) is None
+    assert find_nearest(database, readers, row, replace(made, model_id="ab" * 32)) is None
+    assert find_nearest(database, readers, replace(row, number=99), made) is None
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from sceneprint.engine.search import retrieval
 from sceneprint.errors import Conflict, IdempotencyConflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
 from sceneprint.process import BINS, FIRST_S, STEP, Latencies, bin_of, merged, quantile
-from sceneprint.store.events import Wanted, record_event
+from sceneprint.store.events import EventFilter, record_event
 from sceneprint.store.keys import IdempotentRequest, remove_old_requests
 from sceneprint.store.store_counts import add_sample, samples_since
 from sceneprint.store.tables import events, idempotency, jobs, samples
@@ -227,28 +227,28 @@ def test_requests_are_remembered_for_a_day_and_their_keys_then_removed(make_engi
     asked = [IdempotentRequest("robot", f"key {i}", f"{i}" * 64) for i in range(3)]
     with database.write() as connection:
         for one in asked:
-            one.keep(connection, {"job_id": one.key})
-        asked[0].keep(connection, {"job_id": "again"})  # of a map that was made anew since
+            one.store(connection, {"job_id": one.key})
+        asked[0].store(connection, {"job_id": "again"})  # of a map that was made anew since
         for one, ago in zip(asked, (day - 60, day + 1, 2 * day), strict=True):
             connection.execute(
                 update(idempotency)
                 .where(idempotency.c.key == one.key)
                 .values(created_at=time.time() - ago)
             )
-        found = [one.found(connection) for one in asked]
+        found = [one.stored_result(connection) for one in asked]
         assert found == [{"job_id": "again"}, None, None]
         # what is forgotten gives way though it was not removed yet: another request may have it
         other = IdempotentRequest("robot", "key 1", "f" * 64)
-        other.keep(connection, {"job_id": "other"})
-        assert other.found(connection) == {"job_id": "other"}
+        other.store(connection, {"job_id": "other"})
+        assert other.stored_result(connection) == {"job_id": "other"}
     assert remove_old_requests(database) == 1
     assert remove_old_requests(database) == 0
     with database.read() as connection:
         left = connection.execute(select(idempotency.c.key).order_by(idempotency.c.key)).scalars()
         assert list(left) == ["key 0", "key 1"]
-        assert asked[0].found(connection) == {"job_id": "again"}
+        assert asked[0].stored_result(connection) == {"job_id": "again"}
         with pytest.raises(IdempotencyConflict, match="'key 1' was sent with another request"):
-            asked[1].found(connection)
+            asked[1].stored_result(connection)
 
 
 def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
@@ -256,7 +256,7 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
     engine.rebuild_index("hall")
     (anchor,) = anchors(engine.settings.indexes)
     seals = engine.store.seals
-    before = seals.open("event", engine.operations.events(Wanted(), limit=1).newest)
+    before = seals.open("event", engine.operations.events(EventFilter(), limit=1).newest)
     assert before is not None
     with engine.store.database.write() as connection:
         for _ in range(2500):
@@ -264,9 +264,9 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
     assert engine.operations.tidy() == 0  # it is not time yet
     # of what was there before the newest 1000, the anchor stays, and the last of the map
     floor = before + 1500
-    assert engine.operations.remove_spent() == floor - 2
-    assert engine.operations.remove_spent() == 0
-    page = engine.operations.events(Wanted(), limit=1000)
+    assert engine.operations.remove_surplus() == floor - 2
+    assert engine.operations.remove_surplus() == 0
+    page = engine.operations.events(EventFilter(), limit=1000)
     numbers = [seals.open("event", one.id) for one in page.items[:3]]
     assert numbers == [anchor, floor, floor + 1]
     other = make_engine(data)

@@ -32,7 +32,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.answer_files import AnswerObjects, open_answers
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.deletion import DAY_S
-from sceneprint.store.events import Wanted, list_events
+from sceneprint.store.events import EventFilter, list_events
 from sceneprint.store.frame_queries import QueryOrigin
 from sceneprint.store.query_rows import NewQuery, WantedQueries, drop_answers, keep_answer
 from sceneprint.store.tables import queries
@@ -177,7 +177,7 @@ def test_pages_and_filters(engine):
         with pytest.raises(InvalidRequest, match="cursor"):
             engine.query_log.page(EVERY, None, forged, 2)
     with engine.store.database.read() as connection:
-        found = list_events(connection, Wanted(kinds=("query.",)))
+        found = list_events(connection, EventFilter(kinds=("query.",)))
     assert [int(one.data["query_id"], 16) for one in found] == list(range(7))
     assert [one.map for one in found] == ["hall"] * 3 + ["attic"] + ["hall"] * 3
 
@@ -376,7 +376,7 @@ def test_the_oldest_answers_go_where_room_is_needed(engine):
     names = [log_answer(engine, 1000, log, listed=i % 2 == 0) for i in range(40)]
     kept = names[39]
     log.keep(kept, None)
-    log.remove_spent()
+    log.remove_surplus()
     with engine.store.database.read() as connection:
         held = connection.execute(select(func.sum(queries.c.bytes))).scalar_one()
     assert 20_000 < held <= 30_000
@@ -444,12 +444,12 @@ def test_old_and_surplus_queries_are_removed_in_blocks(engine, monkeypatch):
     with engine.store.database.write() as connection:
         aged = update(queries).where(queries.c.id.in_(f"{i:032x}" for i in range(4)))
         connection.execute(aged.values(at=time.time() - 31 * DAY_S))
-    assert engine.query_log.remove_spent() == 4
+    assert engine.query_log.remove_surplus() == 4
     assert numbers(engine) == list(range(13, 3, -1))
     monkeypatch.setattr(query_log, "MOST_QUERIES", 2)
-    assert engine.query_log.remove_spent() == 6
+    assert engine.query_log.remove_surplus() == 6
     assert numbers(engine) == [13, 12, 9, 8]
-    assert engine.query_log.remove_spent() == 0
+    assert engine.query_log.remove_surplus() == 0
     monkeypatch.setattr(query_log, "TIDY_S", 0.0)
     with engine.store.database.write() as connection:
         connection.execute(update(queries).values(at=1.0))
@@ -469,7 +469,7 @@ def test_a_kept_answer_stays_until_it_is_released(engine, make_engine):
     with engine.store.database.write() as connection:
         connection.execute(update(queries).values(at=time.time() - 40 * DAY_S))
         connection.exec_driver_sql("UPDATE maps SET created_at = 0")
-    engine.query_log.remove_spent()
+    engine.query_log.remove_surplus()
     second = make_engine()
     assert second.query_log.find(kept).answer.query_id == kept
     page = second.query_log.page(WantedQueries(kept=True), None, None, 9)
@@ -478,7 +478,7 @@ def test_a_kept_answer_stays_until_it_is_released(engine, make_engine):
     second.query_log.release(kept)
     assert second.query_log.record(kept).kept_at is None
     assert second.query_log.find(kept).answer.query_id == kept
-    second.query_log.remove_spent()
+    second.query_log.remove_surplus()
     for missing in (
         lambda: engine.query_log.find(kept), lambda: engine.query_log.release(kept),
         lambda: engine.query_log.keep(kept, None), lambda: engine.query_log.find(other),

@@ -16,7 +16,7 @@ from sceneprint.errors import InvalidRequest, MapExists, QuotaExceeded
 from sceneprint.store import frames as stored
 from sceneprint.store import maps
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import MapUsage, counted_usage, find_map, use_of
+from sceneprint.store.maps import MapUsage, counted_usage, find_map, map_usage
 from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState, NewMap
 
@@ -26,7 +26,7 @@ def used(engine) -> MapUsage:
     told = engine.get_map("hall")
     with engine.store.database.read() as connection:
         number = find_map(connection, "hall").number
-        assert use_of(connection, number) == counted_usage(connection, number)
+        assert map_usage(connection, number) == counted_usage(connection, number)
     return MapUsage(told.used_frames, told.used_bytes)
 
 
@@ -123,7 +123,7 @@ def test_every_change_of_a_frame_is_counted(empty, uploads):
             elif kind == 5 and one.state != FrameState.DELETED:
                 stored.delete_frame(connection, row, one)
             states.add((int(kind), str(one.state)))
-            assert use_of(connection, row.number) == counted_usage(connection, row.number), step
+            assert map_usage(connection, row.number) == counted_usage(connection, row.number), step
     assert {(2, "deleted"), (2, "redundant"), (3, "redundant"), (5, "redundant")} <= states
 
 

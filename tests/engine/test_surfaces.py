@@ -22,7 +22,7 @@ from sceneprint.errors import DamagedBlob, InvalidRequest, NotFound
 from sceneprint.geometry.rigid import transform_points
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
-from sceneprint.store.frame_queries import numbers_of_runs, stops_of
+from sceneprint.store.frame_queries import numbers_of_runs, path_frames
 from sceneprint.store.frames import refers_to, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.store.tables import (
@@ -108,7 +108,7 @@ def oracle(engine: Engine, cell_m: float) -> dict[str, dict[Any, list[Any]]]:
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
         numbers = numbers_of_runs(connection, row.number, None, None)
-        stops = stops_of(connection, numbers)
+        stops = path_frames(connection, numbers)
         blobs = geometry_blobs(connection, numbers, row.model_id)
     for number in sorted(stops):
         stop = stops[number]
@@ -388,7 +388,7 @@ def test_a_spot_is_seen_by_the_frames_that_have_a_point_there(engine: Engine) ->
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
         numbers = numbers_of_runs(connection, row.number, None, None)
-        stops = stops_of(connection, numbers)
+        stops = path_frames(connection, numbers)
         blobs = geometry_blobs(connection, numbers, row.model_id)
     expected = []
     for number, stop in stops.items():

@@ -194,7 +194,7 @@ def test_an_artifact_swept_before_its_commit_is_not_referred_to(
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     claimed = empty.claim("w")
     assert claimed is not None
-    make = working._make
+    make = working._sign
 
     def slowly(*given: Any) -> Any:
         made = make(*given)
@@ -202,7 +202,7 @@ def test_an_artifact_swept_before_its_commit_is_not_referred_to(
         return made
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(working, "_make", slowly)
+        patch.setattr(working, "_sign", slowly)
         empty.run(claimed)
     due_now(empty)
     work_off(empty)
@@ -226,7 +226,7 @@ def test_a_job_that_silences_every_worker_is_given_up(
     assert claimed.frame.id == good.frame_id
     frame, job = empty.get_frame("hall", bad.frame_id), empty.get_job(bad.job_id)
     assert (frame.state, job.state) == (FrameState.FAILED, JobState.DEAD)
-    assert frame.reason == job.error == "its worker fell silent, and 10 tries are over"
+    assert frame.reason == job.error == "its worker fell silent in the last of 10 attempts"
     assert told(empty) == ["map.created", "frame.received", "frame.received", "frame.failed"]
 
 

@@ -96,16 +96,16 @@ def _mend_psycopg(module: ModuleType) -> None:
 def _mend_store(module: ModuleType) -> None:
     from sqlalchemy import make_url
 
-    there = module.is_there
+    exists = module.database_exists
 
-    def is_there(url: str) -> bool:
+    def database_exists(url: str) -> bool:
         """Like that of a file: what new ones are copied from has a schema already."""
         name = "" if url.startswith("sqlite") else make_url(url).database or ""
         if name.startswith(PREFIX):
             return (Path(name.removeprefix(PREFIX)) / MARK).is_file()
-        return bool(there(url))
+        return bool(exists(url))
 
-    module.is_there = is_there
+    module.database_exists = database_exists
 
 
 _MENDED = {

@@ -15,7 +15,7 @@ from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway, UnknownFrame
 from sceneprint.settings import Settings
 from sceneprint.store import Database
-from sceneprint.store.events import EventRow, Wanted
+from sceneprint.store.events import EventFilter, EventRow
 from sceneprint_client.api import JobState, NewMap, Query
 from service.event_stream import Feed
 
@@ -70,7 +70,7 @@ def _follow(database: Database, found: list[EventRow], ended: threading.Event) -
 
 
 async def _gather(feed: Feed, found: list[EventRow]) -> None:
-    async for events, _ in feed.batches(Wanted(), 0, lambda: True):
+    async for events, _ in feed.batches(EventFilter(), 0, lambda: True):
         found += events
 
 

@@ -14,7 +14,7 @@ from sqlalchemy import Connection, text, update
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import LostLease
 from sceneprint.store import Store, queue
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.tables import JobRow, jobs
 from sceneprint_client.api import JobState
 
@@ -28,7 +28,7 @@ BLOCKED = text(
 def store(server_store: Store) -> Store:
     """With three jobs of no frame that wait."""
     with server_store.database.write() as connection:
-        keep_model(connection, "ab" * 32, "toy", b"the file of a model")
+        store_model(connection, "ab" * 32, "toy", b"the file of a model")
         row = add_map(connection, "hall", None, "ab" * 32)
         for _ in range(3):
             queue.enqueue(connection, "import", None, map_number=row.number)
@@ -190,7 +190,7 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
 
     def tell() -> JobRow | None:
         with store.database.write() as connection:
-            return queue.fail_of_dead(
+            return queue.fail_dead_worker(
                 connection, dead.id, dead.token, "died", "trace", counts=False
             )
 
@@ -242,7 +242,7 @@ def test_the_clock_of_a_host_decides_nothing(
         assert 0 < (queue.due_in_s(connection) or 0) <= 60
         assert queue.read_clock(connection) == pytest.approx(real(), abs=30)
     with store.database.write() as connection:
-        queue.give_back(connection, held)
+        queue.release_job(connection, held)
     assert claimed(store).number == held.number  # at once
     with store.database.write() as connection:
         assert queue.dead_letter(connection) == []

@@ -18,7 +18,7 @@ from sceneprint.errors import StoreLocked
 from sceneprint.store import Store, open_database
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.tables import MapRow
 
@@ -28,7 +28,7 @@ MODEL = "ab" * 32
 @pytest.fixture
 def rows(server_store: Store) -> list[MapRow]:
     with server_store.database.write() as connection:
-        keep_model(connection, MODEL, "toy", b"a model")
+        store_model(connection, MODEL, "toy", b"a model")
         return [add_map(connection, name, None, MODEL) for name in ("a", "b")]
 
 
@@ -44,7 +44,7 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(
         def work(connection: Connection) -> str:
             is_first = request.key not in tries
             tries.append(request.key)
-            request.keep(connection, {})
+            request.store(connection, {})
             if meet and is_first:
                 both.wait(PATIENCE_S)
             return "kept"
@@ -92,7 +92,7 @@ def test_who_waited_for_its_turn_sees_what_was_committed_meanwhile(
     )
     with closing(open_database(url)) as database:
         with database.write() as connection:
-            keep_model(connection, MODEL, "toy", b"a model")
+            store_model(connection, MODEL, "toy", b"a model")
             row = add_map(connection, "a", None, MODEL)
         for how in ({}, {"map_number": row.number}, {"turn": False}):
             with database.write(**how) as connection:
@@ -116,13 +116,13 @@ def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
     assert sign(rows[0])
     with database.write() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-    both, look = threading.Barrier(2), postgres.KnownSchema.look
+    both, look = threading.Barrier(2), postgres.KnownSchema.read
 
     def look_together(self: Any, connection: Any) -> None:
         both.wait(PATIENCE_S)  # both have sent the schema of before
         look(self, connection)
 
-    monkeypatch.setattr(postgres.KnownSchema, "look", look_together)
+    monkeypatch.setattr(postgres.KnownSchema, "read", look_together)
     with ThreadPoolExecutor(2) as pool:
         assert list(pool.map(sign, rows)) == [True, True]
 

@@ -20,8 +20,8 @@ from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import IdempotencyConflict, StoreLocked
 from sceneprint.store import Store, open_store
 from sceneprint.store.events import (
+    EventFilter,
     EventRow,
-    Wanted,
     anchor_number,
     anchor_of_now,
     events_table,
@@ -31,7 +31,7 @@ from sceneprint.store.events import (
     record_event,
 )
 from sceneprint.store.keys import IdempotentRequest, Overtaken
-from sceneprint.store.maps import add_map, keep_model, next_revision
+from sceneprint.store.maps import add_map, next_revision, store_model
 from sceneprint.store.postgres.connection import EVENTS, LOCKS
 from sceneprint.store.tables import MapRow, event_values, events, pending_events
 
@@ -47,7 +47,7 @@ _WAITING = text(
 def rows(server_store: Store) -> list[MapRow]:
     """Some maps."""
     with server_store.database.write() as connection:
-        keep_model(connection, MODEL, "toy", b"a model")
+        store_model(connection, MODEL, "toy", b"a model")
         return [add_map(connection, f"map-{i}", None, MODEL) for i in range(MAPS)]
 
 
@@ -58,7 +58,7 @@ def waiting(store: Store) -> int:
 
 def told(store: Store) -> list[EventRow]:
     """All events that a reader finds."""
-    return next_events(store.database, Wanted(), 0, 10_000).found
+    return next_events(store.database, EventFilter(), 0, 10_000).events
 
 
 def others_write(database_url: str, of: int | None, folder: Path) -> Callable[[], bool]:
@@ -117,9 +117,9 @@ def test_readers_miss_no_event_and_see_those_of_a_map_in_its_order(
         place, last = 0, False
         while not last:
             last = over.is_set()
-            slice_ = next_events(database, Wanted(kinds=("x",)), place, 50)
-            into += slice_.found
-            last, place = last and not slice_.found, slice_.place
+            slice_ = next_events(database, EventFilter(kinds=("x",)), place, 50)
+            into += slice_.events
+            last, place = last and not slice_.events, slice_.place
 
     guard = threading.Lock()
     readers = [threading.Thread(target=read, args=[one]) for one in found]
@@ -151,7 +151,7 @@ def test_numbers_of_the_version_before_follow_those_that_are_pending(
         assert events_table(connection) is events
         connection.execute(insert(events).values(event_values("then", row.name, None, None, {})))
     with database.read() as connection:  # and nobody numbered any
-        kinds = [one.kind for one in list_events(connection, Wanted(frozenset([row.name])))]
+        kinds = [one.kind for one in list_events(connection, EventFilter(frozenset([row.name])))]
         assert kinds == ["map.created", "first", "then"]
         assert connection.execute(select(pending_events)).all() == []
 
@@ -204,16 +204,16 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
 
     def keep_first(connection: Connection) -> None:
         assert looked.wait(PATIENCE_S)
-        assert first.found(connection) is None
-        first.keep(connection, {"of": "first"})
+        assert first.stored_result(connection) is None
+        first.store(connection, {"of": "first"})
 
     def keep_second(connection: Connection) -> None:
         tries.append(1)
-        assert second.found(connection) is None
+        assert second.stored_result(connection) is None
         looked.set()
         assert stored.wait(PATIENCE_S)
         record_event(connection, "second", rows[1].name)
-        second.keep(connection, {"of": "second"})
+        second.store(connection, {"of": "second"})
 
     def run_first() -> None:
         Grouping(database, rows[0].number).run(keep_first)
@@ -230,7 +230,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
     assert len(tries) == 2
     assert "second" not in [one.kind for one in told(server_store)]
     with database.read() as connection:
-        assert first.found(connection) == {"of": "first"}
+        assert first.stored_result(connection) == {"of": "first"}
 
 
 def test_nothing_is_pending_where_nobody_reads_once_somebody_numbers(
@@ -242,6 +242,6 @@ def test_nothing_is_pending_where_nobody_reads_once_somebody_numbers(
     number_events(server_store.database)
     with server_store.database.read() as connection:
         assert connection.execute(select(pending_events)).all() == []
-        assert [one.map for one in list_events(connection, Wanted(kinds=("x",)))] == [
+        assert [one.map for one in list_events(connection, EventFilter(kinds=("x",)))] == [
             row.name for row in rows
         ]

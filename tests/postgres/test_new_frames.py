@@ -20,7 +20,7 @@ from sceneprint.process import of_request, work_of
 from sceneprint.store import Database, Store, open_database
 from sceneprint.store.database import MAP_WRITERS
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.postgres.connection import MapsInUse, take_turn
 from sceneprint.store.tables import (
@@ -45,7 +45,7 @@ Until = Callable[[Callable[[], Any]], Any]
 @pytest.fixture
 def rows(server_store: Store) -> list[MapRow]:
     with server_store.database.write() as connection:
-        keep_model(connection, MODEL, "toy", b"a model")
+        store_model(connection, MODEL, "toy", b"a model")
         return [add_map(connection, name, None, MODEL) for name in ("a", "b", "c")]
 
 
@@ -176,7 +176,7 @@ def test_what_was_done_under_its_key_is_not_done_again(
     given += [new(b, 3), new(a, 3, kept=kept(requests[1]))]
     assert receive(database, *given) == [False, True, True]
     with database.read() as connection:
-        assert requests[1].found(connection) == {"frames": "new"}
+        assert requests[1].stored_result(connection) == {"frames": "new"}
         assert len(connection.execute(select(idempotency.c.key)).all()) == 2
     both = IdempotentRequest("robot", "both", "0" * 64)
     with pytest.raises(IntegrityError, match="pk_idempotency"):

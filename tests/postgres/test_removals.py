@@ -57,14 +57,14 @@ from sceneprint.store import open_store
 url, bucket, dies, *blobs = sys.argv[1:]
 store = open_store(url, bucket)
 if dies == "after":
-    settle = garbage_collection.settle
+    clear = garbage_collection.clear_doomed
 
-    def settle_all_but_what_is_gone(connection, some, at=None, before=None):
+    def clear_all_but_what_is_gone(connection, some, at=None, before=None):
         if at is not None:
             os.kill(os.getpid(), signal.SIGKILL)
-        settle(connection, some, at, before)
+        clear(connection, some, at, before)
 
-    garbage_collection.settle = settle_all_but_what_is_gone
+    garbage_collection.clear_doomed = clear_all_but_what_is_gone
 garbage_collection.collect_blobs(store, blobs)
 """
 
@@ -306,7 +306,7 @@ def test_a_removal_that_takes_too_long_stores_nothing(
     monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
     digest = engine.store.blobs.put(small[0].png)
     removing = removal(digest)
-    with pytest.raises(StoreLocked, match="Come back later"):
+    with pytest.raises(StoreLocked, match="Try again later"):
         in_a_group(engine, small)
     assert engine.get_map("hall").frames == {}
     held.release()

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Table, insert, select, update
 
 from sceneprint.store import Store, queue
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import add_frame, add_map, keep_model, map_of
+from sceneprint.store.maps import add_frame, add_map, map_of_number, store_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.parent_joins import ParentJoin, join_parent
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame, index_frame
@@ -52,7 +52,7 @@ def pair(server_store: Store) -> list[MapRow]:
     """Two maps that are alike: one for each way."""
     with server_store.database.write() as connection:
         for model in (MODEL, OTHER):
-            keep_model(connection, model, "toy", model.encode())
+            store_model(connection, model, "toy", model.encode())
         return [add_map(connection, name, None, MODEL) for name in ("single", "parts")]
 
 
@@ -247,4 +247,4 @@ def test_revisions_of_a_map_follow_each_other(server_store: Store, pair: list[Ma
         assert indexed(server_store, row, claimed(server_store, row), at_once=True)
     assert [one["revision"] for one in rows(server_store, row)["frames"]] == [1, 2, 3]
     with server_store.database.read() as connection:
-        assert map_of(connection, row.number).revision == 3
+        assert map_of_number(connection, row.number).revision == 3

@@ -22,7 +22,7 @@ from sceneprint.errors import IdempotencyConflict, LostLease, NewerSchema, Store
 from sceneprint.settings import Settings
 from sceneprint.store import Database, Store, open_database, queue
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import add_map, find_map, frame_of, keep_model
+from sceneprint.store.maps import add_map, find_map, frame_of, store_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
@@ -91,7 +91,7 @@ class TripCounter:
 @pytest.fixture
 def row(server_store: Store) -> MapRow:
     with server_store.database.write() as connection:
-        keep_model(connection, MODEL, "toy", b"a model")
+        store_model(connection, MODEL, "toy", b"a model")
         return add_map(connection, "hall", None, MODEL)
 
 

@@ -14,7 +14,7 @@ from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import StoreAway
 from sceneprint.store import Store
-from sceneprint.store.events import Wanted, list_events, record_event
+from sceneprint.store.events import EventFilter, list_events, record_event
 
 WAITING = "FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
 
@@ -66,11 +66,11 @@ def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
     thread.start()
     until(lambda: forsaken.execute(f"SELECT 1 {WAITING}"))
     with database.read() as connection:  # others go on reading, and see nothing of it
-        assert list_events(connection, Wanted(), after=0, limit=9) == []
+        assert list_events(connection, EventFilter(), after=0, limit=9) == []
     forsaken.execute(f"SELECT pg_cancel_backend(pid) {WAITING}")
     thread.join(PATIENCE_S)
     assert [type(error) for error in raised] == [StoreAway]  # it may be stored
-    assert "the wait for a standby was ended by hand" in str(raised[0])
+    assert "an operator ended the wait for a standby" in str(raised[0])
 
 
 def test_other_warnings_are_no_doubt(server_store: Store) -> None:
@@ -78,5 +78,5 @@ def test_other_warnings_are_no_doubt(server_store: Store) -> None:
         connection.execute(text("DO $$ BEGIN RAISE WARNING 'of something else'; END $$"))
         record_event(connection, "map.created", "hall")
     with server_store.database.read() as connection:
-        assert len(list_events(connection, Wanted(), after=0, limit=9)) == 1
+        assert len(list_events(connection, EventFilter(), after=0, limit=9)) == 1
         assert connection.execute(text("SHOW statement_timeout")).scalar_one() == "1min"

@@ -21,8 +21,8 @@ from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
 from sceneprint.store.deletion import DAY_S, doom, doomed_blobs
-from sceneprint.store.events import Wanted
-from sceneprint.store.maps import find_map, use_of
+from sceneprint.store.events import EventFilter
+from sceneprint.store.maps import find_map, map_usage
 from sceneprint.store.postgres.connection import LOCKS, TURN
 from sceneprint_client.api import JobState, NewMap
 
@@ -60,7 +60,7 @@ def turns(engine: Engine) -> Iterator[Counter[str]]:
 def used_bytes(engine: Engine) -> int:
     """Bytes that the map is counted to hold."""
     with engine.store.database.read() as connection:
-        return use_of(connection, find_map(connection, "hall").number).bytes
+        return map_usage(connection, find_map(connection, "hall").number).bytes
 
 
 def test_writers_of_two_maps_may_doom_the_same_blobs(
@@ -99,7 +99,7 @@ def test_retention_takes_the_turn_of_its_map(engine: Engine, small: Any) -> None
         assert Retention(engine.store, 7.0).run(time.time() + 2 * DAY_S) == 3
     assert taken == {"one": 1, "all": 1}  # of the sweep: its blobs may be those of any map
     assert engine.get_map("hall").frames == {"deleted": 3}
-    told = next_events(engine.store.database, Wanted(), 0, 100).found
+    told = next_events(engine.store.database, EventFilter(), 0, 100).events
     assert [one.kind for one in told].count("frame.deleted") == 3
 
 
@@ -111,5 +111,5 @@ def test_a_slice_takes_the_turn_of_its_map(engine: Engine) -> None:
     with turns(engine) as taken:
         assert engine.run(work) == JobState.SUCCEEDED
     assert taken == {"one": 1, "all": 0}
-    told = next_events(engine.store.database, Wanted(), 0, 100).found
+    told = next_events(engine.store.database, EventFilter(), 0, 100).events
     assert [one.kind for one in told].count("counted") == 1

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import Busy
 from sceneprint.store import Database, open_store
-from sceneprint.store.events import EventRow, Wanted, record_event, remove_events
+from sceneprint.store.events import EventFilter, EventRow, record_event, remove_events
 from service import event_stream as feeds
 from service.event_stream import Feed
 
@@ -61,7 +61,7 @@ def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
 
     async def run() -> None:
         feed = Feed(database, most=9, kept=1000)
-        streams = [(Wanted(), 0), (Wanted(), 13), (Wanted(frozenset(("shop",))), 0)]
+        streams = [(EventFilter(), 0), (EventFilter(), 13), (EventFilter(frozenset(("shop",))), 0)]
         begun = [feed.batches(wanted, after, always) for wanted, after in streams]
         for _ in begun:
             feed.join()
@@ -89,13 +89,13 @@ def test_from_now_on_means_from_when_it_was_asked(database):
     async def run() -> None:
         feed = Feed(database, most=1, kept=1000)
         feed.join()
-        stream = feed.batches(Wanted(), None, always)
+        stream = feed.batches(EventFilter(), None, always)
         assert await anext(stream) == ([], 1)
         write(database, "hall", "shop")
         assert await gather(stream, 2) == [2, 3]
         feed.leave()
         feed.join()  # a new poller for who comes after the last one left
-        assert await gather(feed.batches(Wanted(), 1, always), 2) == [2, 3]
+        assert await gather(feed.batches(EventFilter(), 1, always), 2) == [2, 3]
         feed.leave()
 
     asyncio.run(run())
@@ -110,13 +110,13 @@ def test_what_is_gone_is_said_to_be(database):
     async def run() -> None:
         feed = Feed(database, most=9, kept=9)
         for after, place in ((1, 1), (99, 12)):
-            stream = feed.batches(Wanted(), after, always)
+            stream = feed.batches(EventFilter(), after, always)
             first, told = await anext(stream)
             assert [(one.number, one.kind) for one in first] == [(place, "events.missed")]
             assert told == place
             if place < 12:
                 assert await gather(stream, 10) == [2, *range(4, 13)]
-        assert await anext(feed.batches(Wanted(), 3, always)) == ([], 3)
+        assert await anext(feed.batches(EventFilter(), 3, always)) == ([], 3)
 
     asyncio.run(run())
 
@@ -132,7 +132,7 @@ def test_silence_is_broken_and_a_key_that_opens_nothing_ends_it(database, monkey
 
     async def run() -> list[Batch]:
         feed = Feed(database, most=1, kept=9)
-        return [batch async for batch in feed.batches(Wanted(), None, twice)]
+        return [batch async for batch in feed.batches(EventFilter(), None, twice)]
 
     assert asyncio.run(run()) == [([], 1)] * 3
     assert len(asked) == 3
@@ -147,7 +147,7 @@ def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
         asked.append(1)
         return len(asked) < 3
 
-    async def run(wanted: Wanted) -> list[Batch]:
+    async def run(wanted: EventFilter) -> list[Batch]:
         feed, found = Feed(database, most=1, kept=1000), []
         asked.clear()
 
@@ -163,9 +163,9 @@ def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
         return found
 
     write(database, "shop")
-    for shop in (Wanted(frozenset(("shop",))), Wanted(frozenset(("shop",)), ("map.",))):
+    for shop in (EventFilter(frozenset(("shop",))), EventFilter(frozenset(("shop",)), ("map.",))):
         assert asyncio.run(run(shop)) == [([], 1)] * 3  # nor are they seen in what is told
-    told = [one for batch in asyncio.run(run(Wanted())) for one in ids(batch)]
+    told = [one for batch in asyncio.run(run(EventFilter())) for one in ids(batch)]
     assert told == list(range(told[0], told[-1] + 1))
 
 
@@ -176,7 +176,7 @@ def test_there_are_so_many_places_and_all_end_together(database):
             feed.join()
         with pytest.raises(Busy, match="limit of open event streams"):
             feed.join()
-        streams = [feed.batches(Wanted(), None, always) for _ in range(2)]
+        streams = [feed.batches(EventFilter(), None, always) for _ in range(2)]
         waiting = []
         for stream in streams:
             await anext(stream)

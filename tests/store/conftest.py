@@ -16,7 +16,7 @@ from sqlalchemy import Connection, event, update
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.store import Store, open_database, open_store, queue
-from sceneprint.store.maps import add_frame, add_map, keep_model
+from sceneprint.store.maps import add_frame, add_map, store_model
 from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs
 from sceneprint_client.api import JobState
 
@@ -117,7 +117,7 @@ def store(url: str, empty_file: Path, tmp_path: Path) -> Iterator[Store]:
 def hall(store: Store) -> MapRow:
     """An empty map."""
     with store.database.write() as connection:
-        keep_model(connection, MODEL, "toy", b"the file of a model")
+        store_model(connection, MODEL, "toy", b"the file of a model")
         return add_map(connection, "hall", None, MODEL)
 
 

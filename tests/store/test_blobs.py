@@ -159,7 +159,7 @@ def test_nothing_but_a_digest_becomes_a_path(blobs: FolderBlobs, given: str) -> 
     others = ObjectBlobs(open_objects("memory:///"), FileLocks(Path("/none")), lambda: "me")
     for each in (blobs, others):
         for call in (each.get, each.open, each.holds, each.size, each.remove):
-            with pytest.raises(ValueError, match="is no digest"):
+            with pytest.raises(ValueError, match="is not a digest"):
                 call(given)
         assert each.condition(given) == "missing"
 
@@ -237,7 +237,7 @@ def test_a_file_where_a_folder_should_be_is_said(tmp_path: Path) -> None:
     place.write_bytes(b"")  # a file where the folder should be
     with pytest.raises(UnusableStore, match="Check the folder and its permissions"):
         blobs.put(b"depth")
-    with pytest.raises(UnusableStore, match=r"the folder cannot be made \(Not a directory\)"):
+    with pytest.raises(UnusableStore, match=r"the folder cannot be created \(Not a directory\)"):
         FolderBlobs(place / "below")
 
 

@@ -11,8 +11,8 @@ from sqlalchemy import insert, select, update
 
 from sceneprint.store import Store
 from sceneprint.store.deletion import remove_map
-from sceneprint.store.events import Wanted, floor_of, list_events, newest_seen
-from sceneprint.store.maps import add_map, find_map, keep_model
+from sceneprint.store.events import EventFilter, list_events, newest_seen, removal_floor
+from sceneprint.store.maps import add_map, find_map, store_model
 from sceneprint.store.store_counts import count_events
 from sceneprint.store.tables import events
 from sceneprint_client.api.admin import KINDS
@@ -39,14 +39,14 @@ def work(i):
             pass
 """
 READ = """
-from sceneprint.store.events import Wanted
+from sceneprint.store.events import EventFilter
 from sceneprint.engine.admin.operations import next_events
 import time
 
 def read(store):
     seen, place = [], 0
     while len(seen) < int(ARGS[2]):
-        found, place, _ = next_events(store.database, Wanted(), place, 5)
+        found, place, _ = next_events(store.database, EventFilter(), place, 5)
         seen += [(one.number, one.frame_id) for one in found]
     return seen
 
@@ -63,7 +63,7 @@ def empty(store: Store) -> Store:
 
 def fill(store: Store, count: int) -> None:
     with store.database.write() as connection:
-        keep_model(connection, "m" * 64, "small", b"")
+        store_model(connection, "m" * 64, "small", b"")
         for name in ("hall", "shop"):
             add_map(connection, name, None, "m" * 64)
         for i in range(count):
@@ -92,21 +92,21 @@ def test_the_database_and_the_stream_pick_the_same(empty):
     maps = (None, frozenset(("hall",)), frozenset(("hall", "shop")), frozenset())
     kinds = ((), ("frame.",), ("frame.i", "key."), ("frame_",), ("map.created",))
     with empty.database.read() as connection:
-        every = list_events(connection, Wanted())
+        every = list_events(connection, EventFilter())
         assert [one.number for one in every] == list(range(1, 63))
         for named, begun, of_maps in itertools.product(maps, kinds, (False, True)):
-            wanted = Wanted(named, begun, of_maps)
+            wanted = EventFilter(named, begun, of_maps)
             assert list_events(connection, wanted) == [one for one in every if wanted(one)]
             seen = [one.number for one in every if wanted.sees(one)]
             assert newest_seen(connection, wanted) == max(seen, default=0)
-        newest = list_events(connection, Wanted(), before=50, limit=7, newest_first=True)
+        newest = list_events(connection, EventFilter(), before=50, limit=7, newest_first=True)
         assert [one.number for one in newest] == list(range(49, 42, -1))
 
 
 def test_events_are_counted_by_interval(empty):
     fill(empty, 60)
     with empty.database.read() as connection:
-        every = [one for one in list_events(connection, Wanted()) if one.at < 2000]
+        every = [one for one in list_events(connection, EventFilter()) if one.at < 2000]
         for start, width, name in (
             (1000.0, 10.0, None),
             (1007.5, 4.0, "hall"),
@@ -139,11 +139,11 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -
     """Nor is it told of one that was deleted before it was made, and of which there is no other."""
 
     def told(since: float | None, *names: str) -> list[tuple[str, str | None]]:
-        wanted = Wanted(frozenset(names), since=since)
+        wanted = EventFilter(frozenset(names), since=since)
         with store.database.read() as connection:
             found = [(one.kind, one.map) for one in list_events(connection, wanted)]
             newest = newest_seen(connection, wanted)
-            lost = floor_of(connection, wanted, 1, 0)
+            lost = removal_floor(connection, wanted, 1, 0)
             numbers = connection.execute(select(events.c.number, events.c.kind, events.c.map))
             last = [row.number for row in numbers if (row.kind, row.map) in found]
         assert newest == max(last, default=0)
@@ -167,7 +167,7 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -
                 remove_map(connection, find_map(connection, name))
 
     with store.database.write() as connection:
-        keep_model(connection, "m" * 64, "small", b"")
+        store_model(connection, "m" * 64, "small", b"")
     begin("hall", "shop")
     at(100)
     end("hall", "shop")

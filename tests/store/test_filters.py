@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import Connection, update
 
 from sceneprint.store import Store
-from sceneprint.store.frame_queries import QueryOrigin, passing
+from sceneprint.store.frame_queries import QueryOrigin, passing_frames
 from sceneprint.store.frames import delete_frame, set_state
 from sceneprint.store.maps import add_map
 from sceneprint.store.tables import FrameRow, MapRow, frames
@@ -23,7 +23,7 @@ NOBODY = QueryOrigin(None, None, None)
 
 def found(store: Store, row: MapRow, taken: QueryOrigin = NOBODY, **wanted: Any) -> list[int]:
     with store.database.read() as connection:
-        return sorted(passing(connection, row.number, Filter(**wanted), taken).tolist())
+        return sorted(passing_frames(connection, row.number, Filter(**wanted), taken).tolist())
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_only_indexed_frames_of_the_map_pass(
     assert found(store, attic) == [other.number]
     assert found(store, hall, robot="r2") == []
     with store.database.read() as connection:
-        nobody = passing(connection, 99, Filter(), NOBODY)
+        nobody = passing_frames(connection, 99, Filter(), NOBODY)
     assert (nobody.dtype, nobody.shape) == ("int64", (0,))
 
 
@@ -106,7 +106,9 @@ def test_no_filter_reads_other_maps(
     store: Store, hall: MapRow, plans: Plans, wanted: dict[str, Any]
 ) -> None:
     with store.database.read() as connection, plans(connection) as told:
-        passing(connection, hall.number, Filter.model_validate(wanted), QueryOrigin("r1", "s", 1.0))
+        passing_frames(
+            connection, hall.number, Filter.model_validate(wanted), QueryOrigin("r1", "s", 1.0)
+        )
     assert told
     assert all("SEARCH" in step or "LIST SUBQUERY" in step for step in told), told
     assert not any("TEMP B-TREE" in step for step in told), told

@@ -221,7 +221,7 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
         assert stored_maps.frames_of(connection, [mine.number, theirs.number]).keys() == {
             theirs.number
         }
-        assert queue.job_ids_of(connection, [mine.number, theirs.number]) == {
+        assert queue.signing_jobs(connection, [mine.number, theirs.number]) == {
             theirs.number: kept.id
         }
         assert job.number != kept.number

@@ -140,7 +140,7 @@ def test_a_file_that_changes_while_it_is_read_is_not_believed(folder: Path) -> N
             return int(connection.execute(text("SELECT sum(number) FROM events")).scalar_one())
 
     assert total(lambda: None) == 1
-    with pytest.raises(UnusableStore, match=r"was written by somebody else.*Ask again"):
+    with pytest.raises(UnusableStore, match=r"was written by another process.*Try again"):
         total(lambda: add(folder))
     database.close()  # who asks again, has it opened again
     assert total(lambda: None) == 3

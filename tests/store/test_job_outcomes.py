@@ -97,7 +97,7 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
         (buried,) = queue.dead_letter(connection)
     assert buried == hand.row(silent)
     assert (buried.state, buried.leased_until) == (JobState.DEAD, None)
-    assert buried.error == "its worker fell silent, and 10 tries are over"
+    assert buried.error == "its worker fell silent in the last of 10 attempts"
     assert buried.finished_at is not None
     assert not hand.due()
     with pytest.raises(LostLease), store.database.write() as connection:
@@ -155,7 +155,7 @@ def test_what_is_given_back_was_never_tried(store: Store, hand: Any, queued: Que
         held = hand.taken()
         assert (held.token, held.attempts) == (token, 1)
         with store.database.write() as connection:
-            queue.give_back(connection, held)
+            queue.release_job(connection, held)
         now = hand.row(job)
         assert (now.state, now.attempts, now.worker, now.leased_until) == (
             JobState.QUEUED, 0, None, None,

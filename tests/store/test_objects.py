@@ -90,7 +90,7 @@ def test_keys_are_put_listed_and_removed(
     for call in (objects.get, objects.open, lambda key: [*objects.chunks(key)]):
         with pytest.raises(FileNotFoundError, match="a/1"):
             call("a/1")
-    assert objects.look("a/1") is None
+    assert objects.head("a/1") is None
 
 
 def test_a_bucket_that_is_not_there_is_no_missing_blob(bucket: str) -> None:
@@ -112,7 +112,7 @@ def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket: str) -> None:
         assert child.stdout.readline() == "half way\n"
         child.send_signal(signal.SIGKILL)
     objects = open_objects(bucket)
-    assert objects.look("large") is None
+    assert objects.head("large") is None
     assert list(objects.list("")) == []
 
 

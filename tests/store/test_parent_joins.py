@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import Connection, insert, select, update
 
 from sceneprint.store import Store
-from sceneprint.store.maps import add_frame, add_map, keep_model, position
+from sceneprint.store.maps import add_frame, add_map, position, store_model
 from sceneprint.store.parent_joins import (
     ParentJoin,
     join_parent,
@@ -41,7 +41,7 @@ A_B[:3] = [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 100.0]]
 def at(store: Store) -> Any:
     """A writing connection, and the number of a map of four frames: in A, B, C and without pose."""
     with store.database.write() as connection:
-        keep_model(connection, MODEL, "toy", b"")
+        store_model(connection, MODEL, "toy", b"")
         row = add_map(connection, "hall", None, MODEL)
         for name in ("A", "B", "C", None):
             values = {

@@ -36,7 +36,7 @@ def test_a_job_is_queued_as_it_should_be(
     assert (job.started_at, job.finished_at) == (None, None)
     assert hand.row(job) == job
     with store.database.read() as connection:
-        assert queue.job_ids_of(connection, [job.frame_number]) == {job.frame_number: job.id}
+        assert queue.signing_jobs(connection, [job.frame_number]) == {job.frame_number: job.id}
         assert queue.count_jobs(connection) == {"queued": 1}
         with pytest.raises(UnknownJob, match="no job 'nobody'"):
             queue.find_job(connection, "nobody")
@@ -97,7 +97,7 @@ def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
         lambda c: queue.finish(c, first, JobState.SUCCEEDED),
         lambda c: queue.fail(c, first, "late", "late"),
         lambda c: queue.renew(c, first, 9.0),
-        lambda c: queue.give_back(c, first),
+        lambda c: queue.release_job(c, first),
     ):
         lost = pytest.raises(LostLease, match=f"{job.id} is no longer held")
         with lost, store.database.write() as connection:
@@ -207,7 +207,7 @@ def test_a_long_job_makes_way_for_other_tenants_and_for_higher_priorities(
 
     def makes_way() -> bool:
         with store.database.read() as connection:
-            return queue.waits_before(connection, held)
+            return queue.has_waiting_before(connection, held)
 
     assert not makes_way()
     queue_jobs(store, hall, "long", 1, priority=0)  # an equal comes when this has ended

@@ -10,17 +10,17 @@ from sqlalchemy import Connection
 from sceneprint.store import Store, events
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.events import (
-    Wanted,
+    EventFilter,
     anchor_of_now,
-    floor_of,
-    floors,
     holds_anchor,
     list_events,
     record_event,
+    removal_floor,
+    removal_floors,
     remove_events,
-    spent_numbers,
+    surplus_events,
 )
-from sceneprint.store.maps import add_map, find_map, keep_model
+from sceneprint.store.maps import add_map, find_map, store_model
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def empty(store: Store) -> Store:
 def filled(empty: Store) -> Store:
     """Two maps, made by the events 1 and 2; then hall, shop and none in turn, 3 to 62."""
     with empty.database.write() as connection:
-        keep_model(connection, "m" * 64, "small", b"")
+        store_model(connection, "m" * 64, "small", b"")
         for name in ("hall", "shop"):
             add_map(connection, name, None, "m" * 64)
         for i in range(60):
@@ -41,7 +41,7 @@ def filled(empty: Store) -> Store:
 
 
 def numbers_of(connection: Connection, name: str | None) -> list[int]:
-    return [one.number for one in list_events(connection, Wanted()) if one.map == name]
+    return [one.number for one in list_events(connection, EventFilter()) if one.map == name]
 
 
 def expected(connection: Connection, kept: int, anchors: Collection[int]) -> set[int]:
@@ -57,65 +57,65 @@ def expected(connection: Connection, kept: int, anchors: Collection[int]) -> set
 def test_what_is_not_kept_goes_and_the_anchors_stay(filled, kept):
     anchor = anchor_of_now(filled.database, "shop")
     with filled.database.write() as connection:
-        found = spent_numbers(connection, kept, (6, 33), 99)
+        found = surplus_events(connection, kept, (6, 33), 99)
         assert set(found) == expected(connection, kept, (6, 33))
         assert len(found) == len(set(found))
-        assert spent_numbers(connection, kept, (6, 33), 5) == found[:5]
+        assert surplus_events(connection, kept, (6, 33), 5) == found[:5]
         remove_events(connection, found)
-        assert spent_numbers(connection, kept, (6, 33), 99) == []
+        assert surplus_events(connection, kept, (6, 33), 99) == []
         assert holds_anchor(connection, anchor)
 
 
 def test_what_happens_elsewhere_moves_nothing(filled):
-    shop = Wanted(frozenset(("shop",)))
+    shop = EventFilter(frozenset(("shop",)))
     with filled.database.write() as connection:
-        before = {after: floor_of(connection, shop, 10, after) for after in range(62)}
-        own = floors(connection, 10)["shop"]
+        before = {after: removal_floor(connection, shop, 10, after) for after in range(62)}
+        own = removal_floors(connection, 10)["shop"]
         assert own == numbers_of(connection, "shop")[-11]
         assert {after for after, floor in before.items() if floor > after} == set(range(own))
         for _ in range(150):
             record_event(connection, "frame.received", "hall")
             record_event(connection, "key.created")
-        assert floors(connection, 10)["shop"] == own
+        assert removal_floors(connection, 10)["shop"] == own
         for after in before:  # the same is missed
-            assert (floor_of(connection, shop, 10, after) > after) == (after < own)
-        gone = spent_numbers(connection, 10, (), 9999)
+            assert (removal_floor(connection, shop, 10, after) > after) == (after < own)
+        gone = surplus_events(connection, 10, (), 9999)
         shop_numbers = numbers_of(connection, "shop")
         shops = [one for one in shop_numbers if one < own]
         assert [one for one in gone if one in shop_numbers] == shops
-        assert floor_of(connection, Wanted(), 10, 0) > own
+        assert removal_floor(connection, EventFilter(), 10, 0) > own
 
 
 def test_what_is_left_of_maps_that_are_gone_is_bounded_together(filled):
     with filled.database.write() as connection:
         remove_map(connection, find_map(connection, "hall"))
         rest = sorted(numbers_of(connection, "hall") + numbers_of(connection, None))
-        assert floors(connection, 10)[None] == rest[-11]
-        hall = Wanted(frozenset(("hall",)))
-        assert floor_of(connection, hall, 10, 0) == rest[-11]
-        gone = spent_numbers(connection, 10, (), 99)
+        assert removal_floors(connection, 10)[None] == rest[-11]
+        hall = EventFilter(frozenset(("hall",)))
+        assert removal_floor(connection, hall, 10, 0) == rest[-11]
+        gone = surplus_events(connection, 10, (), 99)
         assert set(gone) - set(numbers_of(connection, "shop")) == set(rest[:-10])
 
 
 def test_nothing_goes_of_nothing(empty):
     with empty.database.read() as connection:
-        assert spent_numbers(connection, 10, (), 99) == []
-        assert floor_of(connection, Wanted(), 10, 0) == 0
+        assert surplus_events(connection, 10, (), 99) == []
+        assert removal_floor(connection, EventFilter(), 10, 0) == 0
 
 
 def test_of_a_map_that_is_gone_nothing_is_missed_after_its_last_event(filled):
-    hall = Wanted(frozenset(("hall",)))
+    hall = EventFilter(frozenset(("hall",)))
     with filled.database.write() as connection:
         remove_map(connection, find_map(connection, "hall"))
         last = numbers_of(connection, "hall")[-1]
         for _ in range(100):  # in others that are gone, and in none
             record_event(connection, "key.created")
-        remove_events(connection, spent_numbers(connection, 10, (), 999))
+        remove_events(connection, surplus_events(connection, 10, (), 999))
         assert numbers_of(connection, "hall") == []
-        assert floor_of(connection, hall, 10, last - 1) > last - 1
-        assert floor_of(connection, hall, 10, last) <= last
-        assert floor_of(connection, Wanted(frozenset(("never",))), 10, 0) == 0
-        assert floor_of(connection, Wanted(frozenset()), 10, 0) == 0
+        assert removal_floor(connection, hall, 10, last - 1) > last - 1
+        assert removal_floor(connection, hall, 10, last) <= last
+        assert removal_floor(connection, EventFilter(frozenset(("never",))), 10, 0) == 0
+        assert removal_floor(connection, EventFilter(frozenset()), 10, 0) == 0
 
 
 def test_names_of_maps_that_are_gone_are_bounded(filled, monkeypatch):

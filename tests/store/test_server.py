@@ -19,7 +19,7 @@ from sqlalchemy import insert, select, text
 from benchmarks.postgres import Server
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
 from sceneprint.store import Database, Store, database, open_database, open_store
-from sceneprint.store.database import is_there, known_revisions, reach_database
+from sceneprint.store.database import database_exists, known_revisions, reach_database
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import create_key, list_keys
 from sceneprint.store.maps import (
@@ -27,8 +27,8 @@ from sceneprint.store.maps import (
     add_map,
     find_map,
     frames_of,
-    keep_model,
     list_maps,
+    store_model,
 )
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.tables import MapRow, events, maps, metadata
@@ -73,9 +73,9 @@ def keeper(postgres_url: str) -> Iterator[Callable[[], None]]:
 def test_two_processes_may_open_an_empty_database_at_once(
     empty_url: str, race: Race, opens: str
 ) -> None:
-    assert not is_there(empty_url)
+    assert not database_exists(empty_url)
     assert race(opens, 2, empty_url) == [[known_revisions()[0]]] * 2
-    assert is_there(empty_url)
+    assert database_exists(empty_url)
     made = open_database(empty_url)
     with made.read() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
@@ -122,7 +122,7 @@ def test_a_turn_that_another_process_keeps_is_said(
     monkeypatch.setattr(postgres, "HELD_S", 0.2)
     for _ in range(2):  # the second, who comes after one that waited in vain, waits less
         with (
-            pytest.raises(StoreLocked, match=r"nothing was stored\. Come back.*pg_stat_activity"),
+            pytest.raises(StoreLocked, match=r"nothing was stored\. Try again.*pg_stat_activity"),
             served.write(),
         ):
             pytest.fail("it is not our turn")
@@ -167,7 +167,7 @@ def test_a_reader_sees_one_state_and_writes_nothing(served: Database) -> None:
             assert shown[6:] == ["3", "2", "3"]
         before = {one.execute(text("SELECT pg_backend_pid()")).scalar_one() for one in held}
     with pytest.raises(UnusableStore, match="read-only transaction"), served.read() as connection:
-        keep_model(connection, "m", "toy", b"x")
+        store_model(connection, "m", "toy", b"x")
     with served.read(), served.read(), served.write() as connection:
         # as if it were a standby: connections made anew may lead to the one that writes
         assert connection.execute(text("SELECT pg_backend_pid()")).scalar_one() not in before
@@ -207,7 +207,7 @@ def test_a_connection_of_its_own_commits_each_statement(served: Database) -> Non
     own.execute("INSERT INTO events (at, kind, data) VALUES (1, 'own', '{}')")
     with served.read() as connection:
         assert connection.execute(select(events.c.kind)).scalars().all() == ["own"]
-    with pytest.raises(StoreAway, match="is tried again"), served.explained():
+    with pytest.raises(StoreAway, match="service tries again"), served.explained():
         own.execute("SELECT pg_terminate_backend(pg_backend_pid())")
     assert own.closed
 
@@ -225,7 +225,7 @@ def test_texts_are_in_the_order_of_their_code_points(store: Store) -> None:
 
 def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store: Store) -> None:
     with store.database.write() as connection:
-        keep_model(connection, "m", "n" * 200, b"x")
+        store_model(connection, "m", "n" * 200, b"x")
         add_map(connection, "hall", None, "m")
         assert [row.name for row in list_maps(connection)] == ["hall"]
         found = connection.execute(select(maps.c.number).where(maps.c.name == "hall\0"))

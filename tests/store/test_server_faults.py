@@ -11,8 +11,8 @@ from sqlalchemy.exc import DBAPIError
 from benchmarks.postgres import Server
 from sceneprint import errors
 from sceneprint.store import Database, open_database
-from sceneprint.store.database import is_there, reach_database
-from sceneprint.store.read_only import look_at
+from sceneprint.store.database import database_exists, reach_database
+from sceneprint.store.read_only import inspect_database
 from sceneprint.store.tables import maps
 
 
@@ -26,20 +26,20 @@ def served(postgres_url: str) -> Iterator[Database]:
 @pytest.mark.parametrize(
     ("state", "kind", "said"),
     [
-        ("55P03", errors.StoreLocked, "Another process has been writing for long"),
+        ("55P03", errors.StoreLocked, "Another process has been writing for too long"),
         ("40001", errors.StoreLocked, "Another transaction was in the way"),
         ("40P01", errors.StoreLocked, "Another transaction was in the way"),
         ("53100", errors.StoreFull, "Free some space on the disk of the server"),
         ("53200", errors.UnusableStore, "Look into its log"),
         ("53300", errors.StoreAway, "max_connections"),
         ("25006", errors.ReadOnlyStore, "target_session_attrs=read-write"),
-        ("25P03", errors.UnusableStore, "was silent for long"),
+        ("25P03", errors.UnusableStore, "was idle for too long"),
         ("57014", errors.UnusableStore, "took too long"),
-        ("57P01", errors.StoreAway, "is tried again"),
-        ("08006", errors.StoreAway, "is tried again"),
+        ("57P01", errors.StoreAway, "service tries again"),
+        ("08006", errors.StoreAway, "service tries again"),
         ("28P01", errors.UnusableStore, "Check user and password"),
-        ("42501", errors.UnusableStore, "grant what is missing"),
-        ("58030", errors.UnusableStore, "trouble with its files"),
+        ("42501", errors.UnusableStore, "grant the ownership"),
+        ("58030", errors.UnusableStore, "cannot use its files"),
         ("XX001", errors.UnusableStore, "Restore a bundle"),
     ],
 )
@@ -99,7 +99,7 @@ def test_connections_that_were_ended_are_made_anew(served: Database, postgres: S
     [
         ("postgresql://u:hunter2@127.0.0.1:{port}/none", errors.UnusableStore, "does not exist"),
         ("postgres://none:hunter2@127.0.0.1:{port}/postgres", errors.UnusableStore, "user"),
-        ("postgresql+psycopg://u:hunter2@127.0.0.1:1/x", errors.StoreAway, "is tried again"),
+        ("postgresql+psycopg://u:hunter2@127.0.0.1:1/x", errors.StoreAway, "service tries again"),
         ("postgresql://u:hunt@er2@127.0.0.1/x", errors.UnusableStore, "%40"),
         ("postgresql://u:hunt@127.0.0.1:er2/x", errors.UnusableStore, "%40"),
         ("postgresql://127.0.0.1:{port}/x?user=u&password=hunter2&at=er2",
@@ -110,7 +110,7 @@ def test_connections_that_were_ended_are_made_anew(served: Database, postgres: S
          errors.UnusableStore, "Correct"),
         ("postgresql+asyncpg://u:hunter2@127.0.0.1/x", errors.UnusableStore, r"\+psycopg"),
         ("postgresql+psycopg2://u:hunter2@127.0.0.1/x", errors.UnusableStore, r"\+psycopg"),
-        ("mysql://u:hunter2@127.0.0.1/x", errors.UnusableStore, "is no database that is known"),
+        ("mysql://u:hunter2@127.0.0.1/x", errors.UnusableStore, "is not a supported database"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_reached_is_said_without_the_password(
@@ -118,8 +118,8 @@ def test_what_cannot_be_reached_is_said_without_the_password(
 ) -> None:
     monkeypatch.setenv("PGHOST", "/nowhere")
     port = postgres.url().rpartition(":")[2].partition("/")[0]
-    for use in (open_database, is_there, _looked_at):
-        if use is is_there and "Correct" not in said and "exist" not in said:
+    for use in (open_database, database_exists, _looked_at):
+        if use is database_exists and "Correct" not in said and "exist" not in said:
             continue  # it is asked before the database is opened, which says why
         with pytest.raises(errors.UnusableStore, match=said) as caught:
             use(given.format(port=port))
@@ -129,7 +129,7 @@ def test_what_cannot_be_reached_is_said_without_the_password(
 
 
 def _looked_at(url: str) -> None:
-    with look_at(url):
+    with inspect_database(url):
         pass
 
 

@@ -66,12 +66,12 @@ def test_a_prefix_belongs_to_one_database(store_url: str, bucket: str, tmp_path:
     assert again.blobs.get(digest) == b"depth"
     again.close()
     other = f"sqlite:///{tmp_path / 'other.db'}"
-    with pytest.raises(UnusableStore, match=r"of another database.*SCENEPRINT_BLOB_URL"):
+    with pytest.raises(UnusableStore, match=r"belong to another database.*SCENEPRINT_BLOB_URL"):
         open_store(other, f"{bucket}/mine")
     open_store(other, f"{bucket}/yours").close()
     objects = open_objects(f"{bucket}/mine")
     objects.put(MARK, b"[1]")
-    with pytest.raises(UnusableStore, match="of another database"):
+    with pytest.raises(UnusableStore, match="belong to another database"):
         open_store(store_url, f"{bucket}/mine")
 
 
@@ -81,7 +81,7 @@ def test_a_folder_of_a_fleet_belongs_to_one_database(postgres: Server, tmp_path:
     with closing(open_store(first, tmp_path)) as store:
         assert (tmp_path / MARK).is_file()
         assert list(store.blobs.digests()) == []
-    with pytest.raises(UnusableStore, match=r"of another database.*a prefix of its own"):
+    with pytest.raises(UnusableStore, match=r"belong to another database.*a prefix of its own"):
         open_store(second, tmp_path)
     with closing(open_database(second)) as database:
         (tmp_path / MARK).unlink()
@@ -94,7 +94,7 @@ def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:
     blobs = open_blobs(bucket, database, claim=False)
     assert list(open_objects(bucket).list("")) == []
     blobs.put(b"depth")  # what writes does
-    assert open_objects(bucket).look(MARK) is not None
+    assert open_objects(bucket).head(MARK) is not None
     blobs.close()
     database.close()
 
@@ -241,7 +241,7 @@ def test_a_folder_waits_for_who_removes(tmp_path: Path, monkeypatch: pytest.Monk
         store.blobs.remove(digest)
     assert held.result() is False
     monkeypatch.setattr("sceneprint.store.blobs.folder.TURN_S", 0.0)
-    with store.blobs.removing(), pytest.raises(StoreLocked, match="Come back later"):
+    with store.blobs.removing(), pytest.raises(StoreLocked, match="Try again later"):
         store.blobs.holds(digest)
     store.close()
 
@@ -258,6 +258,6 @@ def test_a_lock_that_was_lost_is_said(postgres_url: str, bucket: str) -> None:
                 "(SELECT oid FROM pg_database WHERE datname = current_database())"
             )
         )
-    with pytest.raises(UnusableStore, match=r"connection was lost.*Do it again"):
+    with pytest.raises(UnusableStore, match=r"connection was lost.*Run the command again"):
         kept.__exit__(None, None, None)
     store.close()

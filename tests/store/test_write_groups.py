@@ -170,7 +170,7 @@ def test_ctrl_c_of_one_that_waits_is_its_own(
         group._hand_over()  # before it notices
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(interrupted.told, "wait", wait)
+    monkeypatch.setattr(interrupted.ready, "wait", wait)
     monkeypatch.setattr("sceneprint.engine.ingest.write_groups._Waiting", lambda _: interrupted)
     group._led = True  # somebody writes
     with pytest.raises(KeyboardInterrupt):
@@ -186,10 +186,10 @@ def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
     entered, taken_by_now, leave = (threading.Event() for _ in range(3))
 
     class Interrupted(_Group[str]):
-        def _write_together(self, taken: list[_Waiting[str]]) -> None:
+        def _write_together(self, batch: list[_Waiting[str]]) -> None:
             entered.set()
             assert taken_by_now.wait(PATIENCE_S)
-            self._take(taken)
+            self._take(batch)
             leave.set()
             waiter.join(PATIENCE_S)
             raise KeyboardInterrupt
@@ -197,7 +197,7 @@ def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
     class Leaving(_Waiting[str]):
         def __init__(self, work: str) -> None:
             super().__init__(work)
-            monkeypatch.setattr(self.told, "wait", self.leave)
+            monkeypatch.setattr(self.ready, "wait", self.leave)
 
         def leave(self) -> None:
             assert leave.wait(PATIENCE_S)

@@ -1,4 +1,4 @@
-"""What operators and dashboards ask of a store: events, figures, models; and its housekeeping."""
+"""Operator tasks of a store: events, audit log, keys, tenants, and removal of old rows."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from sceneprint.store import keys as stored
 from sceneprint.store.audit_log import AuditFilter, AuditRow
 from sceneprint.store.deletion import DAY_S, remove_in_blocks
 from sceneprint.store.events import (
+    EventFilter,
     EventRow,
-    Wanted,
-    floor_of,
     list_events,
     newest_number,
     newest_seen,
     number_events,
+    removal_floor,
     remove_events,
-    spent_numbers,
+    surplus_events,
 )
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import OpaqueIds, invalid_cursor
@@ -52,78 +52,78 @@ from sceneprint_client.api.admin import (
 )
 from sceneprint_client.api.base import MAP_OR_EVERY
 
-# Following events: where a reader begins, and what comes next.
+# Event streams.
 #
-# after  --begin-->  place  --next_events-->  events and the next place, again and again
+# after  --begin-->  place  --next_events-->  events and the next place, repeatedly
 #
-# A place counts events of all maps, and stays in the process; what a reader is told of it is
-# `seen`, the last event up to there that it may be told.
+# A place is a number among the events of all maps, and stays in the process. Readers get `seen`
+# instead, the last event up to it that they may see.
 
 
 class EventSlice(NamedTuple):
-    """What comes next to a reader.
+    """The next events of a reader.
 
     Parameters
     ----------
-    found : events
-    place : number up to which these are all
-    seen : the last number up to there that the reader may know
+    events : events
+    place : number up to which the events are complete
+    seen : last number up to it that the reader may see
     """
 
-    found: list[EventRow]
+    events: list[EventRow]
     place: int
     seen: int
 
 
-def begin(database: Database, wanted: Wanted, kept: int, after: int | None) -> EventSlice:
-    """Where a reader goes on from, and what it must be told first.
+def begin(database: Database, wanted: EventFilter, kept: int, after: int | None) -> EventSlice:
+    """Return the place at which a reader starts, and a `missed` event if events were removed.
 
     Parameters
     ----------
-    database : that has the events
-    wanted : by the reader
-    kept : newest events of each map that are there for sure
-    after : number of the last event that the reader has had; None: it wants those from now on
+    database : database of the events
+    wanted : filter of the reader
+    kept : number of newest events of each map that are never removed
+    after : number of the reader's last event; None: start with new events
     """
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
         seen = newest_seen(connection, wanted)
-        lost = after is not None and floor_of(connection, wanted, kept, after) > after
+        lost = after is not None and removal_floor(connection, wanted, kept, after) > after
     if after is None:
         return EventSlice([], newest, seen)
-    if after > newest:  # the database was put back to an earlier state
+    if after > newest:  # the database was restored to an earlier state
         return EventSlice([missed(seen)], newest, seen)
     return EventSlice([missed(after)] if lost else [], after, after)
 
 
-def next_events(database: Database, wanted: Wanted, place: int, most: int) -> EventSlice:
-    """The next events."""
+def next_events(database: Database, wanted: EventFilter, place: int, most: int) -> EventSlice:
+    """Return the next events."""
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
-        found = list_events(connection, wanted, after=place, limit=most)
-        if len(found) == most:
-            return EventSlice(found, found[-1].number, found[-1].number)
-        return EventSlice(found, max(newest, place), newest_seen(connection, wanted))
+        rows = list_events(connection, wanted, after=place, limit=most)
+        if len(rows) == most:
+            return EventSlice(rows, rows[-1].number, rows[-1].number)
+        return EventSlice(rows, max(newest, place), newest_seen(connection, wanted))
 
 
 def missed(place: int) -> EventRow:
-    """Stands before what is still there."""
+    """Return an event that reports removed ones before the remaining ones."""
     return EventRow(place, time.time(), MISSED, None, None, None, {})
 
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks for events that are no longer kept, and how many are removed after one.
+#: Seconds between two removals of old events, and maximum number of events in one.
 TIDY_S = 60.0
 AT_MOST = 20_000
-#: Most beginnings of kinds that may be asked for.
+#: Maximum number of prefixes of kinds in a request.
 MOST_KINDS = 20
 
 
 class OperatorTasks:
-    """Events, figures and models of one store."""
+    """Events, statistics and models of one store."""
 
     def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
         self._store, self._settings = store, settings
@@ -131,18 +131,18 @@ class OperatorTasks:
         self.catalogue = Catalogue(store.database)
         self._tidied = time.monotonic()
 
-    def wanted(self, map_name: str | None = None, kinds: Sequence[str] = ()) -> Wanted:
-        """Which events are meant.
+    def wanted(self, map_name: str | None = None, kinds: Sequence[str] = ()) -> EventFilter:
+        """Return the filter of a request.
 
         Parameters
         ----------
-        map_name : only of this map
-        kinds : beginnings of the kinds; none: all
+        map_name : only map; None: all
+        kinds : prefixes of kinds; empty: all
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : too many kinds, or one that cannot be one.
+        UnknownMap : the map does not exist.
+        InvalidRequest : there are too many kinds, or one is malformed.
         """
         if len(kinds) > MOST_KINDS or not all(re.fullmatch(r"[a-z_.]{1,32}", k) for k in kinds):
             raise InvalidRequest(
@@ -151,28 +151,28 @@ class OperatorTasks:
                 (("kind", "not an event kind"),),
             )
         if map_name is None:
-            return Wanted(None, tuple(kinds))
+            return EventFilter(None, tuple(kinds))
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-        return Wanted(frozenset((row.name,)), tuple(kinds))
+        return EventFilter(frozenset((row.name,)), tuple(kinds))
 
     def events(
-        self, wanted: Wanted, *, after: str | None = None, cursor: str | None = None,
+        self, wanted: EventFilter, *, after: str | None = None, cursor: str | None = None,
         limit: int = 100, newest_first: bool = False,
     ) -> EventPage:  # fmt: skip
-        """A page of events.
+        """Return a page of events.
 
         Parameters
         ----------
-        wanted : which
-        after : only those that followed the event of this id
-        cursor : `next_cursor` of the page before
-        limit : at most so many
-        newest_first : else the oldest first
+        wanted : filter
+        after : id of an event, after which the page starts
+        cursor : `next_cursor` of the previous page
+        limit : maximum number of events
+        newest_first : whether the newest comes first
 
         Raises
         ------
-        InvalidRequest : a cursor that was not given out, or no id of an event.
+        InvalidRequest : the service issued no such cursor or event id.
         """
         seals, before = self._store.seals, None
         least = 0 if after is None else seals.event(after)
@@ -182,60 +182,53 @@ class OperatorTasks:
         number_events(self._store.database)
         with self._store.database.read() as connection:
             newest = newest_seen(connection, wanted)
-            found = list_events(
+            rows = list_events(
                 connection, wanted, after=least, before=before, limit=limit + 1,
                 newest_first=newest_first,
             )  # fmt: skip
-        items = [event_record(seals, one) for one in found[:limit]]
-        more = items[-1].id if len(found) > limit else None
+        items = [event_record(seals, one) for one in rows[:limit]]
+        more = items[-1].id if len(rows) > limit else None
         return EventPage(items=items, next_cursor=more, newest=seals.seal("event", newest))
 
     def tidy(self) -> int:
-        """Remove events that are no longer kept, if it is time; returns how many. Requests whose
-        keys are not remembered any more go with them.
+        """Remove old events and results of idempotent requests if it is due; return the number of
+        events.
 
-        Where that cannot be written, nothing is lost: it is tried again the next time.
+        Errors are logged, and the next call tries again.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
         self._tidied = time.monotonic()
         try:
             stored.remove_old_requests(self._store.database)
-            return self.remove_spent()
+            return self.remove_surplus()
         except SceneprintError as error:
             log.warning("event removal failed", extra={"error": str(error)})
             return 0
 
-    def remove_spent(self) -> int:
-        """Remove events that are no longer kept, a few at a time; returns how many."""
+    def remove_surplus(self) -> int:
+        """Remove surplus events in blocks; return their number."""
         kept, indexes = self._settings.events_kept, Path(self._settings.indexes)
 
         def spent(connection: Connection, limit: int) -> list[int]:
-            if not spent_numbers(connection, kept, (), 1):
-                return []  # most often: no index is looked at
-            return spent_numbers(connection, kept, anchors(indexes), limit)
+            if not surplus_events(connection, kept, (), 1):
+                return []  # usually, without reading indexes
+            return surplus_events(connection, kept, anchors(indexes), limit)
 
         return remove_in_blocks(self._store.database, spent, remove_events, AT_MOST)
 
 
 def event_record(seals: OpaqueIds, row: EventRow) -> Event:
-    """An event as JSON tells it."""
+    """Return the API record of an event."""
     return Event(
-        id=seals.seal("event", row.number),
-        at=when(row.at),
-        kind=row.kind,
-        map=row.map,
-        frame_id=row.frame_id,
-        job_id=row.job_id,
-        data=row.data,
-    )
+        id=seals.seal("event", row.number), at=when(row.at), kind=row.kind, map=row.map,
+        frame_id=row.frame_id, job_id=row.job_id, data=row.data,
+    )  # fmt: skip
 
 
-# Who changed what.
-
-#: Seconds between two looks for lines that are no longer kept.
+#: Seconds between two removals of old lines of the audit log.
 PRUNE_S = 3600.0
-#: Lines that are read at once.
+#: Number of lines to read at once.
 _BLOCK = 1000
 
 
@@ -244,7 +237,7 @@ class Audit:
 
     Parameters
     ----------
-    kept_days : after which a line is removed
+    kept_days : age at which lines are removed
     """
 
     def __init__(self, store: Store, kept_days: float) -> None:
@@ -255,7 +248,7 @@ class Audit:
         self, actor: Actor, tenant: str, map_name: str | None, target: str | None, request_id: str,
         **data: Any,
     ) -> None:  # fmt: skip
-        """Write a line for a request that was refused; see `audit_log.record_refusal`."""
+        """Write a line for a refused request; see `audit_log.record_refusal`."""
         with self._store.database.write(turn=False) as connection:
             audit_log.record_refusal(
                 connection, actor, tenant, map_name, target, request_id, **data
@@ -264,7 +257,7 @@ class Audit:
     def record(
         self, action: str, map_name: str | None = None, target: str | None = None, **data: Any
     ) -> None:
-        """Write a line for a change outside of the database, or in many transactions."""
+        """Write a line for a change outside the database, or in many transactions."""
         with self._store.database.write(turn=False) as connection:
             audit_log.record_change(connection, action, map_name, target, **data)
 
@@ -283,7 +276,7 @@ class Audit:
 
         def spent(connection: Connection, limit: int) -> list[int]:
             before = (read_clock(connection) if now is None else now) - self._kept_s
-            return audit_log.spent_lines(connection, before, limit)
+            return audit_log.surplus_lines(connection, before, limit)
 
         try:
             return remove_in_blocks(self._store.database, spent, audit_log.remove_lines, AT_MOST)
@@ -294,7 +287,7 @@ class Audit:
     def lines(self, wanted: AuditFilter) -> Iterator[AuditLine]:
         """Yield all lines, the oldest first."""
         after = 0
-        while True:  # whoever takes them may be slow, and no transaction waits for that
+        while True:  # a transaction for each block, as the reader may be slow
             with self._store.database.read() as connection:
                 block = audit_log.list_lines(connection, wanted, _BLOCK, after=after)
             if not block:
@@ -309,14 +302,14 @@ class Audit:
 
         Raises
         ------
-        InvalidRequest : a cursor that was not given out.
+        InvalidRequest : the service did not issue the cursor.
         """
         seals = self._store.seals
         before = seals.row("audit", cursor)
         with self._store.database.read() as connection:
-            found = audit_log.list_lines(connection, wanted, limit + 1, before=before)
-        more = seals.next_cursor("audit", [one.number for one in found], limit)
-        return Page[AuditLine](items=[_audit_line(one) for one in found[:limit]], next_cursor=more)
+            rows = audit_log.list_lines(connection, wanted, limit + 1, before=before)
+        more = seals.next_cursor("audit", [one.number for one in rows], limit)
+        return Page[AuditLine](items=[_audit_line(one) for one in rows[:limit]], next_cursor=more)
 
 
 def _audit_line(row: AuditRow) -> AuditLine:
@@ -328,27 +321,27 @@ def create_key(
     store: Store, name: str, grants: Mapping[str, Scope] | None = None,
     expires_at: datetime | None = None, tenant: str | None = None,
 ) -> MadeKey:  # fmt: skip
-    """Make a key; its secret is shown this once.
+    """Create a key, and return it with its secret, which is not stored.
 
     Parameters
     ----------
     grants : scope by name of a map, `*` for all; default: admin of all
-    expires_at : when it opens nothing any more, with a zone; default: never
-    tenant : whom it belongs to; default: one of the key's name
+    expires_at : end of validity, with a time zone; default: never
+    tenant : owner; default: a tenant with the key's name
 
     Raises
     ------
-    InvalidRequest : the name is empty, too long, not printable or taken by us; or a name of a map
-        that none can have; or `expires_at` is beyond what a date can say.
-    Conflict : there is a key of that name.
-    UnknownTenant : there is no such tenant.
+    InvalidRequest : the name is empty, too long, not printable or reserved; a name of a map is
+        malformed; or `expires_at` is out of range.
+    Conflict : the name is in use.
+    UnknownTenant : the tenant does not exist.
     """
     _check_name(name, "key")
     granted: dict[str, Scope] = dict(grants or {EVERY: "admin"})
-    for one in granted:
-        if not re.fullmatch(MAP_OR_EVERY, one):
+    for pattern in granted:
+        if not re.fullmatch(MAP_OR_EVERY, pattern):
             raise InvalidRequest(
-                f"{one!r:.80} is not a valid map name. Give map names, or * for all maps.",
+                f"{pattern!r:.80} is not a valid map name. Give map names, or * for all maps.",
                 (("grants", "not a map name"),),
             )
     until = None if expires_at is None else _until(expires_at)
@@ -364,8 +357,8 @@ def create_tenant(store: Store, name: str) -> None:
 
     Raises
     ------
-    InvalidRequest : the name is empty, too long, not printable or taken by us.
-    Conflict : there is a tenant of that name.
+    InvalidRequest : the name is empty, too long, not printable or reserved.
+    Conflict : the name is in use.
     """
     _check_name(name, "tenant")
     with store.database.write() as connection:
@@ -374,7 +367,12 @@ def create_tenant(store: Store, name: str) -> None:
 
 
 def delete_tenant(store: Store, name: str) -> None:
-    """Delete a tenant that has no key; UnknownTenant, Conflict."""
+    """Delete a tenant without keys.
+
+    Raises
+    ------
+    UnknownTenant, Conflict : see `tenants.delete_tenant`.
+    """
     with store.database.write() as connection:
         tenants.delete_tenant(connection, name)
         audit_log.record_change(connection, "tenant.deleted", target=name)
@@ -389,21 +387,21 @@ def _check_name(name: str, of: str) -> None:
         )
 
 
-#: Seconds for which a secret works after its rotation, unless told otherwise, and at most.
+#: Default and maximum seconds for which the former secret stays valid after a rotation.
 OVERLAP_S, MOST_OVERLAP_S = 3600.0, 30 * 86_400.0
 
 
 def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey:
-    """Give a key a new secret, shown this once; the one before works for a while longer.
+    """Give a key a new secret, and return it; the former secret stays valid for a while.
 
     Parameters
     ----------
-    overlap_s : seconds; 0: the one before ends now
+    overlap_s : seconds; 0: the former secret ends now
 
     Raises
     ------
     InvalidRequest : `overlap_s` is negative, or more than 30 days.
-    UnknownKey : there is none of that name.
+    UnknownKey : the key does not exist.
     """
     if not 0 <= overlap_s <= MOST_OVERLAP_S:
         raise InvalidRequest(
@@ -417,27 +415,27 @@ def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey
 
 
 def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page[Key]:
-    """Keys by name.
+    """Return a page of keys, sorted by name.
 
     Raises
     ------
-    InvalidRequest : a cursor that was not given out.
+    InvalidRequest : the service did not issue the cursor.
     """
     after = None if cursor is None else _name_of(cursor)
     with store.database.read() as connection:
-        found = stored.list_keys(connection, after, limit + 1)
-    last = found[limit - 1].name.encode() if len(found) > limit else None
+        rows = stored.list_keys(connection, after, limit + 1)
+    last = rows[limit - 1].name.encode() if len(rows) > limit else None
     more = None if last is None else base64.urlsafe_b64encode(last).decode()
-    items = [_key_record(row) for row in found[:limit]]
+    items = [_key_record(row) for row in rows[:limit]]
     return Page[Key](items=items, next_cursor=more)
 
 
 def _until(expires_at: datetime) -> float:
-    """Seconds since 1970, that are a date again when the key is told of."""
+    """Return the seconds since 1970 of a time that UTC can represent."""
     seconds = expires_at.timestamp()
     try:
         datetime.fromtimestamp(seconds, UTC)
-    except (ValueError, OverflowError) as error:  # of another zone, or rounded up
+    except (ValueError, OverflowError) as error:  # its zone or rounding puts it out of range
         raise InvalidRequest(
             f"{expires_at.isoformat()} is not within the years 1 to 9999 of UTC. Leave expires_at "
             "out for a key that does not expire.",
@@ -447,17 +445,12 @@ def _until(expires_at: datetime) -> float:
 
 
 def _key_record(row: stored.KeyRow) -> Key:
-    now = time.time()
+    previous = row.previous_until if (row.previous_until or 0) > time.time() else None
     return Key(
-        name=row.name,
-        grants=row.grants,
-        created_at=when(row.created_at),
-        expires_at=when(row.expires_at),
-        tenant=row.tenant,
-        # when it has passed, it is of no more interest
-        previous_until=when(row.previous_until) if (row.previous_until or 0) > now else None,
+        name=row.name, grants=row.grants, created_at=when(row.created_at),
+        expires_at=when(row.expires_at), tenant=row.tenant, previous_until=when(previous),
         last_used_at=when(row.last_used_at),
-    )
+    )  # fmt: skip
 
 
 def _name_of(cursor: str) -> str:

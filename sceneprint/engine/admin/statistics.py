@@ -1,4 +1,4 @@
-"""How the service does now, and did in the last hour: from the store, whoever wrote it.
+"""Statistics of the service, now and over the last hour, from the shared store.
 
 frames, jobs, events, samples  --Statistics.tell-->  Stats
 """
@@ -53,33 +53,33 @@ from sceneprint_client.api.admin import (
 
 log = logging.getLogger(__name__)
 
-# How far the search indexes are behind their maps, and which events they need to be believed.
+# State of the search indexes, and the events that are their anchors.
 
-#: Maps that are told of at most: those that changed most often.
+#: Maximum number of maps to report: those that changed most often.
 MOST = 200
 
 
 def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexState:
-    """The newest index of a map that can be read, by its manifest alone."""
+    """Return the state of a map's newest readable index, from its manifest."""
     for _, path in manifests(index_folder(indexes, row)):
-        found = _read(path)
-        if found is not None and row.pruned_revision <= found.revision <= row.revision:
-            tail = count_indexed(connection, row.number, found.revision)
-            recall = IndexRecall(**found.recall.model_dump())
-            return IndexState(map=row.name, generation=found.number, tail=tail, recall=recall)
+        manifest = _read(path)
+        if manifest is not None and row.pruned_revision <= manifest.revision <= row.revision:
+            tail = count_indexed(connection, row.number, manifest.revision)
+            recall = IndexRecall(**manifest.recall.model_dump())
+            return IndexState(map=row.name, generation=manifest.number, tail=tail, recall=recall)
     tail = count_indexed(connection, row.number, 0)
     return IndexState(map=row.name, generation=None, tail=tail, recall=None)
 
 
 def index_states(connection: Connection, indexes: Path) -> list[IndexState]:
-    """Of the maps that changed most often; the longest tail first."""
+    """Return the states of the maps that changed most often, the longest tail first."""
     rows = sorted(list_maps(connection), key=lambda row: -row.revision)[:MOST]
-    found = [index_state(connection, indexes, row) for row in rows]
-    return sorted(found, key=lambda state: (-state.tail, state.map))
+    states = [index_state(connection, indexes, row) for row in rows]
+    return sorted(states, key=lambda state: (-state.tail, state.map))
 
 
 def anchors(indexes: Path) -> frozenset[int]:
-    """Numbers of the events that the indexes of this machine are held to."""
+    """Return the numbers of the events that are anchors of this machine's indexes."""
     if not indexes.is_dir():
         return frozenset()
     folders = [folder for folder in indexes.iterdir() if is_index_folder(folder.name)]
@@ -92,16 +92,16 @@ def _read(path: Path) -> GenerationManifest | None:
     try:
         return read_manifest(path)
     except DamagedIndex:
-        return None  # readers pass it over too
+        return None  # readers skip it as well
 
 
-# How much room a store takes on its disk.
+# Sizes of a store's parts on the disk.
 
-#: Blobs that are measured one by one; of more, the rest is taken to be like them.
+#: Maximum number of files to measure; the size of the others is extrapolated.
 MEASURED = 5_000
-#: Frames of one map that are; taken evenly in the order they came.
+#: Maximum number of frames of a map to measure, evenly spaced in upload order.
 WEIGHED = 1_000
-#: Frames of a whole store that are weighed where blobs are not files, and blobs that are asked for.
+#: Maximum number of frames of a store, and of objects, to measure in an object store.
 SPREAD, ASKED = 64, 16
 _HERE = func.current_database()
 
@@ -111,39 +111,35 @@ def _bytes_of(folder: Path) -> int:
     total = 0
     for path in folder.rglob("*"):
         with suppress(OSError):
-            found = path.stat()
-            total += found.st_size if stat.S_ISREG(found.st_mode) else 0
+            status = path.stat()
+            total += status.st_size if stat.S_ISREG(status.st_mode) else 0
     return total
 
 
 def sizes(settings: Settings, store: Store) -> Sizes:
-    """Bytes of all parts of a store."""
+    """Return the bytes of all parts of a store."""
     free, disk = _free_of(settings.data_dir)
     blobs = settings.blobs
     return Sizes(
         database=_of_database(store.database),
         blobs=_of_blobs(blobs) if isinstance(blobs, Path) else _of_objects(store),
-        index=_bytes_of(settings.indexes),
-        free=free,
-        disk=disk,
-    )
+        index=_bytes_of(settings.indexes), free=free, disk=disk,
+    )  # fmt: skip
 
 
 def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRow) -> Sizes:
-    """Bytes of what one map takes: of it alone, so that nothing shows of any other.
+    """Return the bytes of one map, which reveal nothing of other maps.
 
-    A blob that several frames share counts for each of them."""
+    A blob that several frames share counts for each of them.
+    """
     numbers, total = frame_queries.frames_with_uploads(connection, row.number, WEIGHED)
-    uploads, signed, made = frame_queries.weigh(connection, numbers)
-    artifacts = _of_artifacts(store.blobs, made)
+    uploads, signed, blobs = frame_queries.stored_sizes(connection, numbers)
+    artifacts = _of_artifacts(store.blobs, blobs)
     share = max(len(numbers), 1)
     return Sizes(
-        database=signed * total // share,
-        blobs=(uploads + artifacts) * total // share,
-        index=_bytes_of(index_folder(indexes, row)),
-        free=None,
-        disk=None,
-    )
+        database=signed * total // share, blobs=(uploads + artifacts) * total // share,
+        index=_bytes_of(index_folder(indexes, row)), free=None, disk=None,
+    )  # fmt: skip
 
 
 def _of_database(database: Database) -> int | None:
@@ -157,51 +153,51 @@ def _of_database(database: Database) -> int | None:
 
 
 def _of_objects(store: Store) -> int:
-    """Bytes of all blobs in an object store: some of the rows are weighed, nothing is listed."""
+    """Return the bytes of all blobs in an object store, extrapolated from some rows."""
     with store.database.read() as connection:
-        some = frame_queries.spread_frames(connection, SPREAD)
-        uploads, _, artifacts = frame_queries.weigh(connection, some)
+        sample = frame_queries.sample_frames(connection, SPREAD)
+        uploads, _, artifacts = frame_queries.stored_sizes(connection, sample)
         total = frame_queries.count_uploads(connection)
         files = frame_queries.bytes_of_files(connection)
-    each = (uploads + _of_artifacts(store.blobs, artifacts)) / max(len(some), 1)
+    each = (uploads + _of_artifacts(store.blobs, artifacts)) / max(len(sample), 1)
     return int(each * total) + files
 
 
 def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
-    """Bytes of some blobs; of many that each cost a request, a few stand for all."""
+    """Return the bytes of some blobs; in an object store, extrapolate from a few."""
     if isinstance(blobs, FolderBlobs):
-        return sum(blobs.size(one) or 0 for one in artifacts)
-    some = artifacts[:: max(-(-len(artifacts) // ASKED), 1)]
+        return sum(blobs.size(digest) or 0 for digest in artifacts)
+    sample = artifacts[:: max(-(-len(artifacts) // ASKED), 1)]
     try:
-        asked = sum(blobs.size(one) or 0 for one in some)
-    except UnusableStore:  # other figures are told while the store is away
+        size = sum(blobs.size(digest) or 0 for digest in sample)
+    except UnusableStore:  # other statistics stay available
         return 0
-    return asked * len(artifacts) // max(len(some), 1)
+    return size * len(artifacts) // max(len(sample), 1)
 
 
 def _of_blobs(folder: Path) -> int:
-    """Bytes of all blobs: their names are hashes, so that any of the 256 folders is like all."""
+    """Return the bytes of all blobs, extrapolated: names are hashes, so all folders are alike."""
     try:
         parts = sorted(one.path for one in os.scandir(folder) if one.is_dir())
     except OSError:
         return 0
     total, seen = 0, 0
     for done, part in enumerate(parts, 1):
-        found = list(_files_of(Path(part)))
-        total, seen = total + sum(found), seen + len(found)
+        file_sizes = list(_file_sizes(Path(part)))
+        total, seen = total + sum(file_sizes), seen + len(file_sizes)
         if seen >= MEASURED:
             return total * len(parts) // done
     return total
 
 
-def _files_of(folder: Path) -> Iterator[int]:
+def _file_sizes(folder: Path) -> Iterator[int]:
     """Yield the bytes of each file of a folder."""
     try:
         for one in os.scandir(folder):
             if one.is_file(follow_symlinks=False):
                 yield _size(one)
     except OSError:
-        return  # removed meanwhile, or not there yet
+        return  # removed meanwhile, or missing
 
 
 def _size(path: Path | os.DirEntry[str]) -> int:
@@ -212,29 +208,35 @@ def _size(path: Path | os.DirEntry[str]) -> int:
 
 
 def _free_of(folder: Path) -> tuple[int, int]:
-    """Bytes left on the disk of a folder, which need not be there yet, and all that it has."""
+    """Return the free and total bytes of the disk of a folder, which may be missing."""
     try:
-        found = shutil.disk_usage(nearest_folder(folder))
+        usage = shutil.disk_usage(nearest_folder(folder))
     except OSError:
         return 0, 0
-    return found.free, found.total
+    return usage.free, usage.total
 
 
 MINUTE_S, HOUR_S = 60.0, 3600.0
-#: Seconds for which the sizes of folders, which take long to measure, are told again.
+#: Seconds for which measured sizes are reused, as measuring takes long.
 MEASURED_S = 30.0
-#: Seconds for which figures are told again: whoever asks, and however often, it costs little.
+#: Seconds for which metrics are reused.
 TOLD_S = 1.0
-#: Frames and jobs from which on a thread counts them, and the share of the time that it does.
+#: Number of frames and jobs above which a thread counts them, and its maximum share of the time.
 MANY, COUNTING = 100_000, 0.01
-#: What samples are kept of: what a service counted, and workers that began.
+#: Kinds of samples: counts of a service, and starts of workers.
 SERVICE, WORKER = "service", "worker"
 
 
 @dataclass(frozen=True)
 class Figures:
-    """How the whole store is: its statistics, workers that began in the last hour, the number of
-    the newest event, and the jobs that wait by tenant.
+    """Metrics of the whole store.
+
+    Parameters
+    ----------
+    stats : statistics
+    began : number of workers that started in the last hour
+    events : number of the newest event
+    waiting : queued jobs by tenant
     """
 
     stats: Stats
@@ -245,15 +247,15 @@ class Figures:
 
 @dataclass(frozen=True)
 class StoreCounts:
-    """What takes the longer to count the more there is.
+    """Counts that take longer the larger the store is.
 
     Parameters
     ----------
-    frames, jobs : how many are in each state
+    frames, jobs : numbers by state
     indexes : see `index_states`
     sizes : bytes on the disk
-    at : when they were counted, seconds since 1970
-    seconds : that it took
+    at : time of the counts, seconds since 1970
+    seconds : duration of counting
     """
 
     frames: Mapping[str, int]
@@ -265,38 +267,38 @@ class StoreCounts:
 
     @property
     def is_large(self) -> bool:
-        """Whether there is too much to be counted for whoever asks."""
+        """Whether the store is too large to be counted for each request."""
         return sum(self.frames.values()) + sum(self.jobs.values()) >= MANY
 
     @property
     def is_old(self) -> bool:
-        """Whether to count again; where a clock was set back, it is."""
+        """Whether the counts are outdated, or the clock was set back."""
         return not 0 <= time.time() - self.at < self.seconds / COUNTING
 
 
 class Statistics:
-    """Figures of one store."""
+    """Statistics of one store."""
 
     def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
         self._store, self._settings, self._bell = store, settings, bell
         self._counts: StoreCounts | None = None
-        self._counting = threading.Lock()  # held by who counts a large store
+        self._counting = threading.Lock()  # held while a large store is counted
         self._sizes: tuple[float, Sizes] | None = None
         self._sizes_of: dict[int, tuple[float, Sizes]] = {}
         self._figures: tuple[float, Figures] | None = None
         self._lock = threading.Lock()
 
     def tell(self, minutes: int = 60, map_name: str | None = None) -> Stats:
-        """All figures, of the whole store or of one map.
+        """Return all statistics of the store or of one map.
 
         Parameters
         ----------
-        minutes : of history, from 1 to 60
-        map_name : only of this map
+        minutes : length of the history, from 1 to 60
+        map_name : only map; None: all
 
         Raises
         ------
-        UnknownMap : no such map.
+        UnknownMap : the map does not exist.
         """
         now = time.time()
         start = (now // MINUTE_S - minutes + 1) * MINUTE_S
@@ -321,53 +323,44 @@ class Statistics:
                 maps, indexes = 1, [index_state(connection, self._indexes, row)]
                 oldest, workers = store_counts.oldest_waiting(connection, row.number), None
             scrub = None if row is not None else _scrub_seen(read_scrub(connection))
-            taken = counted.sizes if row is None else self._sizes_of_map(connection, row)
+            used = counted.sizes if row is None else self._sizes_of_map(connection, row)
         return Stats(
-            at=when(now),
-            counted_at=when(now if row is not None else counted.at),
-            map=map_name,
-            maps=maps,
-            frames=frames,
-            jobs=jobs,
-            waiting=jobs.get(JobState.QUEUED, 0),
-            oldest_waiting_s=None if oldest is None else max(now - oldest, 0.0),
-            indexes=indexes,
-            workers=workers,
-            bytes=taken,
-            use=None if row is None else _use(row),
-            scrub=scrub,
+            at=when(now), counted_at=when(now if row is not None else counted.at), map=map_name,
+            maps=maps, frames=frames, jobs=jobs, waiting=jobs.get(JobState.QUEUED, 0),
+            oldest_waiting_s=None if oldest is None else max(now - oldest, 0.0), indexes=indexes,
+            workers=workers, bytes=used, use=None if row is None else _use(row), scrub=scrub,
             total=Counted(**_recent_counts(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
-        )
+        )  # fmt: skip
 
     @property
     def _indexes(self) -> Path:
         return self._settings.indexes
 
     def figures(self) -> Figures:
-        """The whole store, looked at now and then."""
-        with self._lock:  # who comes meanwhile waits, and is told the same
+        """Return the metrics of the whole store, at most a second old."""
+        with self._lock:  # concurrent requests wait for the same metrics
             now = time.monotonic()
             if self._figures is None or now - self._figures[0] > TOLD_S:
                 self._figures = now, self._look()
             return self._figures[1]
 
     def counts(self, connection: Connection) -> StoreCounts:
-        """How many frames and jobs there are, how far the indexes are, and what all takes.
+        """Return the counts of frames and jobs, the states of indexes, and sizes.
 
-        Of a large store it is what was counted last; a thread counts again for COUNTING of the
-        time.
+        For a large store, return the last counts; a thread renews them for the share COUNTING of
+        the time.
         """
-        known = self._counts
-        if known is None or not known.is_large:
+        counts = self._counts
+        if counts is None or not counts.is_large:
             return self._count(connection)
-        if known.is_old and self._counting.acquire(blocking=False):
+        if counts.is_old and self._counting.acquire(blocking=False):
             try:
                 threading.Thread(target=self._count_again, name="counts", daemon=True).start()
-            except BaseException:  # the system has no thread left: the next request tries again
+            except BaseException:  # no thread could start; the next request tries again
                 self._counting.release()
                 raise
-        return known
+        return counts
 
     def _count_again(self) -> None:
         try:
@@ -380,19 +373,15 @@ class Statistics:
 
     def _count(self, connection: Connection) -> StoreCounts:
         began, start = time.time(), time.monotonic()
-        found = StoreCounts(
-            frames=count_states(connection),
-            jobs=count_jobs(connection),
-            indexes=index_states(connection, self._indexes),
-            sizes=self.sizes(),
-            at=began,
+        self._counts = StoreCounts(
+            frames=count_states(connection), jobs=count_jobs(connection),
+            indexes=index_states(connection, self._indexes), sizes=self.sizes(), at=began,
             seconds=time.monotonic() - start,
-        )
-        self._counts = found
-        return found
+        )  # fmt: skip
+        return self._counts
 
     def began(self, worker: str) -> None:
-        """Note that a worker has begun; where that cannot be written, nobody will know."""
+        """Record the start of a worker; ignore errors of the store."""
         with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
             store_counts.add_sample(connection, WORKER, worker, {})
 
@@ -405,13 +394,13 @@ class Statistics:
             return Figures(stats, began, newest, waiting)
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
-        """Processes that wait for jobs, with SQLite on this machine, and those that have one."""
-        busy = store_counts.at_work(connection, read_clock(connection))
+        """Return processes that wait for jobs (on SQLite, of this machine), or run one."""
+        busy = store_counts.running_jobs(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
 
     def sizes(self) -> Sizes:
-        """Bytes on the disk, measured now and then."""
+        """Return the bytes on the disk, at most MEASURED_S old."""
         now = time.monotonic()
         if self._sizes is None or now - self._sizes[0] > MEASURED_S:
             self._sizes = now, sizes(self._settings, self._store)
@@ -419,47 +408,38 @@ class Statistics:
 
     def _sizes_of_map(self, connection: Connection, row: MapRow) -> Sizes:
         now = time.monotonic()
-        kept = {n: one for n, one in list(self._sizes_of.items()) if now - one[0] <= MEASURED_S}
-        if row.number not in kept:  # two that ask at once measure twice, and tell the same
-            found = sizes_of_map(connection, self._store, self._indexes, row)
-            kept[row.number] = now, found
-            self._sizes_of = kept
-        return kept[row.number][1]
+        recent = {n: one for n, one in list(self._sizes_of.items()) if now - one[0] <= MEASURED_S}
+        if row.number not in recent:  # concurrent requests may measure twice
+            recent[row.number] = now, sizes_of_map(connection, self._store, self._indexes, row)
+            self._sizes_of = recent
+        return recent[row.number][1]
 
 
 def _scrub_seen(row: ScrubRow | None) -> ScrubSeen | None:
     if row is None:
         return None
     return ScrubSeen(
-        began_at=when(row.began_at),
-        finished_at=None if row.finished_at is None else when(row.finished_at),
-        blobs=row.blobs,
-        bytes=row.bytes,
-        damaged=row.damaged,
-    )
+        began_at=when(row.began_at), finished_at=when(row.finished_at), blobs=row.blobs,
+        bytes=row.bytes, damaged=row.damaged,
+    )  # fmt: skip
 
 
 def _use(row: MapRow) -> MapUse:
     return MapUse(
-        frames=row.used_frames,
-        bytes=row.used_bytes,
-        quota_frames=row.quota_frames,
-        quota_bytes=row.quota_bytes,
-        retention_days=row.retention_days,
-    )
+        frames=row.used_frames, bytes=row.used_bytes, quota_frames=row.quota_frames,
+        quota_bytes=row.quota_bytes, retention_days=row.retention_days,
+    )  # fmt: skip
 
 
 def _minutes(
-    happened: Mapping[tuple[int, str], int],
-    samples: list[store_counts.Sample] | None,
-    start: float,
-    count: int,
-) -> list[Minute]:
-    """What happened in each minute; a minute in which nothing did is told too."""
+    happened: Mapping[tuple[int, str], int], samples: list[store_counts.Sample] | None,
+    start: float, count: int,
+) -> list[Minute]:  # fmt: skip
+    """Return the counts of each minute, including those without events."""
     of_minute: dict[int, list[store_counts.Sample]] = {place: [] for place in range(count)}
     for sample in samples or ():
         place = int((sample.at - start) // MINUTE_S)
-        if place in of_minute:  # a clock that was set back may be ahead of now
+        if place in of_minute:  # a sample may be in the future if a clock was set back
             of_minute[place].append(sample)
     return [
         Minute(
@@ -473,23 +453,24 @@ def _minutes(
 
 
 def _recent_counts(
-    happened: Mapping[tuple[int, str], int],
-    places: range,
+    happened: Mapping[tuple[int, str], int], places: range,
     samples: list[store_counts.Sample] | None,
-) -> dict[str, Any]:
-    """Fields of `Counted` for some minutes."""
-    told: dict[str, Any] = {
+) -> dict[str, Any]:  # fmt: skip
+    """Return the fields of `Counted` for some minutes."""
+    counts: dict[str, Any] = {
         outcome: sum(happened.get((place, f"frame.{outcome}"), 0) for place in places)
         for outcome in OUTCOMES
     }
     if samples is None:
-        return told | dict.fromkeys(("queries", "latency", "requests", "refused", "busy", "broken"))
+        return counts | dict.fromkeys(
+            ("queries", "latency", "requests", "refused", "busy", "broken")
+        )
     queries: Counter[str] = Counter()
     statuses: Counter[int] = Counter()
     for sample in samples:
         queries.update(sample.data["queries"])
         statuses.update({int(status): n for status, n in sample.data["statuses"].items()})
-    return told | {
+    return counts | {
         "queries": dict(queries),
         "latency": _latency([sample.data["latencies"] for sample in samples]),
         "requests": sum(statuses.values()),
@@ -501,8 +482,8 @@ def _recent_counts(
 
 def _latency(parts: list[dict[str, int]]) -> Latency | None:
     histogram = merged(parts)  # type: ignore[arg-type]
-    found = [quantile(histogram, share) for share in (0.5, 0.95, 0.99)]
-    if any(one is None for one in found):
+    quantiles = [quantile(histogram, share) for share in (0.5, 0.95, 0.99)]
+    if any(one is None for one in quantiles):
         return None
-    p50, p95, p99 = (round(one, 6) for one in found if one is not None)
+    p50, p95, p99 = (round(one, 6) for one in quantiles if one is not None)
     return Latency(p50=p50, p95=p95, p99=p99)

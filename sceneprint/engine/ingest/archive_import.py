@@ -1,7 +1,8 @@
-"""Files into a map: stored whole on upload. Archives of sequences are then read frame by frame by a
-worker; for a map that comes as one file, see `map_import`.
+"""Import of archives: store a file whole on upload, then read its frames by a worker.
 
-chunks  --Receiver-->  a seekable blob  --Imports.begin-->  job  --Imports.handle-->  items
+For a map that comes as one file, see `map_import`.
+
+    chunks  --Receiver-->  a seekable blob  --Imports.begin-->  job  --Imports.handle-->  items
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.deletion import make_room
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map, living_map, model_content
+from sceneprint.store.maps import current_map, find_map, model_content
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.tables import ARCHIVE, JobRow, MapRow, frames
 from sceneprint.types import Intrinsics
@@ -49,20 +50,20 @@ from sceneprint_client.api.frames import ImportItem, ImportOptions, UploadSummar
 from sceneprint_client.formats import HEAD
 from sceneprint_client.frame_files import meta_of
 
-# Frames of an archive into a map, some at a time; what is wrong with one costs no other.
+# Frames of an archive are added in blocks. An error of one frame does not affect the others.
 #
-#     archive  --steps_of-->  Steps  --next_of-->  those taken at once  --take-->  ImportItems
+#     archive  --steps_of-->  Steps  --next_block-->  a block  --add_block-->  ImportItems
 #
-# A frame goes the way of every upload, so that what is done again after a crash finds it there.
+# Frames are added as by uploads, so that a repeated slice finds them.
 
-#: Frames that are taken in one commit, and bytes of more than one: a cloud may have 512 MiB, and
-#: what is taken at once is in memory.
+#: Maximum number of frames in one commit, and of their bytes: a cloud may have 512 MiB, and a block
+#: is in memory.
 _AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A frame of an archive, or why there is none."""
+    """A frame of an archive, or the reason why it cannot be read."""
 
     name: str
     sequence: FrameSequence | None = None
@@ -71,9 +72,9 @@ class Step:
 
 
 def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterator[Step]:
-    """All there is to tell of an archive, in the same order each time.
+    """Yield the frames and errors of an archive, in the same order each time.
 
-    `session` is that of all its frames; by default each sequence is one.
+    With `session`, all frames have that session; else each sequence is one.
     """
     for name, reason in archive.refused:
         yield Step(name, refused=errors.UnreadableArchive(reason))
@@ -82,8 +83,8 @@ def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterat
             yield Step(archive.name_of(reference), sequence, reference)
 
 
-def next_of(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step]:
-    """The steps that are taken at once, at least one."""
+def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step]:
+    """Return the next block of steps, at least one."""
     count = size = 0
     for step in steps[done : done + _AT_ONCE]:
         size += 0 if step.reference is None else archive.size_of(step.reference)
@@ -93,19 +94,19 @@ def next_of(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step
     return steps[done : done + count]
 
 
-def take(
+def add_block(
     uploads: Uploads, task: LongJob, archive: Archive, steps: Sequence[Step], options: ImportOptions
 ) -> list[ImportItem]:
-    """Take some frames in one commit, as long as the job is this worker's."""
+    """Add a block of frames in one commit, while the job is this worker's."""
 
-    def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
+    def fence(connection: Connection) -> None:  # the job may be cancelled
         queue.check_held(connection, task.job)
 
     outcomes: list[UploadOutcome | None] = []
-    taken = []
+    uploaded = []
     for step in steps:
         try:
-            taken.append(_upload(archive, step, options))
+            uploaded.append(_upload(archive, step, options))
             outcomes.append(None)
         except errors.StoreError:
             raise
@@ -113,7 +114,7 @@ def take(
             outcomes.append(UploadOutcome(None, error=type(error)(archive.told(error))))
         except MemoryError:
             outcomes.append(_too_large())
-    rest = iter(_added(uploads, task.of_map.name, taken, fence))
+    rest = iter(_added(uploads, task.of_map.name, uploaded, fence))
     return [
         import_item(step.name, outcome or next(rest))
         for step, outcome in zip(steps, outcomes, strict=True)
@@ -121,42 +122,36 @@ def take(
 
 
 def _added(
-    uploads: Uploads, map_name: str, taken: list[Upload], fence: Callable[[Connection], None]
+    uploads: Uploads, map_name: str, block: list[Upload], fence: Callable[[Connection], None]
 ) -> list[UploadOutcome]:
-    """Add them together; where memory does not do for that, one by one."""
-    if not taken:
+    """Add frames together, or one by one if memory is too small."""
+    if not block:
         return []
     try:
-        return uploads.add_all(map_name, taken, fence=fence)[0]
+        return uploads.add_all(map_name, block, fence=fence)[0]
     except MemoryError:
-        if len(taken) == 1:
+        if len(block) == 1:
             return [_too_large()]
-    return [one for each in taken for one in _added(uploads, map_name, [each], fence)]
+    return [one for each in block for one in _added(uploads, map_name, [each], fence)]
 
 
 def _too_large() -> UploadOutcome:
-    return UploadOutcome(
-        None,
-        error=errors.UnreadableFrame(
-            "The frame needs more memory than a worker may use. Send a smaller one."
-        ),
-    )
+    reason = "The frame needs more memory than a worker may use. Send a smaller one."
+    return UploadOutcome(None, error=errors.UnreadableFrame(reason))
 
 
 def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
     if step.sequence is None or step.reference is None:
         raise step.refused or ValueError("neither a frame nor refused")
     meta = meta_of(
-        step.reference,
-        robot=options.robot,
-        session=options.session or session_of(step.sequence),
-        tags=options.tags,
+        step.reference, robot=options.robot,
+        session=options.session or session_of(step.sequence), tags=options.tags,
         with_pose=options.with_poses,
         parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
         base=options.T_base_sensor,
         up=options.up.unit if isinstance(options.up, GivenDirection) else None,
         trust_depth=options.trust_depth,
-    )
+    )  # fmt: skip
     data = archive.data_of(step.reference)
     return Upload(data, meta, options.priority, options.if_novel)
 
@@ -164,10 +159,10 @@ def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
 def _summary_of(
     archive: Archive, steps: Sequence[Step], items: Sequence[dict[str, Any]], options: ImportOptions
 ) -> UploadSummary:
-    """Return what an import took, by what came of each step."""
-    found = [ImportItem.model_validate(one) for one in items]
+    """Return the summary of an import, from the results of its steps."""
+    results = [ImportItem.model_validate(one) for one in items]
     without, frames = Counter[str](), 0
-    for step, item in zip(steps, found, strict=True):
+    for step, item in zip(steps, results, strict=True):
         if step.sequence is None:
             continue
         frames += 1
@@ -177,50 +172,50 @@ def _summary_of(
             without[step.sequence.unposed if options.with_poses else "with_poses is false"] += 1
     notes = [one.note for one in archive.sequences if one.note]
     return upload_summary(
-        frames, without, [one.samples for one in found if one.samples is not None], notes,
+        frames, without, [one.samples for one in results if one.samples is not None], notes,
         lost=sum(one.lost for one in archive.sequences if options.with_poses),
     )  # fmt: skip
 
 
 def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
-    """Return what came of one frame of an import."""
+    """Return the item of an import for the result of one frame."""
     item = item_of(outcome)
+    if item.frame is None:
+        return ImportItem(
+            name=name, status=item.status, frame_id=None, job_id=None, problem=item.problem
+        )
+    frame = item.frame
     return ImportItem(
-        name=name,
-        status=item.status,
-        frame_id=None if item.frame is None else item.frame.frame_id,
-        job_id=None if item.frame is None else item.frame.job_id,
-        problem=item.problem,
-        samples=None if item.frame is None else item.frame.samples,
-        has_pose=item.frame is not None and item.frame.has_pose,
-    )
+        name=name, status=item.status, frame_id=frame.frame_id, job_id=frame.job_id,
+        problem=item.problem, samples=frame.samples, has_pose=frame.has_pose,
+    )  # fmt: skip
 
 
-#: Kinds of the jobs: of archives, and of maps that come as one file.
+#: Kinds of the jobs that import archives, and maps in one file.
 KIND, MAP_KIND = "import", "import-map"
-#: Seconds between two searches for archives of imports that have ended.
+#: Seconds between two searches for archives of finished imports.
 TIDY_S = 5.0
-#: How much more a compressed tar may hold than the largest archive that is taken.
+#: Maximum ratio of a compressed tar's content to the largest accepted archive.
 _UNPACKED = 4
-#: Frames that one statement names.
+#: Maximum number of ids in one statement.
 _IDS_AT_ONCE = 500
-#: Pixels along the longer side of a rendered view, at most.
+#: Maximum pixels along the longer side of a rendered view.
 _MOST_PIXELS = 640
 
 
 class _MapBytes:
-    """Passes the file of a map on as it is.
+    """Pass on the bytes of a map's file unchanged, and check them.
 
     Parameters
     ----------
-    name : of the file
+    name : name of the file
     """
 
     def __init__(self, name: str) -> None:
         self._name, self._head, self._size = name, b"", 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
-        """Yield the chunk; raises InvalidRequest where the file is an archive."""
+        """Yield the chunk; raise InvalidRequest if the file is an archive."""
         if len(self._head) < HEAD:
             self._head += chunk[: HEAD - len(self._head)]
             if len(self._head) >= BLOCK and is_archive(self._head):
@@ -233,19 +228,19 @@ class _MapBytes:
         yield chunk
 
     def end(self) -> Iterator[bytes]:
-        """Yield nothing; raises UnreadableCloud where what came is no map."""
+        """Yield nothing; raise UnreadableCloud if the file is not a map."""
         surface_format(self._head, self._name, self._size)
         yield from ()
 
 
 class Receiver:
-    """A file on its way in; see `Imports.receive`.
+    """A file that is being received; see `Imports.receive`.
 
     Parameters
     ----------
-    blob : that it becomes, compressed tars inflated
-    source : makes of what comes what is stored
-    reserve : counts a number of bytes against the quota of the map before they are written
+    blob : its blob, with compressed tars inflated
+    source : converts received bytes to stored ones
+    reserve : function that counts bytes against the map's quota before they are written
     """
 
     def __init__(
@@ -254,19 +249,19 @@ class Receiver:
         self._blob, self._source, self._reserve = blob, source, reserve
 
     def write(self, chunk: bytes) -> None:
-        """Take the next part.
+        """Write the next part.
 
         Raises
         ------
-        UnreadableArchive : it is no archive, is damaged, or holds more than it may.
-        UnreadableCloud : it is no file of a map.
+        UnreadableArchive : the file is not an archive, is damaged, or contains too much.
+        UnreadableCloud : the file is not a map.
         QuotaExceeded : the map has no room for it.
-        StoreFull, UnusableStore : it cannot be written.
+        StoreFull, UnusableStore : the blob cannot be written.
         """
         self._write(self._source.pieces(chunk))
 
     def end(self) -> queue.JobFile:
-        """Keep it, durable; raises as `write`."""
+        """Make the blob durable; raise the errors of `write`."""
         self._write(self._source.end())
         return queue.JobFile(
             ARCHIVE, self._blob.keep(), self._blob.size, "application/octet-stream"
@@ -279,26 +274,24 @@ class Receiver:
 
 
 def states_of_import(connection: Connection, job: JobRow) -> Counter[str]:
-    """Return how many frames that an import added are in each state."""
+    """Return the number of an import's frames in each state."""
     items = queue.items_of(connection, job.number)
     ids = [item["frame_id"] for item in items if item["frame_id"] is not None]
-    found = Counter[str]()
+    counts = Counter[str]()
     for start in range(0, len(ids), _IDS_AT_ONCE):
-        own = frames.c.id.in_(ids[start : start + _IDS_AT_ONCE])
-        asked = select(frames.c.state, func.count()).where(
-            frames.c.map_number == job.map_number, own
-        )
-        for state, count in connection.execute(asked.group_by(frames.c.state)):
-            found[state] += count
-    return found
+        own = frames.c.map_number == job.map_number, frames.c.id.in_(ids[start:][:_IDS_AT_ONCE])
+        statement = select(frames.c.state, func.count()).where(*own).group_by(frames.c.state)
+        for state, count in connection.execute(statement):
+            counts[state] += count
+    return counts
 
 
 def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewParameters:
-    """Return how the views of a map are made.
+    """Return the parameters of the views of a map.
 
     Raises
     ------
-    InvalidRequest : a camera, where the model of the map is one of scans.
+    InvalidRequest : a camera was sent for a model of scans.
     """
     k = options.camera
     camera = None
@@ -318,11 +311,11 @@ def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewPa
 
 
 class Imports:
-    """Imports of archives, and the begin of those of maps.
+    """Imports of archives, and the start of those of maps.
 
     Parameters
     ----------
-    most_bytes : of an archive, as it is sent
+    most_bytes : maximum size of an archive as sent
     """
 
     def __init__(self, store: Store, tasks: Tasks, uploads: Uploads, most_bytes: int) -> None:
@@ -333,16 +326,16 @@ class Imports:
 
     @contextmanager
     def receive(self, map_name: str, options: ImportOptions) -> Iterator[Receiver]:
-        """Take a file in parts; what is not kept by `Receiver.end` is removed.
+        """Receive a file in parts; unless `Receiver.end` is called, it is removed.
 
-        Its bytes count against the quota of the map as they come, until this ends: call `begin`
-        before.
+        Its bytes count against the map's quota as they arrive, until this context ends: call
+        `begin` within it.
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : a camera for a map of scans.
-        ReadOnlyStore, StoreFull, UnusableStore : nothing can be kept.
+        UnknownMap : the map does not exist.
+        InvalidRequest : a camera was sent for a map of scans.
+        ReadOnlyStore, StoreFull, UnusableStore : nothing can be stored.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -366,28 +359,25 @@ class Imports:
             incoming.add(row.number, -reserved)
 
     def _require_room(self, row: MapRow, incoming: int) -> None:
-        """Check that a map has room for all bytes that come in, and purge tombstones for them."""
+        """Check that a map has room for all incoming bytes, and purge tombstones for them."""
         with self._store.database.read() as connection:
-            row = living_map(connection, row)
+            row = current_map(connection, row)
         if row.quota_bytes is None or row.used_bytes + incoming <= row.quota_bytes:
             return
         with self._store.database.write(map_number=row.number) as connection:
-            gone = make_room(connection, living_map(connection, row), incoming, new=False)
+            gone = make_room(connection, current_map(connection, row), incoming, new=False)
         collect_deleted_blobs(self._store, gone)
 
     def begin(
-        self,
-        map_name: str,
-        archive: queue.JobFile,
-        options: ImportOptions,
+        self, map_name: str, archive: queue.JobFile, options: ImportOptions,
         once: IdempotentRequest | None = None,
-    ) -> tuple[Job, bool]:
-        """Queue the import of a file that was received.
+    ) -> tuple[Job, bool]:  # fmt: skip
+        """Queue the import of a received file.
 
         Returns
         -------
-        job : that imports it
-        replayed : whether `once` began it before
+        job : job of the import
+        replayed : whether an earlier request of `once` queued it
 
         Raises
         ------
@@ -413,26 +403,24 @@ class Imports:
     def items(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
     ) -> Page[ImportItem]:
-        """What came of the members of an archive, or the views of a map, so far, in their order.
+        """Return the results so far, in order, of an archive's frames or a map's views.
 
         Raises
         ------
-        UnknownMap, UnknownJob : there is none.
-        InvalidRequest : a cursor that was not given out.
+        UnknownMap, UnknownJob : the map or import does not exist.
+        InvalidRequest : the service did not issue the cursor.
         """
         first = row_of(cursor) or 0
         with self._store.database.read() as connection:
             row, job = find_map(connection, map_name), queue.find_job(connection, job_id)
             if job.kind not in (KIND, MAP_KIND) or job.map_number != row.number:
                 raise queue.unknown_job(job_id)
-            found = queue.items_of(connection, job.number, first, limit + 1)
-        more = str(first + limit) if len(found) > limit else None
-        return Page[ImportItem](
-            items=[ImportItem(**one) for one in found[:limit]], next_cursor=more
-        )
+            rows = queue.items_of(connection, job.number, first, limit + 1)
+        more = str(first + limit) if len(rows) > limit else None
+        return Page[ImportItem](items=[ImportItem(**one) for one in rows[:limit]], next_cursor=more)
 
     def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Import a part of an archive: frames until the slice is over, at least some."""
+        """Import a part of an archive: at least one block of frames."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(ARCHIVE)
@@ -441,9 +429,9 @@ class Imports:
                 "The archive was removed when its import failed or was cancelled. Send it again."
             )
         try:
-            with self._opened(file, options.name) as archive:
+            with self._open(file, options.name) as archive:
                 return self._slice(task, archive, options, is_over)
-        except errors.UnreadableArchive:  # trying again cannot help, and it may be large
+        except errors.UnreadableArchive:  # a retry does not help, and the archive may be large
             with self._store.database.write() as connection:
                 number = task.job.number
                 gone = queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
@@ -451,16 +439,16 @@ class Imports:
             raise
 
     def tidy(self) -> int:
-        """Remove archives of imports that failed, if it is time; return how many.
+        """Remove archives of finished imports if it is due; return their number.
 
         Raises
         ------
-        UnusableStore : it cannot be written; it is tried again the next time.
+        UnusableStore : the store cannot be written; the next call tries again.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
         self._tidied = time.monotonic()
-        with self._store.database.read() as connection:  # most often there is none: no lock
+        with self._store.database.read() as connection:  # usually none, so no lock
             if not queue.finished_with_file(connection, ARCHIVE):
                 return 0
         with self._store.database.write() as connection:
@@ -473,7 +461,7 @@ class Imports:
         return len(gone)
 
     @contextmanager
-    def _opened(self, file: queue.JobFile, name: str) -> Iterator[Archive]:
+    def _open(self, file: queue.JobFile, name: str) -> Iterator[Archive]:
         try:
             opened = self._store.blobs.open(file.blob)
         except FileNotFoundError as error:
@@ -496,12 +484,11 @@ class Imports:
         progress["total"] = len(steps)
         items: list[dict[str, Any]] = []
         while progress["done"] < len(steps) and (not items or not is_over()):
-            some = next_of(archive, steps, progress["done"])
-            for item in take(self._uploads, task, archive, some, options):
+            block = next_block(archive, steps, progress["done"])
+            for item in add_block(self._uploads, task, archive, block, options):
                 items.append(item.model_dump(mode="json"))
-                what = {202: "received", 200: "there"}.get(item.status, "refused")
-                progress[what] += 1
-            progress["done"] += len(some)
+                progress[{202: "received", 200: "there"}.get(item.status, "refused")] += 1
+            progress["done"] += len(block)
         over = progress["done"] >= len(steps)
         result: dict[str, Any] | None = None
         if over:

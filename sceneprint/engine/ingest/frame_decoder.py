@@ -1,4 +1,4 @@
-"""The door of the engine: uploaded bytes and their metadata to a frame, and who it is.
+"""Decode uploads and their metadata to frames, and identify their content.
 
 bytes, FrameMeta  --read_upload-->  Read: Frame | Cloud  --content_id-->  64 digits
 """
@@ -27,20 +27,20 @@ from sceneprint_client.files import naming
 from sceneprint_client.formats import CloudFormat, format_at, titles_of
 from sceneprint_client.poses import rotation_of
 
-#: What the coordinates of a cloud as they were sent are called, where its viewpoint is elsewhere.
+#: Name of a cloud's own coordinates as a base frame, if its viewpoint is not their origin.
 GIVEN_FRAME = "cloud"
 
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """An upload as it was read.
+    """A decoded upload.
 
     Parameters
     ----------
-    frame : as the geometry reads it
-    cloud : of a cloud, what is stored of it: how it was packed, where it was seen from, the units
-        a metre has, how many points it has, and what was done to them
-    base : what the frame of the robot's base is called, and T_base_sensor; None where not known
+    frame : frame for the geometry
+    cloud : stored description of a cloud: packing, viewpoint, units per metre, number of points,
+        and corrections
+    base : name of the robot's base frame, and T_base_sensor; None if unknown
     """
 
     frame: AnyFrame
@@ -49,24 +49,24 @@ class Read:
 
     @property
     def kind(self) -> Kind:
-        """A depth image or a point cloud."""
+        """Whether the upload is a depth image or a point cloud."""
         return "depth" if self.cloud is None else "cloud"
 
 
 def read_upload(data: bytes, meta: FrameMeta, decoders: Decoders) -> Read:
-    """The frame of an upload, checked as far as can be without signing it.
+    """Decode an upload, and check it as far as is possible without signing it.
 
     Parameters
     ----------
-    decoders : one of which decodes it
+    decoders : pool of decoders
 
     Raises
     ------
-    FrameError : undecodable samples, a camera that is none or of another image, a pose or
-        T_base_sensor that is not rigid, no sample at all, or a file that its decoder fails at.
-    InvalidRequest : a depth image without a camera, a cloud with one, or what has no meaning for
-        the kind it is; UnsupportedType where what unpacks it is not installed.
-    Busy : no decoder gets free, or none can be started.
+    FrameError : the samples cannot be decoded, the camera is invalid or that of another image, the
+        pose or T_base_sensor is not rigid, or there are no samples.
+    InvalidRequest : a depth image has no camera, a cloud has one, or other metadata does not apply;
+        UnsupportedType if the package that unpacks the file is not installed.
+    Busy : no decoder is free, or none can be started.
     """
     with decoders.place() as decoder:
         return _read(data, meta, decoder)
@@ -102,26 +102,26 @@ def _failed(error: errors.DecoderFailure) -> str:
 
 
 def read_stored(data: bytes, row: FrameRow, decoders: Decoders) -> AnyFrame:
-    """The frame of an upload that was let in before.
+    """Decode a stored upload.
 
     Raises
     ------
-    DamagedBlob : a decoder fails at it, as it did not before.
-    Busy : no decoder gets free, or none can be started.
+    DamagedBlob : the decoder fails, as it did not before.
+    Busy : no decoder is free, or none can be started.
     """
     try:
         with decoders.place() as decoder:
             return _read_stored(data, row, decoder)
     except errors.DecoderFailure as error:
         raise errors.DamagedBlob(
-            f"The upload of frame {row.id} cannot be decoded: {error}. Try again; if it stays so, "
+            f"The upload of frame {row.id} cannot be decoded: {error}. Try again; if that fails, "
             "send the frame again."
         ) from error
 
 
 def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
     if row.cloud is not None:
-        # a lost upload may have come again, packed otherwise
+        # the upload may have been replaced by one with another packing
         return decode_cloud(
             data,
             file_format=_packing(data),
@@ -137,12 +137,12 @@ def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
         along_ray=row.depth_along_ray,
         name=row.id,
         samples_of=decoder.samples,
-        trust_depth=True,  # it was let in
+        trust_depth=True,  # it was accepted before
     )
 
 
 def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
-    """The viewpoint of a stored cloud in its coordinates; None of a depth image."""
+    """Return the viewpoint of a stored cloud in its coordinates; None of a depth image."""
     if row.cloud is None or row.cloud["viewpoint"] is None:
         return None
     x, y, z = row.cloud["viewpoint"]
@@ -150,7 +150,7 @@ def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
 
 
 def content_id(read: Read) -> str:
-    """Hash of samples and camera, or points and viewpoint; not of how they were packed."""
+    """Return the hash of samples and camera, or points and viewpoint, but not of their packing."""
     if isinstance(read.frame, Cloud):
         viewpoint = None if read.cloud is None else read.cloud["viewpoint"]
         digest = hashlib.sha256(f"cloud {json.dumps(viewpoint)}\n".encode())
@@ -165,16 +165,16 @@ def content_id(read: Read) -> str:
 def columns(
     meta: FrameMeta, pose: Floats | None, base: tuple[str, Floats] | None
 ) -> dict[str, Any]:
-    """What of an upload's metadata is stored with it, by the columns of the table.
+    """Return the columns of an upload's metadata.
 
     Parameters
     ----------
-    pose, base : T_parent_sensor, and see Read
+    pose, base : T_parent_sensor, and the base as in Read
     """
     parent = None
     if meta.pose is not None:
         own = meta.session if meta.robot is None else f"{meta.robot}/{meta.session}"
-        parent = meta.pose.parent_frame or own  # two robots may call their runs alike
+        parent = meta.pose.parent_frame or own  # two robots may use the same names of sessions
     return {
         "intrinsics": None if meta.intrinsics is None else meta.intrinsics.model_dump(),
         "depth_scale": meta.depth_scale,
@@ -194,22 +194,22 @@ def columns(
 
 
 def base_of(
-    given: GivenBase | None, viewpoint: Sequence[float] | None
+    transform: GivenBase | None, viewpoint: Sequence[float] | None
 ) -> tuple[str, Floats] | None:
-    """What a robot's base is called, and T_base_sensor.
+    """Return the name of a robot's base frame, and T_base_sensor.
 
     Parameters
     ----------
-    given : as the caller said it
-    viewpoint : of a cloud: where nothing was said and it is not the origin, the coordinates as
-        they were sent take the base's place, so that answers speak of them too
+    transform : transform in the request
+    viewpoint : viewpoint of a cloud. Without `transform`, the cloud's coordinates replace the base
+        unless the viewpoint is their origin, so that answers contain their pose as well
 
     Raises
     ------
-    InvalidPose : not a rigid transform.
+    InvalidPose : the transform is not rigid.
     """
-    if given is not None:
-        return given.base_frame, pose_matrix(given, "T_base_sensor")
+    if transform is not None:
+        return transform.base_frame, pose_matrix(transform, "T_base_sensor")
     if viewpoint is None or not any(viewpoint):
         return None
     T = np.eye(4)
@@ -218,16 +218,18 @@ def base_of(
 
 
 def _packing(data: bytes) -> CloudFormat:
-    """How a cloud is packed that was let in: what does not say so is a KITTI scan."""
+    """Return the format of an accepted cloud; without a signature, it is a KITTI scan."""
     return format_of(data) or "kitti"
 
 
 def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
-    """Whether an upload is a point cloud; an array may be either, and with a camera is an image."""
+    """Return whether an upload is a point cloud. An array may be either; with a camera it is an
+    image.
+    """
     if meta.format is not None:
         return True
-    found = format_of(data)
-    return found is not None and (found != "npy" or meta.intrinsics is None)
+    cloud_format = format_of(data)
+    return cloud_format is not None and (cloud_format != "npy" or meta.intrinsics is None)
 
 
 def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Decoder) -> Read:
@@ -235,29 +237,27 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Deco
         meta, "point cloud",
         {"intrinsics": None, "depth_scale": 1000.0, "depth_along_ray": False, "trust_depth": False},
     )  # fmt: skip
-    given = meta.viewpoint
-    said = None if given is None else UNSAID if given == "file" else (given.x, given.y, given.z)
+    p = meta.viewpoint
+    viewpoint = None if p is None else UNSAID if p == "file" else (p.x, p.y, p.z)
     try:
         scan = decode_scan(
             data,
             file_format=meta.format,
-            viewpoint=said,
+            viewpoint=viewpoint,
             units_per_metre=meta.units_per_metre,
             pose=pose,
             points_of=decoder.points,
         )
     except errors.DecoderFailure as error:
         raise errors.UnreadableCloud(_failed(error)) from error
-    except (
-        errors.MissingDependency
-    ) as error:  # of this machine, and yet it is the file that asks for it
+    except errors.MissingDependency as error:  # the file's type is not supported here
         raise errors.UnsupportedType(str(error)) from error
-    if scan.file_format != _packing(data):  # it could not be read again without what was said
+    if scan.file_format != _packing(data):  # it could not be decoded again
         raise errors.UnreadableCloud(
             f"The file is read as {scan.file_format.upper()} but does not start like one. Write "
             "the file again."
         )
-    # nobody means -0.0 by another place
+    # -0.0 is the same viewpoint as 0.0
     seen_from = None if scan.viewpoint is None else [value + 0.0 for value in scan.viewpoint]
     stored = {
         "format": scan.file_format,
@@ -270,18 +270,18 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Deco
 
 
 def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
-    """See that nothing is said of a frame that would have no effect on it; InvalidRequest."""
-    said = [name for name, default in defaults.items() if getattr(meta, name) != default]
-    if said:
+    """Raise InvalidRequest if metadata does not apply to the kind of frame."""
+    extra = [name for name, default in defaults.items() if getattr(meta, name) != default]
+    if extra:
         raise errors.InvalidRequest(
-            f"The frame is a {kind}, and {' and '.join(f'`{name}`' for name in said)} would have "
+            f"The frame is a {kind}, and {' and '.join(f'`{name}`' for name in extra)} would have "
             "no effect. Leave it out, or check that you sent the right file.",
-            tuple((name, f"does not apply to a {kind}") for name in said),
+            tuple((name, f"does not apply to a {kind}") for name in extra),
         )
 
 
 def _without_camera(data: bytes) -> errors.SceneprintError:
-    """Why an upload without intrinsics is not read."""
+    """Return the error for an upload without intrinsics."""
     if format_at(data, "depth") is not None:
         return errors.InvalidRequest(
             "The frame is a depth image, but its intrinsics are missing. Send width, height, "
@@ -301,22 +301,20 @@ def _camera(k: CameraIntrinsics) -> Intrinsics:
     return Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy, tuple(k.distortion))
 
 
-# Transforms and poses between matrices and JSON.
-
-#: How far from 1 the length of a given quaternion may be.
+#: Maximum deviation of a quaternion's length from 1.
 _TOLERANCE = 1e-2
 
 
 def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
-    """T_parent_sensor (4, 4) of a pose or another transform given either way.
+    """Return T_parent_sensor (4, 4) of a pose or another transform in either notation.
 
     Parameters
     ----------
-    what : to begin an error with, where it is no pose
+    what : prefix of errors, if the transform is not a pose
 
     Raises
     ------
-    InvalidPose : not a rigid transform, or a quaternion that is not of unit length.
+    InvalidPose : the transform is not rigid, or the quaternion has not unit length.
     """
     with naming(what):
         return _matrix(pose)
@@ -326,7 +324,7 @@ def _matrix(pose: GivenTransform) -> Floats:
     if pose.matrix is not None:
         return rigid_transform(np.array(pose.matrix))
     t, r = pose.translation, pose.rotation
-    if t is None or r is None:  # the schema asks for both where there is no matrix
+    if t is None or r is None:  # the schema requires both without a matrix
         raise InvalidPose("The pose is incomplete. Give translation and rotation, or matrix.")
     q = np.array([r.x, r.y, r.z, r.w])
     length = float(np.linalg.norm(q))

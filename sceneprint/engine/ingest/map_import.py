@@ -1,10 +1,9 @@
-"""A map that comes whole, as one cloud or mesh: views of it are rendered and become its frames.
+"""Import of a map as one cloud or mesh: views of it are rendered and become its frames.
 
-file  --read-->  surface  --choose-->  viewpoints  --render-->  frames  --sign, test-->  result
+    file  --read-->  surface  --choose-->  viewpoints  --render-->  frames  --sign, test-->  result
 
-Each step takes one slice of the job or more. The file of the job is the upload at first, then the
-surface that was read from it, then the surface with the viewpoints. It counts against the quota of
-the map until the job is over.
+Each phase takes one or more slices of the job. The job's file is first the upload, then the decoded
+surface, then the surface with viewpoints. It counts against the map's quota until the job is over.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ from sceneprint.geometry.views import Renderer, ViewParameters, choose_views
 from sceneprint.store import Store, queue
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.frame_queries import PathFrame, has_parent_frame
-from sceneprint.store.maps import living_frame, living_map, use_of
+from sceneprint.store.maps import current_map, living_frame, map_usage
 from sceneprint.store.tables import ARCHIVE, MapRow
 from sceneprint.types import Floats, Intrinsics, ReferenceSurface
 from sceneprint_client.api import Answer, Filter, FrameMeta, FrameState, Query
@@ -63,27 +62,25 @@ from sceneprint_client.api.base import (
 from sceneprint_client.api.coverage import COVERAGE_OUTCOMES, NewMapCoverage
 from sceneprint_client.api.frames import VIRTUAL, ImportOptions, MapImportResult, WeakArea
 
-#: Views that are rendered before they are added in one commit.
+#: Number of views to render and add in one commit.
 _AT_ONCE = 16
-#: Seconds between two looks whether all views are signed.
+#: Seconds between two checks whether all views are signed.
 _PAUSE_S = 1.0
-#: Stored units of a metre in rendered depth images, at most, and of the farthest point.
+#: Maximum units per metre of rendered depth images, and units of the farthest point.
 _DEPTH_SCALE, _FARTHEST = 1000.0, 65_000
-#: Most areas that a result names as weak.
+#: Maximum number of weak areas in a result.
 _MOST_WEAK = 20
-
-# The file of the job: arrays one after the other, as NPY.
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSurface:
-    """What a job has of its map.
+    """The file of the job: a surface and its viewpoints, as consecutive NPY arrays.
 
     Parameters
     ----------
-    surface : as it was read
-    poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views that are added, and of those
-        that the map is tested with; none before they are chosen
+    surface : decoded surface
+    poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views to add, and of those to test
+        the map with; empty before they are chosen
     floor : height of the floor along `up`, metres
     """
 
@@ -93,7 +90,7 @@ class StoredSurface:
     floor: float = 0.0
 
     def write(self, file: Any) -> None:
-        """Write it to what has `write`."""
+        """Write the arrays to a file."""
         s = self.surface
         triangles = np.empty((0, 3), np.int32) if s.triangles is None else s.triangles
         floor = np.array([self.floor])
@@ -102,7 +99,7 @@ class StoredSurface:
 
     @classmethod
     def read(cls, file: BinaryIO) -> StoredSurface:
-        """Read what `write` wrote."""
+        """Read the arrays of `write`."""
         arrays = [npy.read_array(file, allow_pickle=False) for _ in range(7)]
         points, triangles, offset, up, poses, held_out, floor = arrays
         surface = ReferenceSurface(points, triangles if len(triangles) else None, offset, up)
@@ -125,9 +122,9 @@ class _Views:
 
     Parameters
     ----------
-    stored : its surface and viewpoints
-    parameters : of the sensor
-    options : of the import
+    stored : surface and viewpoints
+    parameters : parameters of the sensor
+    options : options of the import
     """
 
     def __init__(
@@ -139,8 +136,8 @@ class _Views:
     def upload(self, number: int) -> Upload:
         """Return a view of the map as a frame to add.
 
-        Its id follows from what it shows and where: the same view is added once, and two equal
-        views of two places are two frames.
+        Its id is a hash of content and viewpoint, so a repeated view is added once, and equal views
+        of two places are two frames.
         """
         pose, options = self._stored.poses[number], self._options
         view = self.view(pose)
@@ -149,21 +146,18 @@ class _Views:
         up = R_sensor_map @ self._stored.surface.up
         meta = view.meta.model_copy(
             update={
-                "robot": options.robot,
-                "session": session,
-                "tags": [*options.tags, VIRTUAL],
-                "name": f"{options.name}/{number:05d}",
-                "sequence": number,
+                "robot": options.robot, "session": session, "tags": [*options.tags, VIRTUAL],
+                "name": f"{options.name}/{number:05d}", "sequence": number,
                 "pose": GivenPose(matrix=pose.tolist(), parent_frame=parent),
                 "up": GivenDirection(x=up[0], y=up[1], z=up[2]),
             }
-        )
+        )  # fmt: skip
         place = f"{options.robot}\n{session}\n{parent}\n".encode() + pose.tobytes()
         frame_id = hashlib.sha256(place + view.data).hexdigest()[:32]
         return Upload(view.data, meta, options.priority, options.if_novel, frame_id)
 
     def view(self, pose: Floats) -> _View:
-        """Return a view as a robot without any knowledge of its pose would send it."""
+        """Return a view as a robot that does not know its pose would send it."""
         seen, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
             return _View(encode_npy(seen), FrameMeta())
@@ -184,12 +178,12 @@ def names_of(options: ImportOptions) -> tuple[str, str]:
 
 
 class MapImporter:
-    """Does the imports of maps that come as one file.
+    """Handler of jobs that import a map from one file.
 
     Parameters
     ----------
-    store, signers, uploads, queries : of the engine
-    seconds : processor time that the reading of a file may take
+    store, signers, uploads, queries : parts of the engine
+    seconds : maximum processor time to decode a file
     """
 
     def __init__(
@@ -204,7 +198,7 @@ class MapImporter:
         }  # fmt: skip
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Do a slice: one phase, or a part of it."""
+        """Run a slice: one phase, or a part of it."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(ARCHIVE)
@@ -221,19 +215,21 @@ class MapImporter:
     def _read(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Read the file in a process of its own."""
+        """Decode the file in a confined process."""
         del is_over, task
         axis = options.up if isinstance(options.up, str) else None
-        asked = SurfaceOptions(units_per_metre=options.units_per_metre, up=axis)
+        surface_options = SurfaceOptions(units_per_metre=options.units_per_metre, up=axis)
         with self._opened(file) as opened, tempfile.TemporaryFile() as local:
             try:
                 descriptor = opened.fileno()
-            except OSError:  # of an object store
+            except OSError:  # a file of an object store has no descriptor
                 shutil.copyfileobj(opened, local)
                 local.flush()
                 descriptor = local.fileno()
             try:
-                read = read_surface_confined(descriptor, options.name, asked, self._limits)
+                read = read_surface_confined(
+                    descriptor, options.name, surface_options, self._limits
+                )
             except DecoderFailure as error:
                 raise UnreadableCloud(
                     f"{options.name} cannot be read: {error}. Thin the points or simplify the "
@@ -248,8 +244,8 @@ class MapImporter:
             "units_per_metre": read.units_per_metre, "units_from": read.units,
             "up_from": read.up_from, "notes": list(read.notes),
         }  # fmt: skip
-        kept = self._keep(StoredSurface(surface, _NO_POSES, _NO_POSES))
-        return SliceResult(False, progress, files=[kept])
+        stored = self._store_surface(StoredSurface(surface, _NO_POSES, _NO_POSES))
+        return SliceResult(False, progress, files=[stored])
 
     def _choose(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
@@ -271,26 +267,28 @@ class MapImporter:
             "phase": "render", "total": 2 * n + tests, "views": n, "rendered": 0, "refused": 0,
             "signed": 0, "tested": 0, "outcomes": [], "seen": plan.covered,
         }  # fmt: skip
-        return SliceResult(False, progress, files=[self._keep(chosen)])
+        return SliceResult(False, progress, files=[self._store_surface(chosen)])
 
     def _render(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Render views and add them, at least some."""
+        """Render and add views, at least one block."""
         stored = self._stored(file)
         views = self._views(task, options, stored)
         progress, items = dict(task.progress), list[dict[str, Any]]()
         if not progress["rendered"] and options.offset is None and stored.surface.offset.any():
             self._require_one_offset(task, options, stored.surface.offset, views)
 
-        def fence(connection: Connection) -> None:  # cancelled, or of a map that was made anew
+        def fence(connection: Connection) -> None:  # the job may be cancelled
             queue.check_held(connection, task.job)
 
         while progress["rendered"] < progress["views"] and (not items or not is_over()):
             first = progress["rendered"]
-            some = [views.upload(i) for i in range(first, min(first + _AT_ONCE, progress["views"]))]
-            outcomes, _ = self._uploads.add_all(task.of_map.name, some, fence=fence)
-            for upload, outcome in zip(some, outcomes, strict=True):
+            block = [
+                views.upload(i) for i in range(first, min(first + _AT_ONCE, progress["views"]))
+            ]
+            outcomes, _ = self._uploads.add_all(task.of_map.name, block, fence=fence)
+            for upload, outcome in zip(block, outcomes, strict=True):
                 if isinstance(outcome.error, QuotaExceeded):
                     raise QuotaExceeded(
                         f"{outcome.error} {first} of {progress['views']} views were added; the "
@@ -299,7 +297,7 @@ class MapImporter:
                 item = import_item(str(upload.meta.name), outcome)
                 progress["refused"] += outcome.added is None
                 items.append(item.model_dump(mode="json"))
-            progress["rendered"] += len(some)
+            progress["rendered"] += len(block)
         if progress["rendered"] == progress["views"]:
             progress["phase"] = "sign"
         return SliceResult(False, _counted(progress), items)
@@ -307,7 +305,7 @@ class MapImporter:
     def _await_signatures(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Look whether all views are signed; the map can be tested then."""
+        """Wait until all views are signed, before the map is tested."""
         del options, file, is_over
         progress = dict(task.progress)
         states = self._states(task)
@@ -321,7 +319,7 @@ class MapImporter:
     def _test(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Look up views that were not added, at least one, or conclude."""
+        """Localise held-out views, at least one, and return the result after the last."""
         stored = self._stored(file)
         poses, progress = stored.held_out, dict(task.progress)
         outcomes = progress["outcomes"] = list(progress["outcomes"])
@@ -341,7 +339,7 @@ class MapImporter:
 
     def _parameters(self, row: MapRow, options: ImportOptions) -> ViewParameters:
         with self._store.database.read() as connection:
-            row = living_map(connection, row)
+            row = current_map(connection, row)
         return view_parameters_of(self._signers(row.model_id).model.parameters, options)
 
     def _views(self, task: LongJob, options: ImportOptions, stored: StoredSurface) -> _Views:
@@ -359,7 +357,7 @@ class MapImporter:
         with self._opened(file) as opened:
             return StoredSurface.read(opened)
 
-    def _keep(self, stored: StoredSurface) -> queue.JobFile:
+    def _store_surface(self, stored: StoredSurface) -> queue.JobFile:
         with self._store.blobs.incoming() as blob:
             stored.write(blob)
             return queue.JobFile(ARCHIVE, blob.keep(), blob.size, "application/octet-stream")
@@ -367,13 +365,13 @@ class MapImporter:
     def _require_one_offset(
         self, task: LongJob, options: ImportOptions, offset: Floats, views: _Views
     ) -> None:
-        """See that no other file has frames in the parent frame: it would have another offset."""
+        """Check that no file with another offset has frames in the parent frame."""
         _, parent = names_of(options)
         number, first = task.of_map.number, str(views.upload(0).frame_id)
         with self._store.database.read() as connection:
-            is_taken = has_parent_frame(connection, number, parent)
-            if not is_taken or living_frame(connection, number, first) is not None:
-                return  # the first file, or the same one sent once more
+            in_use = has_parent_frame(connection, number, parent)
+            if not in_use or living_frame(connection, number, first) is not None:
+                return  # the first file, or the same one again
         x, y, z = offset.tolist()
         raise InvalidRequest(
             f"The parent frame {parent!r} has frames already, and {options.name} lies far from its "
@@ -384,10 +382,10 @@ class MapImporter:
         )
 
     def _require_room(self, row: MapRow, views: int) -> None:
-        """See that the quota has room for so many frames, before any is added."""
+        """Check that the quota has room for all views, before any is added."""
         with self._store.database.read() as connection:
-            row = living_map(connection, row)
-            held = use_of(connection, row.number).frames
+            row = current_map(connection, row)
+            held = map_usage(connection, row.number).frames
         if row.quota_frames is not None and held + views > row.quota_frames:
             raise QuotaExceeded(
                 f"The map needs {views} views, and holds {held} frames of the {row.quota_frames} "
@@ -400,7 +398,7 @@ class MapImporter:
             return states_of_import(connection, task.job)
 
     def _outcome(self, row: MapRow, views: _Views, pose: Floats, options: ImportOptions) -> str:
-        """What a robot would be answered whose sensor is at a pose; one core does it."""
+        """Return the outcome of localising a robot at a pose, on one core."""
         session, parent = names_of(options)
         view = views.view(pose)
         query = Query(keep=False, filter=Filter(session=[session], tags=[VIRTUAL]))
@@ -412,7 +410,7 @@ class MapImporter:
 
         try:
             answer = steadily(self._store, [row.name], ask)
-        except FrameError:  # nothing in it can be signed
+        except FrameError:  # nothing in the view can be signed
             return "not_found"
         stop = PathFrame(
             -1, "", None, None, None, parent, pose.tolist(), is_cloud=view.meta.intrinsics is None
@@ -426,31 +424,25 @@ class MapImporter:
         surface, outcomes = stored.surface, progress["outcomes"]
         session, parent = names_of(options)
         counts = Counter(outcomes)
-        known = ("points", "triangles", "units_per_metre", "units_from", "up_from", "notes")
-        facts: dict[str, Any] = {name: progress[name] for name in known}
+        names = ("points", "triangles", "units_per_metre", "units_from", "up_from", "notes")
+        facts: dict[str, Any] = {name: progress[name] for name in names}
         # every view has a pose in the map's parent frame, so all are checked
         facts |= {name: counts[name] for name in COVERAGE_OUTCOMES if name != "unchecked"}
         return MapImportResult(
-            **facts,
-            up=Direction(**_xyz(surface.up)),
-            offset=Vector(**_xyz(surface.offset)),
-            session=session,
-            parent_frame=parent,
-            views=self._states(task)[FrameState.INDEXED],
-            refused=progress["refused"],
-            seen=progress["seen"],
-            tested=len(outcomes),
+            **facts, up=Direction(**_xyz(surface.up)), offset=Vector(**_xyz(surface.offset)),
+            session=session, parent_frame=parent, views=self._states(task)[FrameState.INDEXED],
+            refused=progress["refused"], seen=progress["seen"], tested=len(outcomes),
             coverage=counts["found"] / len(outcomes) if outcomes else None,
             weak=weak_areas(stored, outcomes),
-        )
+        )  # fmt: skip
 
 
-#: Farther than this from its new origin a surface would lose its millimetres, metres.
+#: Maximum distance of points from their origin, metres: single precision must keep millimetres.
 _FARTHEST_M = 20_000.0
 
 
 def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> ReferenceSurface:
-    """Return a surface relative to another offset; InvalidRequest where that is far from it."""
+    """Return a surface relative to another offset; raise InvalidRequest if that is far away."""
     to = np.array([offset.x, offset.y, offset.z])
     points = surface.points + (surface.offset - to)
     if not np.abs(points).max() <= _FARTHEST_M:
@@ -464,21 +456,21 @@ def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> R
 
 
 def _counted(progress: dict[str, Any]) -> dict[str, Any]:
-    """Progress with the sum of its steps."""
+    """Return the progress with the sum of its steps."""
     return progress | {"done": sum(progress[name] for name in ("rendered", "signed", "tested"))}
 
 
 def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
-    """Squares of the floor in which fewer than half of the tested views were found.
+    """Return the squares of the floor in which fewer than half of the tested views were localised.
 
     Parameters
     ----------
-    stored : with the poses of the views
-    outcomes : of each view, in their order
+    stored : surface with the poses of the views
+    outcomes : outcomes of the views, in order
 
     Returns
     -------
-    areas : those with the most views that were not found come first
+    areas : areas, those with the most failed views first
     """
     if not outcomes:
         return []
@@ -491,18 +483,15 @@ def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
     plans, width = coverage_plans(
         {"": queried}, {"": stored.poses[:, :3, 3]}, {"": PlanAxes(flat, "frames")}, None
     )
-    found = []
+    areas = []
     for cell in plans[0].cells:
         views = sum(getattr(cell, name) for name in COVERAGE_OUTCOMES)
         if 2 * cell.found < views:
             column, row = width * (cell.column + 0.5), width * (cell.row + 0.5)
             centre = column * flat[0] + row * flat[1] + stored.floor * up
-            found.append(
-                WeakArea(
-                    centre=Vector(**_xyz(centre)), width_m=width, views=views, found=cell.found
-                )
-            )
-    return sorted(found, key=lambda one: one.found - one.views)[:_MOST_WEAK]
+            vector = Vector(**_xyz(centre))
+            areas.append(WeakArea(centre=vector, width_m=width, views=views, found=cell.found))
+    return sorted(areas, key=lambda one: one.found - one.views)[:_MOST_WEAK]
 
 
 def _xyz(vector: Floats) -> dict[str, float]:

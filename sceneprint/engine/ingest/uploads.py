@@ -1,8 +1,8 @@
-"""Uploads into the store: checked, durable, and queued, many in one commit.
+"""Uploads: check and store frames durably, and queue their signing, many in one commit.
 
     Upload  --read_upload-->  decoded  --Store.blobs-->  durable blob  --add_frame-->  Added
 
-When an upload is answered, nothing can lose it. The disk is waited for by many at once.
+An answered upload cannot be lost. Concurrent uploads share the wait for the disk.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sceneprint.formats.sample_range import sample_range
 from sceneprint.store import Store
 from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import loosen, renew_frame
+from sceneprint.store.frames import relax_novelty, renew_frame
 from sceneprint.store.keys import IdempotentRequest, Overtaken
 from sceneprint.store.maps import (
     add_frame,
@@ -39,7 +39,7 @@ from sceneprint.store.maps import (
     require_room,
 )
 from sceneprint.store.new_frames import NewFrame, receive_frames
-from sceneprint.store.queue import enqueue, job_ids_of
+from sceneprint.store.queue import enqueue, signing_jobs
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState
@@ -50,52 +50,52 @@ from sceneprint_client.api.frames import (
     problem_of,
 )
 
-# Who an upload is: the frame that is there, a frame of its own, or a contradiction.
+# Identity: an upload is a new frame, a duplicate, or a conflict.
 
-#: What to call a column when it differs.
+#: Names of columns in error messages.
 _FIELDS = {
     "pose_parent": "pose.parent_frame", "base": "T_base_sensor", "content_id": "content",
     "cloud": "units_per_metre",
 }  # fmt: skip
-#: Columns that do not tell uploads apart: the same content under another name is the frame that is
-#: there, and keeps the name that it came with; samples are content.
+#: Columns that do not distinguish uploads: the same content with another name is a duplicate, and
+#: keeps its first name; samples follow from the content.
 _LABELS = ("name", "sequence", "samples")
 
 
 def find_duplicate(
-    connection: Connection, row: MapRow, content: str, known: dict[str, Any],
+    connection: Connection, row: MapRow, content: str, metadata: dict[str, Any],
     frame_id: str | None = None,
 ) -> FrameRow | None:  # fmt: skip
-    """The frame that an upload is of; None where the map has none yet.
+    """Return the frame that an upload duplicates; None if it is new.
 
     Parameters
     ----------
-    known : its metadata, by column
-    frame_id : that the caller wants for it; None: any frame of that content is it
+    metadata : the upload's columns
+    frame_id : id that the caller requests; None: any frame with the content is a duplicate
 
     Raises
     ------
-    FrameConflict : there is one, with other content or metadata.
+    FrameConflict : a frame has the id or content, but other content or metadata.
     """
     if frame_id is not None:
         frame = living_frame(connection, row.number, frame_id)
         if frame is None:
             return None
-        differing = _differing(frame, {"content_id": content, **known})
+        differing = _differing(frame, {"content_id": content, **metadata})
         if differing:
             raise errors.FrameConflict(
                 f"Frame {frame.id} of map {row.name} already exists with a different "
                 f"{', '.join(differing)}. Delete it first, send it unchanged, or use another id."
             )
         return frame
-    found = frames_of_content(connection, row.number, content)
-    for frame in found:
-        if not _differing(frame, known):
+    alike = frames_of_content(connection, row.number, content)
+    for frame in alike:
+        if not _differing(frame, metadata):
             return frame
-    if found:
+    if alike:
         raise errors.FrameConflict(
-            f"Frame {found[0].id} has the same content, but a different "
-            f"{', '.join(_differing(found[0], known))}. A map stores the same content once: "
+            f"Frame {alike[0].id} has the same content, but a different "
+            f"{', '.join(_differing(alike[0], metadata))}. A map stores the same content once: "
             "delete that frame first, send it unchanged, or PUT it under its own id."
         )
     return None
@@ -108,43 +108,37 @@ def _sent_value(frame: FrameRow, name: str) -> Any:
     return getattr(frame, name)
 
 
-def _differing(frame: FrameRow, known: dict[str, Any]) -> list[str]:
+def _differing(frame: FrameRow, metadata: dict[str, Any]) -> list[str]:
     return [
         _FIELDS.get(name, name)
-        for name, value in known.items()
+        for name, value in metadata.items()
         if name not in _LABELS
-        and _given_value(name, _sent_value(frame, name)) != _given_value(name, value)
+        and _caller_value(name, _sent_value(frame, name)) != _caller_value(name, value)
     ]
 
 
-def _given_value(name: str, value: Any) -> Any:
-    """What of a column the caller has said: not how a cloud was packed, nor what was found in it.
-
-    Its viewpoint is part of its content.
-    """
+def _caller_value(name: str, value: Any) -> Any:
+    """Return the part of a column that the caller supplied: for a cloud, only its units."""
     return value["units_per_metre"] if name == "cloud" and value is not None else value
 
 
 def is_retried(state: FrameState) -> bool:
-    """Whether an upload of the same gives a frame another try.
+    """Return whether a repeated upload retries a frame in this state.
 
-    It broke down every time, or was near to a frame that may be gone since.
+    Failed and redundant frames are retried: the frame that made them redundant may be deleted.
     """
     return state in (FrameState.FAILED, FrameState.REDUNDANT)
 
 
-# What is remembered of uploads that are to take effect once, and what is told of them again.
-
-
 @dataclass(frozen=True)
 class UploadResult:
-    """What came of an upload.
+    """The result of an upload.
 
     Parameters
     ----------
-    added : the frame and its job; None where it was refused
-    new : False where it was there already, and there is nothing to be done
-    error : why it was refused
+    added : the frame and its job; None if the upload was refused
+    new : False if the frame existed already, and nothing is to be done
+    error : why the upload was refused
     """
 
     added: Added | None
@@ -153,14 +147,14 @@ class UploadResult:
 
     @property
     def taken(self) -> Added:
-        """The frame and its job; raises `error` where there is none."""
+        """The frame and its job; raises `error` if the upload was refused."""
         if self.added is None:
-            raise self.error or ValueError("neither taken nor refused")
+            raise self.error or ValueError("neither stored nor refused")
         return self.added
 
 
 def item_of(outcome: UploadResult) -> BatchItem:
-    """What came of one upload of many."""
+    """Return the item of a batch for an upload's result."""
     if outcome.error is not None:
         problem = problem_of(outcome.error)
         return BatchItem(status=problem.status, frame=None, problem=problem)
@@ -168,8 +162,8 @@ def item_of(outcome: UploadResult) -> BatchItem:
 
 
 def upload_response(connection: Connection, frame: FrameRow) -> Added:
-    """A frame as uploads are answered."""
-    job_id = job_ids_of(connection, [frame.number])[frame.number]
+    """Return the answer to an upload of a stored frame."""
+    job_id = signing_jobs(connection, [frame.number])[frame.number]
     return _added(frame, job_id, frame.reason)
 
 
@@ -183,24 +177,22 @@ def _added(frame: FrameRow, job_id: str, reason: str | None = None) -> Added:
 def replayed(
     connection: Connection, row: MapRow, data: dict[str, Any]
 ) -> list[UploadResult] | None:
-    """What came of uploads, as it is now; None where the map was deleted and made anew since."""
-    found = []
+    """Return stored results with their frames as they are now; None if the map was replaced."""
+    results = []
     for one in data["frames"]:
         if "error" in one:
-            found.append(UploadResult(None, error=_error(one)))
+            results.append(UploadResult(None, error=_error(one)))
             continue
-        asked = select(frames).where(
-            frames.c.id == one["frame_id"], frames.c.map_number == row.number
-        )
-        frame = connection.execute(asked).mappings().first()
+        own = frames.c.id == one["frame_id"], frames.c.map_number == row.number
+        frame = connection.execute(select(frames).where(*own)).mappings().first()
         if frame is None:
             return None
-        found.append(UploadResult(upload_response(connection, frame_row(frame)), one["new"]))
-    return found
+        results.append(UploadResult(upload_response(connection, frame_row(frame)), one["new"]))
+    return results
 
 
 def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
-    """What came of an upload, as JSON that is remembered."""
+    """Return the JSON that stores an upload's result."""
     if outcome.added is not None:
         return {"frame_id": outcome.added.frame_id, "new": outcome.new}
     error = outcome.error
@@ -208,26 +200,26 @@ def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
     return {"error": type(error).__name__, "detail": str(error), "fields": fields}
 
 
-def _error(kept: dict[str, Any]) -> errors.SceneprintError:
-    kind: type[errors.SceneprintError] = getattr(errors, kept["error"])
+def _error(stored: dict[str, Any]) -> errors.SceneprintError:
+    kind: type[errors.SceneprintError] = getattr(errors, stored["error"])
     if issubclass(kind, errors.InvalidRequest):
-        return kind(kept["detail"], tuple((place, reason) for place, reason in kept["fields"]))
-    return kind(kept["detail"])
+        return kind(stored["detail"], tuple((place, reason) for place, reason in stored["fields"]))
+    return kind(stored["detail"])
 
 
 @dataclass(frozen=True, eq=False)
 class Upload:
-    """A frame as it is sent.
+    """A frame as sent.
 
     Parameters
     ----------
     data : a depth image as PNG or NPY, or a point cloud: see `sceneprint.formats.points`
-    meta : what is known of it
-    priority : frames of a greater one are signed first; of one that is there it changes nothing
-    if_novel : keep it only if the nearest frame of the map is farther, as a share of the distance
-        of unrelated frames; None to keep it anyway. Of one that is not signed yet, the weaker
-        condition counts
-    frame_id : that it is to have; None: one of ours, and none where the map has its content
+    meta : metadata
+    priority : frames of a higher priority are signed first; ignored if the frame exists
+    if_novel : minimum distance from the nearest frame of the map, as a share of the distance of
+        unrelated frames; None: no minimum. For a duplicate that is not signed yet, the weaker
+        condition applies
+    frame_id : requested id; None: a new one, or the duplicate's
     """
 
     data: bytes
@@ -239,12 +231,12 @@ class Upload:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """An upload that was looked at: who it is, and what is stored with it."""
+    """A decoded upload, with its identity and columns."""
 
     upload: Upload
     blob: str
     content: str
-    known: dict[str, Any]
+    metadata: dict[str, Any]
 
     @property
     def size(self) -> int:
@@ -252,14 +244,14 @@ class _Prepared:
         return len(self.upload.data)
 
     @property
-    def of_blob(self) -> dict[str, Any]:
-        """Columns that follow from the bytes and from how they were sent."""
+    def blob_columns(self) -> dict[str, Any]:
+        """Columns of the upload's bytes and novelty."""
         return {"blob": self.blob, "bytes": self.size, "novelty": self.upload.if_novel}
 
     @property
     def columns(self) -> dict[str, Any]:
         """Columns of a new frame; see `add_frame`."""
-        return {"content_id": self.content, **self.of_blob, **self.known}
+        return {"content_id": self.content, **self.blob_columns, **self.metadata}
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,52 +260,52 @@ class _Request:
 
     Parameters
     ----------
-    todo : those of which it is not known yet what comes of them, by their place
-    known, once, fence : see `Uploads.add_all`
-    left : blobs that may be of no use, of the last try
+    todo : uploads without a result yet, by their place
+    results, once, fence : see `Uploads.add_all`
+    left : possibly unused blobs of the last attempt
     """
 
     todo: dict[int, _Prepared]
-    known: list[UploadResult | None]
+    results: list[UploadResult | None]
     once: IdempotentRequest | None
     fence: Callable[[Connection], None] | None
     left: list[str] = field(default_factory=list)
 
     @cached_property
     def blobs(self) -> dict[str, bytes]:
-        """What has to be durable first."""
+        """Blobs that must be durable first."""
         return {one.blob: one.upload.data for one in self.todo.values()}
 
     @property
     def is_single(self) -> bool:
-        """Whether it is one upload, of which nothing but the frame is to be written."""
-        return len(self.known) == len(self.todo) == 1 and self.fence is None
+        """Whether the request is one upload, and writes only its frame."""
+        return len(self.results) == len(self.todo) == 1 and self.fence is None
 
 
 class IncomingBytes:
-    """Bytes of archives that this process is receiving for each map; no row counts them yet."""
+    """Bytes of archives that this process is receiving, by map; no row counts them yet."""
 
     def __init__(self) -> None:
         self._sizes, self._guard = Counter[int](), threading.Lock()
 
     def add(self, map_number: int, size: int) -> int:
-        """Add bytes, or remove them, and return how many the map has now."""
+        """Add bytes, which may be negative, and return the map's sum."""
         with self._guard:
             self._sizes[map_number] += size
             return self._sizes[map_number]
 
 
 class Uploads:
-    """Takes frames into maps; safe to share between threads.
+    """Store uploaded frames in maps; safe to share between threads.
 
     Parameters
     ----------
-    store, bell : see there
+    store, bell : store, and wakeup of its workers
     """
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
-        # of each map that is written to, as long as somebody writes to it
+        # by map, while a thread writes to it
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
         self._new_frames = NewFrames(store.database)
@@ -322,26 +314,25 @@ class Uploads:
     def add(
         self, map_name: str, upload: Upload, once: IdempotentRequest | None = None
     ) -> tuple[UploadResult, bool]:
-        """Take a frame into a map; it is safe when this returns, and signed soon after.
+        """Store a frame in a map durably; it is signed soon after.
 
-        The same content with the same metadata is the frame that is there; one that failed, or
-        that was not kept as the map had its place, is tried again, and one whose upload was lost or
-        damaged on disk has it again.
+        The same content with the same metadata is a duplicate of the existing frame. A failed or
+        redundant duplicate is retried, and one whose upload is lost or damaged gets it again.
 
         Returns
         -------
-        outcome : of which `added` is there
+        outcome : result with `added`
         replayed : whether it is that of an earlier request of the same `once`
 
         Raises
         ------
-        UnknownMap : no such map.
+        UnknownMap : the map does not exist.
         InvalidRequest : the frame id is not valid; or see `read_upload`.
         FrameError : see `read_upload`.
-        FrameConflict : the frame is there with other content or metadata.
-        QuotaExceeded : the map's quota has no room for one more; nothing was taken.
-        IdempotencyConflict : see `Once`.
-        UnusableStore : the disk is full, or the database cannot be written; nothing was taken.
+        FrameConflict : the frame exists with other content or metadata.
+        QuotaExceeded : the map's quota has no room for another frame; nothing was stored.
+        IdempotencyConflict : see `IdempotentRequest`.
+        UnusableStore : the disk is full, or the database cannot be written; nothing was stored.
         """
         [outcome], again = self.add_all(map_name, [upload], once)
         if outcome.error is not None:
@@ -352,24 +343,25 @@ class Uploads:
         self, map_name: str, uploads: Sequence[Upload], once: IdempotentRequest | None = None,
         fence: Callable[[Connection], None] | None = None,
     ) -> tuple[list[UploadResult], bool]:  # fmt: skip
-        """Take frames into a map in one commit; see `add`, but what is wrong with one is told.
+        """Store frames in a map in one commit; see `add`. Results contain the errors of single
+        frames.
 
         Parameters
         ----------
         map_name, uploads, once : see `add`
-        fence : called in that commit before anything is written; whatever it raises of
-            `SceneprintError` is raised, and none was taken
+        fence : function that is called in the commit before anything is written; if it raises a
+            `SceneprintError`, nothing is stored
 
         Raises
         ------
-        UnknownMap, IdempotencyConflict, UnusableStore : as `add`; none was taken.
+        UnknownMap, IdempotencyConflict, UnusableStore : see `add`; nothing was stored.
         """
         with self._store.database.read() as connection:
-            row = find_map(connection, map_name)  # before the work of decoding
+            row = find_map(connection, map_name)  # before decoding
             before = _before(connection, row, once)
         if before is not None:
             for upload, outcome in zip(uploads, before, strict=True):
-                if outcome.added is not None:  # it may have been told that it was not stored
+                if outcome.added is not None:  # its upload may be lost
                     self._renew(map_name, outcome.added.frame_id, upload)
             return before, True
         outcomes: list[UploadResult | None] = [None] * len(uploads)
@@ -382,10 +374,10 @@ class Uploads:
             except errors.SceneprintError as error:
                 outcomes[i] = UploadResult(None, error=error)
         for i in list(ready):
-            found = self._settled(map_name, ready[i])
-            if found is not None:
-                outcomes[i] = found
-                if once is None or found.added is None:
+            result = self._read_result(map_name, ready[i])
+            if result is not None:
+                outcomes[i] = result
+                if once is None or result.added is None:
                     del ready[i]
         again = False
         if ready:
@@ -398,118 +390,112 @@ class Uploads:
         if upload.frame_id is not None:
             check_frame_id(upload.frame_id)
         read = read_upload(upload.data, upload.meta, self._store.decoders)
-        content = content_id(read)
-        blob = hashlib.sha256(upload.data).hexdigest()
-        samples = {
-            **sample_range(read.frame).model_dump(), "trusted": upload.meta.trust_depth,
+        samples = sample_range(read.frame).model_dump()
+        metadata = {
+            **columns(upload.meta, read.frame.pose, read.base), "cloud": read.cloud,
+            "samples": {**samples, "trusted": upload.meta.trust_depth},
         }  # fmt: skip
-        known = {
-            **columns(upload.meta, read.frame.pose, read.base),
-            "cloud": read.cloud,
-            "samples": samples,
-        }
-        return _Prepared(upload, blob, content, known)
+        blob = hashlib.sha256(upload.data).hexdigest()
+        return _Prepared(upload, blob, content_id(read), metadata)
 
-    def _settled(self, map_name: str, ready: _Prepared) -> UploadResult | None:
-        """What comes of an upload for which nothing has to be written; None: it has to be."""
+    def _read_result(self, map_name: str, ready: _Prepared) -> UploadResult | None:
+        """Return the result of an upload that needs no write; None if it needs one."""
         try:
             with self._store.database.read() as connection:
                 row = find_map(connection, map_name)
                 frame = find_duplicate(
-                    connection, row, ready.content, ready.known, ready.upload.frame_id
+                    connection, row, ready.content, ready.metadata, ready.upload.frame_id
                 )
-                if frame is None:  # what has no room is not even written to the disk
+                if frame is None:  # without room, no blob is written
                     require_room(connection, row, ready.size + self.incoming.add(row.number, 0))
                 if frame is None or is_retried(frame.state):
                     return None
                 waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)
                 if waits and frame.novelty is not None:
-                    return None  # its condition may have to be loosened
-                there = upload_response(connection, frame)
+                    return None  # its novelty threshold may change
+                added = upload_response(connection, frame)
         except (errors.StoreError, errors.UnknownMap):
             raise
         except errors.SceneprintError as error:
             return UploadResult(None, error=error)
-        self._renew(map_name, there.frame_id, ready.upload)
-        reason = repair.without_loss(there.reason)
-        return UploadResult(there.model_copy(update={"reason": reason}))
+        self._renew(map_name, added.frame_id, ready.upload)
+        reason = repair.without_loss(added.reason)
+        return UploadResult(added.model_copy(update={"reason": reason}))
 
     def _renew(self, map_name: str, frame_id: str, upload: Upload) -> None:
-        """Let what came take the place of an upload that was lost."""
+        """Replace the lost upload of a frame."""
         left = repair.take_upload(self._store, map_name, frame_id, upload.data)
         if left:
             garbage_collection.collect_blobs(self._store, left)
 
     def _write(
-        self, row: MapRow, ready: dict[int, _Prepared], known: list[UploadResult | None],
+        self, row: MapRow, ready: dict[int, _Prepared], results: list[UploadResult | None],
         once: IdempotentRequest | None, fence: Callable[[Connection], None] | None,
     ) -> tuple[list[UploadResult | None], bool]:  # fmt: skip
-        """Store those uploads of which it is not known yet what comes of them.
+        """Store the uploads that have no result yet.
 
         Parameters
         ----------
-        row : of the map, as it was before they were decoded
-        ready, known, once, fence : see `add_all`
+        row : map, as read before decoding
+        ready : decoded uploads by their place
+        results, once, fence : see `add_all`
 
         Returns
         -------
-        outcomes : of all
+        outcomes : results of all uploads
         replayed : whether they are those of an earlier request
         """
-        self._store.database.require_writable()  # before a blob to which nothing could refer
-        todo = {i: one for i, one in ready.items() if known[i] is None}
-        request = _Request(todo, known, once, fence)
+        self._store.database.require_writable()  # before blobs are written
+        todo = {i: one for i, one in ready.items() if results[i] is None}
+        request = _Request(todo, results, once, fence)
         blobs = request.blobs
         while True:
             try:
                 for data in blobs.values():
                     self._store.blobs.put(data)
-                came_of = self._received(row, request) if request.is_single else None
-                if came_of is not None:
-                    return [came_of], False
-                found = self._grouping(row).run(partial(self._store_all, row, request))
-                if found is None:
+                single = self._insert_single(row, request) if request.is_single else None
+                if single is not None:
+                    return [single], False
+                written = self._grouping(row).run(partial(self._store_all, row, request))
+                if written is None:
                     with self._store.database.read() as connection:
                         row = find_map(connection, row.name)
             except Overtaken:
                 continue
             except errors.SceneprintError:
-                with suppress(errors.UnusableStore):  # leave nothing, on a full disk least of all
+                with suppress(errors.UnusableStore):
                     garbage_collection.collect_blobs(self._store, list(blobs))
                 raise
-            if found is not None:
+            if written is not None:
                 if request.left:
                     garbage_collection.collect_deleted_blobs(self._store, request.left)
-                return found
+                return written
 
-    def _received(self, row: MapRow, request: _Request) -> UploadResult | None:
-        """Take one new frame, as most uploads are, in one round trip to PostgreSQL, with those that
-        come meanwhile.
+    def _insert_single(self, row: MapRow, request: _Request) -> UploadResult | None:
+        """Insert one new frame in one round trip to PostgreSQL, with concurrent ones.
 
-        None where more has to be found out or written, and on SQLite, whose transactions cost no
-        round trip.
+        Return None on SQLite, which has no round trips, and if the frame needs more statements.
         """
         [one] = request.todo.values()
         if self._store.database.is_sqlite or one.upload.frame_id is not None:
             return None
-        if row.number in self._writes:  # others wait for the map already: behind them is its place
+        if row.number in self._writes:  # earlier uploads wait for the map
             return None
         new = _new_frame(row, one, request.once)
         if not self._new_frames.receive(new):
             return None
-        # a deletion may have removed it before the commit, and from now on none does; a worker
-        # that missed it meanwhile tries again
+        # a deletion may have removed the blob before the commit; a worker that misses it retries
         self._store.blobs.ensure(one.blob, one.upload.data)
         return _new_result(new)
 
     def _store_all(
         self, row: MapRow, request: _Request, connection: Connection
     ) -> tuple[list[UploadResult | None], bool] | None:
-        """As `_write`, in a transaction; None where a blob or the map is gone."""
+        """Store uploads in a transaction; return None if a blob or the map was deleted."""
         if request.fence is not None:
             request.fence(connection)
         if not all(map(self._store.blobs.holds, request.blobs)):
-            return None  # a deletion has removed one, which an earlier request may refer to, too
+            return None  # before a stored result is returned, whose frame may need the blob
         if request.once is not None:
             now = find_map(connection, row.name)
             if now.number != row.number:
@@ -519,48 +505,44 @@ class Uploads:
                 request.left[:] = request.blobs
                 return list(before), True
         request.left.clear()
-        written = _received_together(connection, row, request.todo)
+        written = _insert_new(connection, row, request.todo)
         for i, one in request.todo.items():
             if i in written:
                 continue
             now = find_map(connection, row.name)
             if now.number != row.number:
                 return None
-            written[i] = _stored(connection, now, one, request.left)
-        outcomes = [written.get(i, one) for i, one in enumerate(request.known)]
-        if request.once is not None:
-            _keep(connection, request.once, [one for one in outcomes if one is not None])
+            written[i] = _store_one(connection, now, one, request.left)
+        outcomes = [written.get(i, one) for i, one in enumerate(request.results)]
+        if request.once is not None and not any(
+            one is not None and isinstance(one.error, errors.QuotaExceeded) for one in outcomes
+        ):  # a repeated request may find room
+            stored = [_stored_outcome(one) for one in outcomes if one is not None]
+            request.once.store(connection, {"frames": stored})
         return outcomes, False
 
     def _grouping(self, row: MapRow) -> Grouping:
-        """Where uploads wait that may be committed together: of a map, in SQLite of all."""
+        """Return the group whose writes are committed together: by map; on SQLite, one for all."""
         key = None if self._store.database.is_sqlite else row.number
         with self._guard:
-            found = self._writes.get(key)
-            if found is None:
-                found = self._writes[key] = Grouping(self._store.database, key)
-            return found
+            group = self._writes.get(key)
+            if group is None:
+                group = self._writes[key] = Grouping(self._store.database, key)
+            return group
 
 
 def _before(
     connection: Connection, row: MapRow, once: IdempotentRequest | None
 ) -> list[UploadResult] | None:
-    """What came of the same request before."""
-    data = None if once is None else once.found(connection)
+    """Return the results of the same request, if it was sent before."""
+    data = None if once is None else once.stored_result(connection)
     return None if data is None else replayed(connection, row, data)
-
-
-def _keep(connection: Connection, once: IdempotentRequest, came: list[UploadResult]) -> None:
-    """Remember what came of a request; what had no room may have it when it is sent again."""
-    if not any(isinstance(one.error, errors.QuotaExceeded) for one in came):
-        once.keep(connection, {"frames": [_stored_outcome(one) for one in came]})
 
 
 def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
     """Return the row of a frame that its map may lack.
 
-    With `once`, on PostgreSQL alone, the same statement stores the outcome under the request's
-    idempotency key.
+    With `once`, on PostgreSQL, the same statement stores the result for the idempotency key.
     """
     frame_id = uuid.uuid4().hex
     outcome = None
@@ -570,7 +552,7 @@ def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = N
 
 
 def _new_result(new: NewFrame) -> UploadResult:
-    """What came of an upload whose frame was taken."""
+    """Return the result of an upload whose frame was inserted."""
     added = Added(
         frame_id=new.frame_id, job_id=new.job_id, state=FrameState.RECEIVED, reason=None,
         samples=SampleRange.model_validate(new.values["samples"]),
@@ -579,29 +561,31 @@ def _new_result(new: NewFrame) -> UploadResult:
     return UploadResult(added, new=True)
 
 
-def _received_together(
+def _insert_new(
     connection: Connection, row: MapRow, todo: dict[int, _Prepared]
 ) -> dict[int, UploadResult]:
-    """Uploads of new frames that were taken, by their place; see `_stored` for the others."""
+    """Insert new frames, and return the results by place; see `_store_one` for the others."""
     new = {i: _new_frame(row, one) for i, one in todo.items() if one.upload.frame_id is None}
     ids = receive_frames(connection, list(new.values()))
     return {i: _new_result(one) for i, one in new.items() if one.frame_id in ids}
 
 
-def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[str]) -> UploadResult:
-    """What comes of an upload; blobs that are of no use any more are added to `left`."""
+def _store_one(
+    connection: Connection, row: MapRow, ready: _Prepared, left: list[str]
+) -> UploadResult:
+    """Store an upload and return its result; add unused blobs to `left`."""
     upload = ready.upload
-    try:  # once more: another upload may have been first
-        frame = find_duplicate(connection, row, ready.content, ready.known, upload.frame_id)
+    try:  # again: another upload may have been first
+        frame = find_duplicate(connection, row, ready.content, ready.metadata, upload.frame_id)
     except errors.FrameConflict as error:
         left.append(ready.blob)
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
-        loosen(connection, frame.number, upload.if_novel)
+        relax_novelty(connection, frame.number, upload.if_novel)
         left.append(ready.blob)
         return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
-    # a failed one is counted already, and may come packed otherwise
+    # a failed frame counts already, but its packing may differ
     held = 0 if frame is None or new else frame.bytes
     try:
         left.extend(make_room(connection, row, ready.size - held, new=new))
@@ -610,9 +594,9 @@ def _stored(connection: Connection, row: MapRow, ready: _Prepared, left: list[st
         return UploadResult(None, error=error)
     if frame is None:
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
-    else:  # it was given up, and somebody asks for another try
-        left.append(frame.blob)  # it was packed otherwise
-        frame = renew_frame(connection, frame.number, ready.of_blob)
+    else:  # retry it
+        left.append(frame.blob)  # the packing may differ
+        frame = renew_frame(connection, frame.number, ready.blob_columns)
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
     return UploadResult(_added(frame, job.id), new=True)

@@ -1,9 +1,9 @@
-"""Write groups: writers that come while another one writes are written together in the next
-transaction. A commit waits for the disk, whatever is in it, and eight clients need not wait eight
-times.
+"""Write groups: writes that arrive while another one runs share the next transaction.
+
+A commit waits for the disk, whatever it contains, so eight clients need not wait eight times.
 
     run(a), run(b), run(c)  --Grouping, in one commit-->       each gets its own result
-    receive(a), receive(b)  --NewFrames, in one statement-->   whether each was taken
+    receive(a), receive(b)  --NewFrames, in one statement-->   whether each was inserted
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from sceneprint.store.new_frames import NewFrame, receive_frames
 T = TypeVar("T")
 W = TypeVar("W")
 
-#: Pieces of work in one transaction: other writers wait meanwhile.
+#: Maximum number of writes in one transaction; other writers wait for it.
 MOST_TOGETHER = 32
-#: Seconds that new frames of several maps wait for one of them. It is in use for a few milliseconds
-#: as a rule; where it takes longer, the others should not wait for it.
+#: Seconds that new frames of several maps wait for one of them. A map is usually in use for a few
+#: milliseconds; frames of the others should not wait longer.
 MAPS_WAIT_S = 0.25
 
 
 class _Waiting(Generic[W]):
-    """A piece of work, and what came of it.
+    """A waiting write, and its result.
 
     Parameters
     ----------
-    leads : whether its thread writes what waits, or is to begin with that; see `_Group`
-    told : set when it is done, or leads
-    left : whether its thread waits no more
+    leads : whether its thread writes for the others, or is about to; see `_Group`
+    ready : set when the write is done, or its thread leads
+    left : whether its thread no longer waits
     """
 
     def __init__(self, work: W) -> None:
         self.work = work
-        self.leads, self.told = False, threading.Event()
+        self.leads, self.ready = False, threading.Event()
         self.done = self.left = False
         self.result: Any = None
         self.error: Exception | None = None
 
 
 class _Group(Generic[W]):
-    """Pieces of work of many threads. One thread at a time does what waits together with its own;
-    then the next one does what has come meanwhile.
+    """Writes of many threads. One thread at a time writes all waiting ones with its own; then the
+    next one leads.
     """
 
     def __init__(self) -> None:
@@ -59,19 +59,19 @@ class _Group(Generic[W]):
         self._led = False
 
     def _await(self, work: W) -> Any:
-        """Wait until it is done, by this thread or another; its result."""
+        """Wait until a write is done, by this thread or another, and return its result."""
         mine = _Waiting(work)
         with self._list:
             self._waiting.append(mine)
             mine.leads, self._led = not self._led, True
         try:
             if not mine.leads:
-                mine.told.wait()
-            while not mine.done:  # there may be more before it than are written at once
+                mine.ready.wait()
+            while not mine.done:  # more may wait before it than are written at once
                 self._write()
         except BaseException:  # such as Ctrl-C
             with self._list:
-                mine.left = True  # and is not put back by who has taken it
+                mine.left = True  # the writing thread does not return it to the list
                 if mine in self._waiting:
                     self._waiting.remove(mine)
             raise
@@ -83,36 +83,36 @@ class _Group(Generic[W]):
         return mine.result
 
     def _hand_over(self) -> None:
-        """Let the next one lead."""
+        """Let the next thread lead."""
         with self._list:
             self._led = bool(self._waiting)
             if self._waiting:
                 self._waiting[0].leads = True
-                self._waiting[0].told.set()
+                self._waiting[0].ready.set()
 
     def _write(self) -> None:
-        """Write what waits, from the first on."""
-        taken: list[_Waiting[W]] = []
+        """Write the waiting writes, from the first on."""
+        batch: list[_Waiting[W]] = []
         try:
-            self._write_together(taken)
-        except BaseException:  # Ctrl-C is the caller's alone: the others write themselves
+            self._write_together(batch)
+        except BaseException:  # Ctrl-C stops only this caller: the others write themselves
             with self._list:
-                back = [one for one in taken if not (one.done or one.left)]
+                back = [one for one in batch if not (one.done or one.left)]
                 self._waiting = back + self._waiting
             raise
         finally:
-            for one in taken:
+            for one in batch:
                 if one.done:
-                    one.told.set()
+                    one.ready.set()
 
-    def _take(self, taken: list[_Waiting[W]], *, all_: bool = False) -> None:
-        """Have what waits, from the first on."""
+    def _take(self, batch: list[_Waiting[W]], *, all_: bool = False) -> None:
+        """Move waiting writes, from the first on, to `batch`."""
         with self._list:
-            taken[:] = self._waiting[: None if all_ else MOST_TOGETHER]
-            del self._waiting[: len(taken)]
+            batch[:] = self._waiting[: None if all_ else MOST_TOGETHER]
+            del self._waiting[: len(batch)]
 
-    def _write_together(self, taken: list[_Waiting[W]]) -> None:
-        """Write what waits in one transaction; `taken` is filled with it."""
+    def _write_together(self, batch: list[_Waiting[W]]) -> None:
+        """Write the waiting writes in one transaction, and return them in `batch`."""
         raise NotImplementedError
 
 
@@ -120,7 +120,7 @@ _Work = Callable[[Connection], Any]
 
 
 class Grouping(_Group[_Work]):
-    """Writes of many threads to one database; safe to share between them.
+    """Share transactions on one database between threads.
 
     Parameters
     ----------
@@ -132,39 +132,39 @@ class Grouping(_Group[_Work]):
         self._database, self._map_number = database, map_number
 
     def run(self, do: Callable[[Connection], T]) -> T:
-        """Do it in a writing transaction; when this returns it is committed.
+        """Call a function in a writing transaction, and return when it is committed.
 
         Parameters
         ----------
-        do : whatever it raises of `SceneprintError`, beside `UnusableStore`, it raises before it
-            writes: others of the transaction go on. It may be called more than once
+        do : function. It may be called several times, and must raise errors other than
+            `UnusableStore` before it writes, since other writes of the transaction continue
 
         Raises
         ------
-        what `do` raises, and what `Database.write` does.
+        errors of `do` and of `Database.write`
         """
-        own = copy_context()  # another thread may do it: what it says of a request is of this one
+        own = copy_context()  # another thread may call it, with this thread's request
         return cast(T, self._await(lambda connection: own.run(do, connection)))
 
-    def _write_together(self, taken: list[_Waiting[_Work]]) -> None:
-        """Write what waits in one transaction, or each alone."""
+    def _write_together(self, batch: list[_Waiting[_Work]]) -> None:
+        """Write the waiting writes in one transaction, or each alone."""
         try:
             with self._database.write(map_number=self._map_number) as connection:
-                self._take(taken)  # not before it is our turn: more have come since
-                for one in taken:
+                self._take(batch)  # only in the turn, as more have arrived since
+                for one in batch:
                     _do(one, connection)
         except Exception as error:
-            if not taken:  # it was never our turn: who waits has waited as long
-                self._take(taken, all_=True)
+            if not batch:  # the turn never came: the others have waited as long
+                self._take(batch, all_=True)
             of_all = isinstance(error, UnusableStore) and not is_conflict(error)
-            if len(taken) == 1 or of_all:
-                for one in taken:
+            if len(batch) == 1 or of_all:
+                for one in batch:
                     one.result, one.error = None, error
             else:
-                for one in taken:  # one of them broke the transaction of all
+                for one in batch:  # one write failed the transaction of all
                     self._write_alone(one)
                     one.done = True
-        for one in taken:
+        for one in batch:
             one.done = True
 
     def _write_alone(self, one: _Waiting[_Work]) -> None:
@@ -187,12 +187,11 @@ def _do(one: _Waiting[_Work], connection: Connection) -> None:
 
 
 class NewFrames(_Group[NewFrame]):
-    """New frames of many threads, whatever their maps, taken together by one statement of
-    PostgreSQL; safe to share between threads.
+    """Insert new frames of many threads and maps by one statement on PostgreSQL.
 
     Parameters
     ----------
-    database : on PostgreSQL
+    database : PostgreSQL database
     """
 
     def __init__(self, database: Database) -> None:
@@ -200,12 +199,12 @@ class NewFrames(_Group[NewFrame]):
         self._database = database
 
     def receive(self, frame: NewFrame) -> bool:
-        """Take a frame; when this returns, that is committed.
+        """Insert a frame, and return when it is committed.
 
         Returns
         -------
-        taken : False, and nothing of it was written: see `receive_frames`; or because another
-            frame could not be taken with it, or a map was in use. It has to be written alone
+        inserted : False, and nothing was written, if it must be written alone: see
+            `receive_frames`; or another frame of the statement failed, or a map was in use
 
         Raises
         ------
@@ -213,20 +212,20 @@ class NewFrames(_Group[NewFrame]):
         """
         return cast(bool, self._await(frame))
 
-    def _write_together(self, taken: list[_Waiting[NewFrame]]) -> None:
-        self._take(taken)
-        frames = [one.work for one in taken]
+    def _write_together(self, batch: list[_Waiting[NewFrame]]) -> None:
+        self._take(batch)
+        frames = [one.work for one in batch]
         numbers = {one.row.number for one in frames}
         try:
             with self._database.write_maps(numbers, MAPS_WAIT_S) as connection:
                 ids = receive_frames(connection, frames)
-            for one in taken:
+            for one in batch:
                 one.result = one.work.frame_id in ids
         except UnusableStore as error:
-            for one in taken:
+            for one in batch:
                 one.error = error
-        except Exception:  # who writes it alone finds out what is wrong with it, if anything is
-            for one in taken:
+        except Exception:  # writing each alone shows which one is wrong
+            for one in batch:
                 one.result = False
-        for one in taken:
+        for one in batch:
             one.done = True

@@ -1,4 +1,4 @@
-"""The ends a job can come to, other than the good one, and the job while it is in hand."""
+"""The life of jobs of single frames: release, reject, fail, cancel and retry; and lease renewal."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from sceneprint.store import Store, queue
 from sceneprint.store.audit_log import record_change
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import set_state
-from sceneprint.store.maps import frame_of, map_of
-from sceneprint.store.queue import fail_of_dead
+from sceneprint.store.maps import frame_of, map_of_number
+from sceneprint.store.queue import fail_dead_worker
 from sceneprint.store.queue import list_jobs as list_stored
 from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import ARCHIVE, FrameRow, JobRow, MapRow
@@ -29,18 +29,18 @@ from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
 log = logging.getLogger(__name__)
 
-#: Seconds until a job is tried again whose result could not be stored.
+#: Seconds until a job is due again whose result could not be stored.
 LEFT_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A job in hand.
+    """A claimed job of a single frame.
 
     Parameters
     ----------
-    job : as it was claimed
-    frame, map : that it is about
+    job : job as claimed
+    frame, map : its frame and map
     """
 
     job: JobRow
@@ -49,30 +49,30 @@ class Work:
 
     @property
     def again(self) -> bool:
-        """Whether the frame is indexed, stays so all the while, and is signed once more."""
+        """Whether the job signs an indexed frame again, which stays indexed meanwhile."""
         return self.job.kind == REENCODE
 
     @property
     def model_id(self) -> str:
-        """Of the model to sign with."""
+        """Id of the model to sign with."""
         return self.job.model_id or self.map.model_id
 
 
 class Outdated(Exception):
-    """The map has come to have another model since the job was claimed."""
+    """The map's model has changed since the job was claimed."""
 
 
 def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
-    """Queue again what was claimed and not begun, as when a worker is told to stop."""
-    of_map = store.database.write(map_number=work.map.number)
-    with suppress(LostLease), of_map as connection:
-        queue.give_back(connection, work.job, after_s)
+    """Queue a claimed job that was not started, such as when a worker stops."""
+    writing = store.database.write(map_number=work.map.number)
+    with suppress(LostLease), writing as connection:
+        queue.release_job(connection, work.job, after_s)
         if not work.again:
             set_state(connection, work.frame.number, FrameState.RECEIVED)
 
 
 def restart_jobs(store: Store, work: Work) -> JobState | None:
-    """What was signed with a model that the map no longer has, or will not have, is of no use."""
+    """Queue or cancel a job whose model its map no longer uses."""
     if not work.again:
         put_back(store, work)
         return JobState.QUEUED
@@ -85,18 +85,18 @@ def restart_jobs(store: Store, work: Work) -> JobState | None:
 
 
 def record_job_event(connection: Connection, kind: str, work: Work) -> None:
-    """Note what has become of a job."""
+    """Record an event of a job."""
     record_event(connection, kind, work.map.name, work.frame.id, work.job.id)
 
 
 def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
-    """A frame that holds nothing to sign: it would hold nothing the next time either."""
+    """Reject a frame that holds nothing to sign, which another attempt would not change."""
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
         with store.database.write(map_number=work.map.number) as connection:
             queue.finish(connection, work.job, JobState.FAILED, reason)
             if not work.again:
-                if map_of(connection, work.frame.map_number).model_id != work.model_id:
+                if map_of_number(connection, work.frame.map_number).model_id != work.model_id:
                     raise Outdated
                 set_state(connection, work.frame.number, FrameState.REJECTED, reason)
                 record_job_event(connection, "frame.rejected", work)
@@ -108,7 +108,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
 
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
-    """Queue a job again over which something went wrong, or let it be dead."""
+    """Queue a failed job for another attempt, or declare it dead."""
     reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
@@ -127,29 +127,24 @@ def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
 
 
 def failure_texts(error: Exception) -> tuple[str, str]:
-    """What a job says of an error that it broke down over, and its traceback."""
-    known = isinstance(error, SceneprintError)
-    reason = str(error) if known else f"{type(error).__name__}: {error}"
+    """Return the message and traceback of an error that a job failed with."""
+    reason = str(error)
+    if not isinstance(error, SceneprintError):
+        reason = f"{type(error).__name__}: {error}"
     return reason, "".join(traceback.format_exception(error))
 
 
 def about(work: Work, **more: object) -> dict[str, object]:
-    """What a line of the log says of a job."""
+    """Return the fields of a log line about a job."""
     return {
-        "job_id": work.job.id,
-        "frame_id": work.frame.id,
-        "map": work.map.name,
-        "attempt": work.job.attempts,
-        **more,
-    }
-
-
-# Holding a lease while the work goes on.
+        "job_id": work.job.id, "frame_id": work.frame.id, "map": work.map.name,
+        "attempt": work.job.attempts, **more,
+    }  # fmt: skip
 
 
 @contextmanager
 def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> Iterator[None]:
-    """Renew a lease from a thread of its own while the work goes on."""
+    """Renew a lease in another thread during the work."""
     done = threading.Event()
 
     def renew() -> None:
@@ -159,8 +154,8 @@ def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> It
                 with store.database.write(turn=False) as connection:
                     queue.renew(connection, claim, lease_s)
             except LostLease:
-                return  # the end of the work will learn of it
-            except SceneprintError as error:  # the database may be back before the lease is over
+                return  # storing the result will fail
+            except SceneprintError as error:  # the database may recover before the lease ends
                 log.warning("lease not renewed", extra={"error": str(error)})
 
     thread = threading.Thread(target=renew, name="lease", daemon=True)
@@ -172,7 +167,7 @@ def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> It
         thread.join()
 
 
-# Jobs beyond their doing: listed, cancelled, tried again, and taken from workers that died.
+# Jobs for users and operators: list, cancel, retry; and jobs of dead workers.
 
 CANCELLED = "its job was cancelled"
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
@@ -183,38 +178,38 @@ def list_jobs(
     store: Store, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
     kind: str | None = None, map_names: Collection[str] | None = None,
 ) -> Page[Job]:  # fmt: skip
-    """A page of jobs, the newest first; see `queue.list_jobs`.
+    """Return a page of jobs, the newest first; see `queue.list_jobs`.
 
     Raises
     ------
-    InvalidRequest : a cursor that was not given out.
+    InvalidRequest : the service did not issue the cursor.
     """
     before = store.seals.row("job", cursor)
     with store.database.read() as connection:
-        found = list_stored(connection, before, limit + 1, state, kind, map_names)
+        rows = list_stored(connection, before, limit + 1, state, kind, map_names)
     items = [
-        job_record(one.job, one.frame_id, one.map_name, one.followed_by) for one in found[:limit]
+        job_record(one.job, one.frame_id, one.map_name, one.followed_by) for one in rows[:limit]
     ]
-    more = store.seals.next_cursor("job", [one.job.number for one in found], limit)
+    more = store.seals.next_cursor("job", [one.job.number for one in rows], limit)
     return Page[Job](items=items, next_cursor=more)
 
 
 def get_job(store: Store, job_id: str) -> Job:
-    """A job; UnknownJob where there is none."""
+    """Return a job; raise UnknownJob if it does not exist."""
     with store.database.read() as connection:
         return _job_record(connection, queue.find_job(connection, job_id))
 
 
 def cancel(store: Store, job_id: str) -> Job:
-    """Cancel a job that is not over; of one that is cancelled already nothing changes.
+    """Cancel a job that is not over; a cancelled job is returned unchanged.
 
-    A worker that holds it goes on to the end, and its result is refused. The archive of an import
-    is removed at once.
+    A worker that runs it continues, and its result is refused. The archive of an import is removed
+    at once.
 
     Raises
     ------
-    UnknownJob : there is none.
-    JobOver : there is nothing left to give up.
+    UnknownJob : the job does not exist.
+    JobOver : the job is over.
     """
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
@@ -230,26 +225,26 @@ def cancel(store: Store, job_id: str) -> Job:
 
 
 def retry(store: Store, job_id: str) -> tuple[Job, bool]:
-    """Try again what was given up, in a new job of the same priority.
+    """Retry a job that failed or was cancelled, by a new job of the same priority.
 
     Returns
     -------
-    job : the new one
-    new : False where the frame is being tried again already, by a job that is returned
+    job : new job
+    new : False if another job retries the frame already, which is returned
 
     Raises
     ------
-    UnknownJob : there is none.
-    CannotRetry : it was not given up, its frame has a later job that is over, or its upload is
-        gone.
+    UnknownJob : the job does not exist.
+    CannotRetry : the job succeeded, its frame has a later job that is over, or the upload is
+        missing.
     """
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
         if job.frame_number is None:
             return _retry_task(connection, job)
         frame = frame_of(connection, job.frame)
-        row = map_of(connection, frame.map_number)
-        latest = queue.last_of(connection, job.kind, frame.number, job.model_id) or job
+        row = map_of_number(connection, frame.map_number)
+        latest = queue.latest_job(connection, job.kind, frame.number, job.model_id) or job
         if latest.number != job.number and not latest.state.over:
             return _job_record(connection, latest), False
         if latest.number != job.number:
@@ -257,10 +252,10 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
                 f"Job {job.id} was replaced by {latest.id}, which is {latest.state}. Retry that "
                 "one."
             )
-        wanted = frame.state in _GIVEN_UP
+        can_retry = frame.state in _GIVEN_UP
         if job.kind == REENCODE:
-            wanted = frame.state == FrameState.INDEXED and row.next_model_id == job.model_id
-        if not (job.state.over and wanted) or job.state == JobState.SUCCEEDED:
+            can_retry = frame.state == FrameState.INDEXED and row.next_model_id == job.model_id
+        if not (job.state.over and can_retry) or job.state == JobState.SUCCEEDED:
             raise CannotRetry(
                 f"Job {job.id} is {job.state} and its frame is {frame.state}, so there is "
                 "nothing to retry."
@@ -270,25 +265,25 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
                 f"The upload of frame {frame.id} is missing from the data folder, so it cannot "
                 "be signed. Restore the folder from a backup, or upload the frame again."
             )
-        again = queue.enqueue(connection, job.kind, frame.number, job.priority, job.model_id)
+        new = queue.enqueue(connection, job.kind, frame.number, job.priority, job.model_id)
         record_change(connection, "job.retried", row.name, job.id)
         if job.kind != REENCODE:
             set_state(connection, frame.number, FrameState.RECEIVED)
-            record_event(connection, "frame.received", row.name, frame.id, again.id)
-        return _job_record(connection, again), True
+            record_event(connection, "frame.received", row.name, frame.id, new.id)
+        return _job_record(connection, new), True
 
 
 def retry_dead(
     store: Store, cursor: str | None = None, limit: int = 100,
     map_names: Collection[str] | None = None,
 ) -> RetriedJobs:  # fmt: skip
-    """Try again a page of dead jobs, the newest first; those that were tried since stay.
+    """Retry a page of dead jobs, the newest first; ignore jobs that were retried already.
 
-    Each is a commit of its own: what was tried again before a fault is.
+    Each retry is a commit of its own, so those before an error stay.
 
     Raises
     ------
-    InvalidRequest : a cursor that was not given out.
+    InvalidRequest : the service did not issue the cursor.
     """
     page = list_jobs(store, JobState.DEAD, cursor, limit, map_names=map_names)
     retried, refused = [], []
@@ -307,20 +302,20 @@ def retry_dead(
 def worker_died(
     store: Store, job_id: str, token: int, error: str, traceback: str, *, counts: bool
 ) -> JobState | None:
-    """Take a job from a worker that died over it, now and not when its lease runs out.
+    """Take a job from a dead worker, without waiting for the end of its lease.
 
-    Parameters are those of `queue.fail_of_dead`. Returns the state of the job; None where the death
-    changed nothing.
+    Parameters as in `queue.fail_dead_worker`. Return the state of the job; None if nothing changed.
     """
     with store.database.write() as connection:
-        job = fail_of_dead(connection, job_id, token, error, traceback, counts=counts)
+        job = fail_dead_worker(connection, job_id, token, error, traceback, counts=counts)
         if job is None:
             return None
-        if job.frame_number is None:
-            pass  # it is of no single frame
-        elif job.state == JobState.DEAD:
+        if job.state == JobState.DEAD:
             fail_frame(connection, job, error)
-        elif frame_of(connection, job.frame).state == FrameState.SIGNING:
+        elif (
+            job.frame_number is not None
+            and frame_of(connection, job.frame).state == FrameState.SIGNING
+        ):
             set_state(connection, job.frame, FrameState.RECEIVED)
     about = {"job_id": job_id, "state": job.state, "attempt": job.attempts, "error": error}
     log.error("worker died during a job", extra={**about, "traceback": traceback})
@@ -328,23 +323,23 @@ def worker_died(
 
 
 def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
-    """A frame that will not be signed; one that is indexed, or gone, stays so."""
+    """Set the frame of a job to failed, unless it is indexed or deleted."""
     if job.frame_number is None:
         return
     frame = frame_of(connection, job.frame)
     if frame.state in _BEING_SIGNED:
         set_state(connection, frame.number, FrameState.FAILED, reason)
-        name = map_of(connection, frame.map_number).name
+        name = map_of_number(connection, frame.map_number).name
         record_event(connection, "frame.failed", name, frame.id, job.id)
 
 
 def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
-    """A long job goes on where it stood, as the same job: what it found so far is kept."""
+    """Continue a long job where it stopped, as the same job."""
     if not job.state.over:
         return _job_record(connection, job), False
     if job.state == JobState.SUCCEEDED:
         raise CannotRetry(f"Job {job.id} is {job.state}, so there is nothing to retry.")
-    queue.revive(connection, job)
+    queue.requeue_job(connection, job)
     record_change(connection, "job.retried", _map_name(connection, job), job.id)
     return _job_record(connection, queue.find_job(connection, job.id)), True
 
@@ -353,10 +348,10 @@ def _job_record(connection: Connection, job: JobRow) -> Job:
     frame_id = followed_by = None
     if job.frame_number is not None:
         frame_id = frame_of(connection, job.frame).id
-        last = queue.last_of(connection, job.kind, job.frame_number, job.model_id)
+        last = queue.latest_job(connection, job.kind, job.frame_number, job.model_id)
         followed_by = None if last is None or last.number == job.number else last.id
     return job_record(job, frame_id, _map_name(connection, job), followed_by)
 
 
 def _map_name(connection: Connection, job: JobRow) -> str | None:
-    return None if job.map_number is None else map_of(connection, job.map_number).name
+    return None if job.map_number is None else map_of_number(connection, job.map_number).name

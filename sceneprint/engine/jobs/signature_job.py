@@ -1,4 +1,4 @@
-"""What a worker does: claim, sign, and store what came of it in one commit."""
+"""The worker's main job: claim a frame, sign it, and store the results in one commit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sceneprint.models import Model
 from sceneprint.pipeline import prepare
 from sceneprint.store import Database, Store, queue
 from sceneprint.store.frames import set_state
-from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of
+from sceneprint.store.maps import find_map, frame_of, geometry_blobs, map_of_number
 from sceneprint.store.reencoding_rows import REENCODE, enqueue_all, models_of
 from sceneprint.store.signatures import (
     StoredSignature,
@@ -39,21 +39,21 @@ from sceneprint_client.api import FrameState, JobState
 
 log = logging.getLogger(__name__)
 
-#: Seconds that a result waits for a server that is away, and between two tries. Less than a worker
-#: has that is told to stop.
+#: Seconds that a result waits for an unreachable server, and between two attempts. A worker that
+#: must stop has more time.
 AWAY_S, AGAIN_S = 12.0, 0.5
 
 
 def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob | None:
-    """Take the next job, or None where there is none; gives up those that kill every worker.
+    """Claim the next job, or return None; declare jobs dead that kill every worker.
 
-    A job of no single frame comes as a LongJob. See also `queue.claim`.
+    A job without a single frame is a LongJob. See also `queue.claim`.
     """
     with store.database.read() as connection:
         if not queue.has_due(connection):
             return None
-        given_up = queue.is_given_up(connection)
-    if given_up:  # jobs that kill every worker, and their frames
+        is_exhausted = queue.has_exhausted(connection)
+    if is_exhausted:
         with store.database.write() as connection:
             for job in queue.dead_letter(connection):
                 if job.kind != REENCODE:
@@ -64,16 +64,16 @@ def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob
             return None
         if held.frame_number is None:
             number = held.map_number
-            return LongJob(held, None if number is None else map_of(connection, number))
+            return LongJob(held, None if number is None else map_of_number(connection, number))
         frame = frame_of(connection, held.frame)
         if held.kind != REENCODE:
             set_state(connection, frame.number, FrameState.SIGNING)
-        return lifecycle.Work(held, frame, map_of(connection, frame.map_number))
+        return lifecycle.Work(held, frame, map_of_number(connection, frame.map_number))
 
 
 @dataclass(frozen=True)
-class Made:
-    """The signature of a frame, to be stored, and the artifact that it refers to."""
+class SigningResult:
+    """A frame's signature to be stored, and the artifact that it refers to."""
 
     signature: StoredSignature
     artifact: bytes
@@ -87,25 +87,25 @@ def run(
 
     Parameters
     ----------
-    work : of `claim`
-    lease_s : seconds for which each renewal holds
-    longest_s : seconds after which it is renewed no more: what takes so long does not end
-    broke : told of an error that nobody raised on purpose, when what came of it is stored:
-        whatever this process holds may be unsound from now on
+    work : job of `claim`
+    lease_s : seconds of each renewal
+    longest_s : seconds after which the lease is no longer renewed, as such work does not end
+    broke : function that is called after an unexpected error, when its result is stored: the state
+        of this process may be damaged
 
     Returns
     -------
-    state : of the job; queued where it broke down, or the map's model changed, and it will be
-        tried again; None where the lease was lost, and with it the work
+    state : state of the job; queued if it failed and will be retried, or if the map's model
+        changed; None if the lease was lost, and the result with it
     """
     start = time.perf_counter()
     state: JobState | None
-    made: Made | None = None
+    result: SigningResult | None = None
     gone: list[str] = []
     try:
         with lifecycle.renewed(store, work.job, lease_s, longest_s):
-            made = _make(store, signers, work)
-            gone = _store_patiently(store, signers, readers, work, made)
+            result = _sign(store, signers, work)
+            gone = _store_patiently(store, signers, readers, work, result)
         state = JobState.SUCCEEDED
     except errors.LostLease as error:
         log.warning("lease lost", extra=lifecycle.about(work, error=str(error)))
@@ -114,19 +114,19 @@ def run(
         state = lifecycle.restart_jobs(store, work)
     except errors.FrameError as error:
         state = lifecycle.reject(store, work, error)
-    except errors.UnusableStore:  # a full disk is no fault of the frame's, and costs it no try
-        with suppress(errors.UnusableStore):  # else its lease runs out
-            # others go before it: it may be its own folder of blobs alone that cannot be written
+    except errors.UnusableStore:  # a full disk does not count as a failure of the frame
+        with suppress(errors.UnusableStore):  # else the lease ends by itself
+            # later than others, as only this worker may be unable to write
             lifecycle.put_back(store, work, lifecycle.LEFT_S)
-            if made is not None:
-                collect_blobs(store, [made.signature.geometry])
+            if result is not None:
+                collect_blobs(store, [result.signature.geometry])
         raise
     except Exception as error:
         state = lifecycle.break_down(store, work, error)
         if broke is not None and not isinstance(error, errors.SceneprintError):
             broke()
-    if made is not None and state != JobState.SUCCEEDED:
-        gone = [made.signature.geometry]  # nothing came to refer to it
+    if result is not None and state != JobState.SUCCEEDED:
+        gone = [result.signature.geometry]  # nothing refers to it
     if gone:
         collect_blobs(store, gone)
     if state is None:
@@ -137,7 +137,7 @@ def run(
     return state
 
 
-def _make(store: Store, signers: Signers, work: lifecycle.Work) -> Made:
+def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> SigningResult:
     """Sign a frame, and store its artifact."""
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
@@ -145,28 +145,25 @@ def _make(store: Store, signers: Signers, work: lifecycle.Work) -> Made:
     frame = read_stored(store.blobs.get(work.frame.blob), work.frame, store.decoders)
     signature, geometry = prepare(frame, signer)
     artifact = write_geometry(geometry)
-    blob = store.blobs.put(artifact)
     stored = StoredSignature(
-        model_id=signature.model_id,
-        vector=signature.vector.tobytes(),
-        geometry=blob,
-        n_patches=signature.n_patches,
+        model_id=signature.model_id, vector=signature.vector.tobytes(),
+        geometry=store.blobs.put(artifact), n_patches=signature.n_patches,
         n_pairs=signature.n_pairs,
-    )
-    return Made(stored, artifact)
+    )  # fmt: skip
+    return SigningResult(stored, artifact)
 
 
 def _store_patiently(
-    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, made: Made
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, result: SigningResult
 ) -> list[str]:
-    """As `_store`, while another server takes the place of one that fell.
+    """Call `_store`, and retry while another server replaces a failed one.
 
-    Where the fall hid that it was committed, the lease is found to be over: it took effect once.
+    If the failed server had committed the result, the retry raises LostLease.
     """
     until = time.monotonic() + AWAY_S
     while True:
         try:
-            return _store(store, signers, readers, work, made)
+            return _store(store, signers, readers, work, result)
         except errors.StoreAway:
             if time.monotonic() > until:
                 raise
@@ -174,175 +171,174 @@ def _store_patiently(
 
 
 def _store(
-    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, result: Made
+    store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, result: SigningResult
 ) -> list[str]:
-    """Signature, artifact, state and end of the job in one commit.
+    """Store signature, artifact, state and the end of the job in one commit.
 
     Returns
     -------
-    blobs : that nothing refers to any more, of a frame that was not to be kept, as its map has the
-        place
+    blobs : blobs that nothing refers to any more, if the frame is redundant
     """
-    made = result.signature
+    signature = result.signature
     if work.again:
-        return _replace_signature(store, work, made)
+        return _replace_signature(store, work, signature)
     if _index_alone(store, work, result):
         return []
     while True:
-        seen, is_kept = None, work.frame.novelty is None
+        nearest, is_kept = None, work.frame.novelty is None
         if not is_kept:
-            seen = look(store.database, readers, work.map, made)
+            nearest = find_nearest(store.database, readers, work.map, signature)
         number = work.frame.map_number
         with (
             suppress(Stale),
             store.database.write(map_number=number) as connection,
         ):
             is_indexed = is_kept and index_claimed_frame(
-                connection, work.job, work.frame, work.map.name, made
+                connection, work.job, work.frame, work.map.name, signature
             )
             if not is_indexed:
                 queue.finish(connection, work.job, JobState.SUCCEEDED)
-            is_held = store.blobs.holds(made.geometry)
+            is_held = store.blobs.holds(signature.geometry)
             if is_indexed and is_held:
                 return []
-            row = map_of(connection, number)
-            if row.model_id != made.model_id:
+            row = map_of_number(connection, number)
+            if row.model_id != signature.model_id:
                 raise lifecycle.Outdated
             reason = None
-            if seen is not None:
-                reason = judge(connection, work.frame, made, seen, signers(made.model_id).model)
+            if nearest is not None:
+                model = signers(signature.model_id).model
+                reason = why_redundant(connection, work.frame, signature, nearest, model)
             if reason is not None:
                 set_state(connection, work.frame.number, FrameState.REDUNDANT, reason)
                 lifecycle.record_job_event(connection, "frame.redundant", work)
-                return [work.frame.blob, made.geometry]
-            if not is_held:  # nothing referred to it until now
-                raise errors.DamagedBlob(
-                    "A deletion elsewhere swept the artifact: it must be made again."
-                )
-            index_frame(connection, work.frame, made)
+                return [work.frame.blob, signature.geometry]
+            if not is_held:
+                raise errors.DamagedBlob(_SWEPT)
+            index_frame(connection, work.frame, signature)
             if row.next_model_id is not None:
                 enqueue_all(connection, row, [work.frame.number])
             lifecycle.record_job_event(connection, "frame.indexed", work)
             return []
 
 
-def _index_alone(store: Store, work: lifecycle.Work, result: Made) -> bool:
-    """Index a frame as most are, in one round trip to PostgreSQL; False, and nothing was written,
-    where more has to be found out or written.
-    """
-    made = result.signature
+_SWEPT = "A deletion removed the artifact, so the frame is signed again."
+
+
+def _index_alone(store: Store, work: lifecycle.Work, result: SigningResult) -> bool:
+    """Index a frame in one round trip to PostgreSQL; return False if nothing was written."""
+    signature = result.signature
     if store.database.is_sqlite or work.frame.novelty is not None:
         return False
     with store.database.write(map_number=work.frame.map_number, single=True) as connection:
-        is_indexed = index_claimed_frame(connection, work.job, work.frame, work.map.name, made)
-    if is_indexed:  # a deletion may have removed it before the commit: from now on none does
-        store.blobs.ensure(made.geometry, result.artifact)
+        is_indexed = index_claimed_frame(connection, work.job, work.frame, work.map.name, signature)
+    if is_indexed:  # a deletion may have removed the artifact before the commit
+        store.blobs.ensure(signature.geometry, result.artifact)
     return is_indexed
 
 
-def _replace_signature(store: Store, work: lifecycle.Work, made: StoredSignature) -> list[str]:
-    """Signature and artifact of an indexed frame, beside those of another model or in the place
-    of damaged ones, and the end of the job in one commit.
+def _replace_signature(store: Store, work: lifecycle.Work, signature: StoredSignature) -> list[str]:
+    """Replace or add the signature of an indexed frame, and end the job, in one commit.
 
     Returns
     -------
-    blobs : that the frame refers to no more
+    blobs : blobs that the frame no longer refers to
     """
     number = work.frame.number
     with store.database.write(map_number=work.frame.map_number) as connection:
         queue.finish(connection, work.job, JobState.SUCCEEDED)
-        row = map_of(connection, work.frame.map_number)
+        row = map_of_number(connection, work.frame.map_number)
         indexed = frame_of(connection, number).state == FrameState.INDEXED
-        if not indexed or made.model_id not in models_of(row):
+        if not indexed or signature.model_id not in models_of(row):
             raise lifecycle.Outdated
-        if not store.blobs.holds(made.geometry):
-            raise errors.DamagedBlob(
-                "A deletion elsewhere swept the artifact: it must be made again."
-            )
-        before = geometry_blobs(connection, [number], made.model_id).values()
-        replace_signature(connection, work.frame, made)
+        if not store.blobs.holds(signature.geometry):
+            raise errors.DamagedBlob(_SWEPT)
+        before = geometry_blobs(connection, [number], signature.model_id).values()
+        replace_signature(connection, work.frame, signature)
         lifecycle.record_job_event(connection, "frame.reencoded", work)
-        return [blob for blob in before if blob != made.geometry]
+        return [blob for blob in before if blob != signature.geometry]
 
 
-# Whether a map has the place of a frame already, as `if_novel` of an upload asks.
+# Novelty: `if_novel` of an upload rejects frames of places that the map has.
 #
-# signature  --look-->  Look, as of a revision  --judge, in the commit-->  Near, or None to keep it
+# signature  --find_nearest-->  Nearest, as of a revision  --why_redundant, in the commit-->  reason
 #
-# The search holds no lock. What was indexed between it and the commit is compared in the commit,
-# so that of two frames of one place that are signed at once only one is kept.
+# The search holds no lock. The commit compares frames that were indexed since, so that of two
+# simultaneous frames of one place only one is stored.
 
 
 @dataclass(frozen=True)
-class Look:
-    """The nearest frame of a map as of a revision, and its distance; None in an empty map."""
+class Nearest:
+    """Number and distance of a map's nearest frame as of a revision; None in an empty map."""
 
     revision: int
     nearest: tuple[int, int] | None
 
 
 class Stale(Exception):
-    """The nearest frame was deleted since the look, and nobody knows the next one."""
+    """The nearest frame was deleted since the search, so that the next one is unknown."""
 
 
-def look(database: Database, readers: Readers, row: MapRow, made: StoredSignature) -> Look | None:
+def find_nearest(
+    database: Database, readers: Readers, row: MapRow, signature: StoredSignature
+) -> Nearest | None:
     """Search a map for the nearest frame.
 
     Parameters
     ----------
-    row : of the map, as it was
+    row : map, as last read
 
     Returns
     -------
-    look : None where the map has come to have another model: nothing can be compared
+    nearest : None if the map has another model now, whose signatures cannot be compared
 
     Raises
     ------
-    LostLease : the map is gone, and the job with it.
+    LostLease : the map was deleted, and the job with it.
     """
     with database.read() as connection:
         try:
             now = find_map(connection, row.name)
         except errors.UnknownMap as error:
             raise errors.LostLease(str(error)) from error
-        if now.number != row.number or now.model_id != made.model_id:
+        if now.number != row.number or now.model_id != signature.model_id:
             return None
         view = readers.view(connection, now)
-    hits = view.search(_vector(made), 1, dead=view.dead)
+    hits = view.search(_vector(signature), 1, dead=view.dead)
     if len(hits) == 0:
-        return Look(view.revision, None)
-    return Look(view.revision, (int(hits.keys[0]), int(hits.distances[0])))
+        return Nearest(view.revision, None)
+    return Nearest(view.revision, (int(hits.keys[0]), int(hits.distances[0])))
 
 
-def judge(
-    connection: Connection, frame: FrameRow, made: StoredSignature, seen: Look | None, model: Model
-) -> str | None:
-    """Why a frame is not kept, in the transaction that would index it; None where it is.
+def why_redundant(
+    connection: Connection, frame: FrameRow, signature: StoredSignature, seen: Nearest | None,
+    model: Model,
+) -> str | None:  # fmt: skip
+    """Return why a frame is redundant, in the transaction that would index it; None if it is novel.
 
     Raises
     ------
-    Stale : look again.
+    Stale : search again.
     """
-    novelty = frame_of(connection, frame.number).novelty  # another upload may have loosened it
-    row = map_of(connection, frame.map_number)
-    if novelty is None or seen is None or row.model_id != made.model_id:
+    novelty = frame_of(connection, frame.number).novelty  # another upload may have relaxed it
+    row = map_of_number(connection, frame.map_number)
+    if novelty is None or seen is None or row.model_id != signature.model_id:
         return None
-    nearest = _nearest_now(connection, row, _vector(made), seen, model.metric)
+    nearest = _nearest_now(connection, row, _vector(signature), seen, model.metric)
     if nearest is None:
         return None
-    apart = np.array(nearest[1])
-    share = float(distance_share(apart, model.unrelated_distance, model.metric))
+    distance = np.array(nearest[1])
+    share = float(distance_share(distance, model.unrelated_distance, model.metric))
     if share > novelty:
         return None
-    there = frame_of(connection, nearest[0]).id
+    other = frame_of(connection, nearest[0]).id
     return (
-        f"the map already has this place: frame {there} is at {share:.3f} of the distance of "
+        f"the map already has this place: frame {other} is at {share:.3f} of the distance of "
         f"unrelated frames (required: more than {novelty:g})"
     )
 
 
 def _nearest_now(
-    connection: Connection, row: MapRow, vector: Bytes, seen: Look, metric: Metric
+    connection: Connection, row: MapRow, vector: Bytes, seen: Nearest, metric: Metric
 ) -> tuple[int, int] | None:
     nearest = seen.nearest
     for block in changes_since(connection, row, seen.revision):
@@ -357,5 +353,5 @@ def _nearest_now(
     return nearest
 
 
-def _vector(made: StoredSignature) -> Bytes:
-    return np.frombuffer(made.vector, np.uint8)
+def _vector(signature: StoredSignature) -> Bytes:
+    return np.frombuffer(signature.vector, np.uint8)

@@ -1,9 +1,9 @@
-"""Long jobs, that are of no single frame: done in slices.
+"""Long jobs, which are not about a single frame and run in slices.
 
     begin  -->  queued  --claim-->  LongJob  --Tasks.run-->  a SliceResult for each slice
 
-What a slice found, how far it came, and that the job goes on or is over, is one commit, fenced by
-the job's token. A slice whose worker died is done again from where the last one ended.
+The results and progress of a slice are one commit, fenced by the job's token. If a worker dies, its
+slice is repeated.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ from sceneprint.store.audit_log import record_change
 from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import find_map, living_map, map_of
+from sceneprint.store.maps import current_map, find_map, map_of_number
 from sceneprint.store.tables import ARCHIVE, JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Job, JobState
 
 
 class Swept(StoreError):
-    """A deletion removed a file before the commit that would have referred to it."""
+    """A deletion removed a file before the commit that refers to it."""
 
 
 @dataclass(frozen=True, eq=False)
 class LongJob:
-    """A long job in hand.
+    """A claimed long job.
 
     Parameters
     ----------
-    job : as it was claimed
-    map : that it is about; None where it is of none
+    job : job as claimed
+    map : its map; None: it has none
     """
 
     job: JobRow
@@ -63,7 +63,7 @@ class LongJob:
 
     @property
     def data(self) -> dict[str, Any]:
-        """What was asked for."""
+        """Parameters of the job."""
         return self.job.data or {}
 
     @property
@@ -73,7 +73,7 @@ class LongJob:
 
     @property
     def of_map(self) -> MapRow:
-        """The map, of a kind of job that always has one."""
+        """The map of a job whose kind always has one."""
         if self.map is None:
             raise ValueError(f"job {self.job.id} has no map")
         return self.map
@@ -81,20 +81,20 @@ class LongJob:
 
 @dataclass(frozen=True, eq=False)
 class SliceResult:
-    """What a slice came to.
+    """The results of a slice.
 
     Parameters
     ----------
     over : whether the job is done
-    progress : `done` and `total` for people, and whatever the next slice needs to go on
-    items : found in this slice
-    files : made in this slice, blobs that are there
-    result : in short, at the end
-    drop : names of files of the job that are of no use any more
-    event : kind of the event that tells of the end, such as association.found; its data is `result`
-    write : what else the commit stores; returns blobs that may be of no use any more
-    blobs : that `write` comes to refer to; they are there
-    after_s : seconds before the next slice, where the job waits for others
+    progress : `done` and `total` for users, and the state that the next slice needs
+    items : items of this slice
+    files : files of this slice, whose blobs exist
+    result : summary, at the end
+    drop : names of files of the job that are no longer needed
+    event : kind of the event at the end, such as association.found; its data is `result`
+    write : function that stores more in the commit, and returns blobs that may be unused
+    blobs : existing blobs that `write` refers to
+    after_s : seconds before the next slice, if the job waits for others
     """
 
     over: bool
@@ -109,78 +109,73 @@ class SliceResult:
     after_s: float = 0.0
 
 
-#: Whether a slice is to end at its next step, as its time is over or somebody else waits.
+#: Returns whether a slice must end, as its time is over or another job waits.
 IsOver = Callable[[], bool]
-#: Does a slice of a job until it is to end, at least a step of it; may be done again.
+#: Runs a slice of a job until it must end, at least one step; it may be repeated.
 Handler = Callable[[LongJob, IsOver], SliceResult]
 
 
 log = logging.getLogger(__name__)
 
-#: Seconds of a slice at most, and between two looks whether another job waits that goes before.
+#: Maximum seconds of a slice, and between two checks whether another job waits.
 SLICE_S, LOOK_S = 15.0, 0.1
-#: Errors that trying again cannot help: what was asked for cannot be done.
+#: Errors that a retry does not help.
 HOPELESS = (
     FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, QuotaExceeded,
 )  # fmt: skip
 
 
 def ends_within(is_over: IsOver, seconds: float) -> IsOver:
-    """The end of a slice that takes no longer than that from now."""
+    """Return an `IsOver` that also ends the slice after some seconds from now."""
     until = time.monotonic() + seconds
     return lambda: time.monotonic() >= until or is_over()
 
 
 class Tasks:
-    """Kinds of long jobs, each with what does it."""
+    """The handlers of long jobs, by kind."""
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
         self._handlers: dict[str, Handler] = {}
 
     def register(self, kind: str, handler: Handler) -> None:
-        """Let jobs of a kind be done by this process.
-
-        Parameters
-        ----------
-        kind, handler : see there
-        """
+        """Let this process run jobs of a kind."""
         self._handlers[kind] = handler
 
     def begin(
         self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
         files: Collection[queue.JobFile] = (), once: IdempotentRequest | None = None,
     ) -> tuple[Job, bool]:  # fmt: skip
-        """Queue a job of a kind.
+        """Queue a job.
 
         Parameters
         ----------
-        kind : such as associate
-        map_name : that it is about, or None
-        data : what is asked for, as JSON
-        priority : as of frames
-        files : that it works on
-        once : the request that is to take effect once
+        kind : kind, such as associate
+        map_name : name of its map, or None
+        data : parameters, as JSON
+        priority : priority, as of frames
+        files : input files
+        once : request that must take effect once
 
         Returns
         -------
-        job : the job
-        replayed : whether `once` began it before; it is told as it is
+        job : job
+        replayed : whether an earlier request of `once` queued it; it is returned as it is now
 
         Raises
         ------
-        UnknownMap : no such map.
-        Swept : a file is gone; put it once more.
-        IdempotencyConflict : something else was asked with the key of `once`.
+        UnknownMap : the map does not exist.
+        Swept : a file was removed; store it again.
+        IdempotencyConflict : another request was sent with the key of `once`.
         QuotaExceeded : the map has no room for an archive among the files.
         """
         with self._store.database.write() as connection:
             row = None if map_name is None else find_map(connection, map_name)
-            before = None if once is None else once.found(connection)
+            before = None if once is None else once.stored_result(connection)
             if before is not None:
-                with suppress(UnknownJob):  # its map may have been deleted and made anew
-                    there = queue.find_job(connection, before["job_id"])
-                    return job_record(there, None, map_name), True
+                with suppress(UnknownJob):  # a new map may have replaced its map
+                    former = queue.find_job(connection, before["job_id"])
+                    return job_record(former, None, map_name), True
             self._check(files)
             size = sum(one.bytes for one in files if one.name == ARCHIVE)
             gone = [] if row is None else make_room(connection, row, size, new=False)
@@ -189,19 +184,16 @@ class Tasks:
             queue.add_files(connection, job.number, files)
             record_change(connection, "job.queued", map_name, job.id, kind=kind)
             if once is not None:
-                once.keep(connection, {"job_id": job.id})
+                once.store(connection, {"job_id": job.id})
         collect_deleted_blobs(self._store, gone)
         self._bell.ring()
         return job_record(job, None, map_name), False
 
     def run(
-        self,
-        task: LongJob,
-        lease_s: float,
-        longest_s: float,
+        self, task: LongJob, lease_s: float, longest_s: float,
         broke: Callable[[], None] | None = None,
-    ) -> JobState | None:
-        """Do a slice of a claimed job; see `signature_job.run` for the rest."""
+    ) -> JobState | None:  # fmt: skip
+        """Run a slice of a claimed job; other parameters as in `signature_job.run`."""
         start, job = time.perf_counter(), task.job
         state: JobState | None
         try:
@@ -213,7 +205,7 @@ class Tasks:
                         "`sceneprint serve` or `sceneprint work`."
                     )
                 outcome = handler(task, self._end_of_slice(job))
-                state = self._keep(task, outcome)
+                state = self._store_result(task, outcome)
         except LostLease as error:
             log.warning("lease lost", extra=_about(task, error=str(error)))
             return None
@@ -222,7 +214,7 @@ class Tasks:
         except Swept:
             self.put_back(task)
             state = JobState.QUEUED
-        except UnusableStore:  # a full disk is no fault of the job's, and costs it no try
+        except UnusableStore:  # a full disk does not count as a failure of the job
             self.put_back(task, LEFT_S)
             raise
         except Exception as error:
@@ -234,7 +226,7 @@ class Tasks:
         return state
 
     def _end_of_slice(self, job: JobRow) -> IsOver:
-        """When a slice of a job ends that begins now."""
+        """Return when a slice that begins now must end."""
         until, look_at = time.monotonic() + SLICE_S, 0.0
 
         def is_over() -> bool:
@@ -243,30 +235,30 @@ class Tasks:
             if now < until and now >= look_at:
                 look_at = now + LOOK_S
                 with self._store.database.read() as connection:
-                    return queue.waits_before(connection, job)
+                    return queue.has_waiting_before(connection, job)
             return now >= until
 
         return is_over
 
     def put_back(self, task: LongJob, after_s: float = 0.0) -> None:
-        """Return a claimed job undone."""
+        """Queue a claimed job that was not started."""
         with suppress(LostLease, UnusableStore), self._store.database.write() as connection:
-            queue.give_back(connection, task.job, after_s)
+            queue.release_job(connection, task.job, after_s)
 
-    def _keep(self, task: LongJob, outcome: SliceResult) -> JobState:
+    def _store_result(self, task: LongJob, outcome: SliceResult) -> JobState:
         try:
-            gone = self._stored(task, outcome)
-        except Exception:  # nothing came to refer to them
-            made = [*(one.blob for one in outcome.files), *outcome.blobs]
-            collect_deleted_blobs(self._store, made)
+            gone = self._commit(task, outcome)
+        except Exception:  # nothing refers to the blobs
+            unused = [*(file.blob for file in outcome.files), *outcome.blobs]
+            collect_deleted_blobs(self._store, unused)
             raise
         collect_deleted_blobs(self._store, gone)
         if not outcome.over:
             self._bell.ring()
         return JobState.SUCCEEDED if outcome.over else JobState.QUEUED
 
-    def _stored(self, task: LongJob, outcome: SliceResult) -> list[str]:
-        """What a slice came to, in one commit; returns blobs that may be of no use any more."""
+    def _commit(self, task: LongJob, outcome: SliceResult) -> list[str]:
+        """Store the results of a slice, and return blobs that may be unused now."""
         job, number = task.job, None if task.map is None else task.map.number
         with self._store.database.write(map_number=number) as connection:
             if outcome.over:
@@ -275,16 +267,16 @@ class Tasks:
                     result=outcome.result,
                 )  # fmt: skip
                 if outcome.event is not None:
-                    name = None if task.map is None else map_of(connection, task.map.number).name
+                    name = None if number is None else map_of_number(connection, number).name
                     record_event(
                         connection, outcome.event, name, None, job.id, **(outcome.result or {})
                     )
             else:
-                queue.go_on(connection, task.job, outcome.progress, outcome.after_s)
+                queue.requeue_slice(connection, task.job, outcome.progress, outcome.after_s)
             self._check(outcome.files)
             if not all(map(self._store.blobs.holds, outcome.blobs)):
-                raise Swept("A deletion elsewhere swept the same bytes before they were stored.")
-            # after the job: it may be gone, and nothing can be of one that is
+                raise Swept("A deletion removed the same bytes before they were stored.")
+            # after the job, which fails if the job was deleted
             queue.append_items(connection, job.number, outcome.items)
             before = queue.files_of(connection, job.number)
             gone = _make_room(connection, task.map, before, outcome.files)
@@ -294,12 +286,10 @@ class Tasks:
             return gone if outcome.write is None else [*gone, *outcome.write(connection)]
 
     def _check(self, files: Collection[queue.JobFile]) -> None:
-        """See that files are there, in the transaction that comes to refer to them."""
-        for one in files:
-            if not self._store.blobs.holds(one.blob):
-                raise Swept(
-                    f"A deletion elsewhere swept the same {one.name} before its job was stored."
-                )
+        """Check that files exist, in the transaction that refers to them."""
+        for file in files:
+            if not self._store.blobs.holds(file.blob):
+                raise Swept(f"A deletion removed the same {file.name} before its job was stored.")
 
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
         try:
@@ -323,16 +313,16 @@ def _make_room(
     connection: Connection, row: MapRow | None, before: Mapping[str, queue.JobFile],
     files: Collection[queue.JobFile],
 ) -> list[str]:  # fmt: skip
-    """Make room for an archive that takes the place of a smaller one; returns doomed blobs."""
+    """Make room for an archive that replaces a smaller one; return doomed blobs."""
     [size] = [one.bytes for one in files if one.name == ARCHIVE] or [0]
     if row is None or size == 0:
         return []
     held = before[ARCHIVE].bytes if ARCHIVE in before else 0
-    return make_room(connection, living_map(connection, row), size - held, new=False)
+    return make_room(connection, current_map(connection, row), size - held, new=False)
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:
-    """What a line of the log says of a job."""
+    """Return the fields of a log line about a job."""
     job = task.job
     name = None if task.map is None else task.map.name
     return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

@@ -41,7 +41,7 @@ from sceneprint.store.copy_rows import (
 )
 from sceneprint.store.deletion import BLOCK, delete_frames, remove_map
 from sceneprint.store.frames import write_map
-from sceneprint.store.maps import add_map, find_map, keep_model, list_maps
+from sceneprint.store.maps import add_map, find_map, list_maps, store_model
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import FrameRow, MapRow
@@ -317,7 +317,7 @@ def _write(
     written = [_copied(head, row) for name, row in rows.items() if before.get(name) != row]
     blobs: list[str] = []
     with store.blobs.kept(), store.database.write() as connection:
-        keep_model(connection, head.model_id, head.model, model)
+        store_model(connection, head.model_id, head.model, model)
         row = _prepared(store, connection, head, blobs)
         there = living_rows(connection, row)
         gone = [one for name, one in there.items() if name not in rows]

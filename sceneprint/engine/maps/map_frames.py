@@ -35,7 +35,7 @@ from sceneprint.pictures import (
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
 from sceneprint.store.frame_queries import (
-    Held,
+    RunSummary,
     TakenPosition,
     count_run,
     list_runs,
@@ -310,7 +310,7 @@ def _only(what: str, asked: str | None, found: Iterable[str | None], session: st
     return names[0] if names else None
 
 
-def _session(run: Held) -> Session:
+def _session(run: RunSummary) -> Session:
     return Session(
         robot=run.robot,
         session=run.session,

@@ -39,10 +39,10 @@ from sceneprint.store.maps import (
     add_map,
     find_frame,
     find_map,
-    keep_model,
     list_maps,
     model_content,
     model_names,
+    store_model,
 )
 from sceneprint.store.parent_joins import root_columns
 from sceneprint.store.queue import cancel_jobs
@@ -75,7 +75,7 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
     with store.database.write() as connection:
         there = {row.name: row for row in list_maps(connection)}.get(new.name)
         if there is None:
-            keep_model(connection, model.id, model.name, write_model(model))
+            store_model(connection, model.id, model.name, write_model(model))
             row = add_map(connection, new.name, new.title, model.id, limits)
             return serializers.map_record(connection, row), True
         other = any(getattr(there, name) != value for name, value in limits.items())
@@ -284,8 +284,8 @@ def begin_reencoding(store: Store, map_name: str, model: str | Path | Model) -> 
                 f"Map {row.name!r} is already signed with {wanted.label}. There is nothing to do."
             )
         if row.next_model_id is None:
-            keep_model(connection, wanted.id, wanted.name, write_model(wanted))
-            stored.begin(connection, row, wanted.id)
+            store_model(connection, wanted.id, wanted.name, write_model(wanted))
+            stored.begin_reencoding(connection, row, wanted.id)
             row = find_map(connection, row.name)
         else:
             record_change(connection, "map.reencoding_retried", row.name, model=wanted.id)
@@ -310,7 +310,7 @@ def cancel_reencoding(store: Store, map_name: str) -> Map:
                 "cancel. To undo a finished switch, run it again with --model and the previous "
                 "model."
             )
-        stored.give_up(connection, row)
+        stored.cancel_reencoding(connection, row)
     _tidy(store, row)
     with store.database.read() as connection:
         return map_record(connection, find_map(connection, map_name))
@@ -368,8 +368,8 @@ class Reencodings:
             found = trusted(connection, now, generation)
             if found is not None:
                 # what was signed after the index was published, and had a revision before it
-                signed = stored.signed_up_to(connection, now, found.revision)
-                stored.touch(connection, now, np.setdiff1d(signed, found.keys).tolist())
+                signed = stored.frames_signed_by(connection, now, found.revision)
+                stored.raise_revisions(connection, now, np.setdiff1d(signed, found.keys).tolist())
             rejected = stored.switch_model(connection, now)
         log.info(
             "map reencoded",
@@ -383,12 +383,12 @@ def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
     after, queued = 0, 0
     while True:
         with store.database.read() as connection:  # most often there is nothing: no lock
-            if not stored.unqueued(connection, row, after, again=again):
+            if not stored.unqueued_frames(connection, row, after, again=again):
                 return queued
         with store.database.write() as connection:
             if not _still(find_map(connection, row.name), row):
                 return queued
-            numbers = stored.unqueued(connection, row, after, again=again)
+            numbers = stored.unqueued_frames(connection, row, after, again=again)
             stored.enqueue_all(connection, row, numbers)
         if numbers:
             after, queued = numbers[-1], queued + len(numbers)

@@ -36,7 +36,7 @@ from sceneprint.geometry.rigid import transform_points
 from sceneprint.store import Store, queue
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.audit_log import record_change
-from sceneprint.store.maps import find_map, map_of
+from sceneprint.store.maps import find_map, map_of_number
 from sceneprint.store.opaque_ids import invalid_cursor
 from sceneprint.store.surface_rows import LevelTotals, SightingFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import JobRow, MapRow
@@ -345,7 +345,7 @@ class MapSurfaces:
             now = stored.tile_of_number(connection, tile.number)
             if now is None or now.blob != tile.blob:
                 raise _unknown_tile(row, tile.digest)
-            stored.spoil_tile(connection, now)
+            stored.schedule_rebuild(connection, now)
 
     def _moment(self, last: tuple[float, int]) -> str | None:
         return self._store.seals.next_moment("frame", [last, last], 1)
@@ -396,7 +396,7 @@ def remove_block(store: Store, row: MapRow) -> bool:
         surface = stored.find_surface(connection, row.number)
         if surface is None or surface.wanted:
             return True
-        blobs, over = stored.remove_some(connection, row.number)
+        blobs, over = stored.remove_block(connection, row.number)
         if over:
             stored.write_surface(
                 connection, row.number, model_id="", parents=[], sessions=[], updated_at=None
@@ -434,7 +434,7 @@ class SurfaceUpkeep:
         self._next = time.monotonic() + LOOK_S
         try:
             with self._store.database.read() as connection:
-                found = stored.maps_to_look_at(connection)
+                found = stored.maps_to_update(connection)
             if self._auto:
                 self._add_rows([row for row, surface in found if surface is None])
             seen = self._seen
@@ -465,7 +465,7 @@ class SurfaceUpkeep:
             if not self._is_due(connection, row, surface):
                 return
         with self._store.database.write(map_number=row.number) as connection:
-            row = map_of(connection, row.number)
+            row = map_of_number(connection, row.number)
             now = stored.find_surface(connection, row.number)
             if now is None or not now.wanted:
                 return
@@ -494,7 +494,9 @@ class SurfaceUpkeep:
             for row in rows[:_ROWS_AT_ONCE]:
                 with suppress(SceneprintError):
                     if (
-                        stored.find_surface(connection, map_of(connection, row.number).number)
+                        stored.find_surface(
+                            connection, map_of_number(connection, row.number).number
+                        )
                         is None
                     ):
                         stored.add_surface(connection, row)

@@ -44,7 +44,7 @@ from sceneprint.geometry.rigid import transform_points
 from sceneprint.store import Store
 from sceneprint.store import surface_rows as stored
 from sceneprint.store.deletion import doom
-from sceneprint.store.maps import living_map
+from sceneprint.store.maps import current_map
 from sceneprint.store.surface_rows import FusedFrame, SurfaceRow, TileRow
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
@@ -155,7 +155,7 @@ class SurfaceHandler:
         """A slice: some frames added or taken out, some tiles made anew, or the conclusion."""
         is_over = ends_within(is_over, SLICE_S)
         with self._store.database.read() as connection:
-            row = living_map(connection, task.of_map)
+            row = current_map(connection, task.of_map)
             surface = stored.find_surface(connection, row.number)
         if surface is None or not surface.wanted:
             return SliceResult(True, dict(task.progress))
@@ -191,7 +191,7 @@ class SurfaceHandler:
         cell_m = cell_width(self._signers(row.model_id).model.parameters.cloud.voxel_size)
 
         def write(connection: Connection) -> Collection[str]:
-            blobs, over = stored.remove_some(connection, row.number)
+            blobs, over = stored.remove_block(connection, row.number)
             if over:
                 stored.write_surface(
                     connection, row.number, model_id=row.model_id, cell_m=cell_m, revision=-1,
@@ -210,7 +210,7 @@ class SurfaceHandler:
             return SliceResult(False, progress | {"checked": True})
 
         def write(connection: Connection) -> Collection[str]:
-            stored.take_out(connection, numbers)
+            stored.remove_fused(connection, numbers)
             return ()
 
         progress["done"] += len(numbers)
@@ -323,7 +323,7 @@ class SurfaceHandler:
     def _conclude(self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
         """The end, where nothing came, went or was edited meanwhile; else once more."""
         with self._store.database.read() as connection:
-            row = living_map(connection, row)
+            row = current_map(connection, row)
             now = stored.find_surface(connection, row.number)
             if (
                 now is None

@@ -44,8 +44,8 @@ from sceneprint.store.frame_queries import (
     PathFrame,
     QueryOrigin,
     numbers_of_session,
-    passing,
-    stops_of,
+    passing_frames,
+    path_frames,
 )
 from sceneprint.store.maps import find_map, frames_of, geometry_blobs, unknown_map
 from sceneprint.store.parent_joins import (
@@ -90,7 +90,9 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
     sides, found = sessions_of(request), []
     numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
     if request.filter is not None:
-        passed = passing(connection, row.number, request.filter, QueryOrigin(None, None, None))
+        passed = passing_frames(
+            connection, row.number, request.filter, QueryOrigin(None, None, None)
+        )
         kept = set(passed.tolist())
         numbers = [[number for number in own if number in kept] for own in numbers]
     if sum(map(len, numbers)) > MOST_FRAMES:
@@ -101,7 +103,7 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
             (("sessions", "too many frames"),),
         )
     for own in numbers:
-        stops = stops_of(connection, own)
+        stops = path_frames(connection, own)
         found.append([stops[number] for number in own if number in stops])
     for stops_found, (session, robot) in zip(found, sides, strict=True):
         robots = sorted({stop.robot or "" for stop in stops_found})
@@ -215,7 +217,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         source, target = progress["source"], progress["target"]
         with self._store.database.read() as connection:
             found = items_of(connection, task.job.number) + items
-            stops = stops_of(connection, {*source, *target})
+            stops = path_frames(connection, {*source, *target})
         scale = self._signers(task.of_map.model_id).model.answer.map.same_m / MapParameters().same_m
         verdicts, counts, joins = finish_association(found, source, target, stops, request, scale)
         rooted = self._rooted(task, joins) if request.join and len(request.sessions) == 2 else []
@@ -329,7 +331,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         """
 
         def records(connection: Connection, block: list[dict[str, Any]]) -> list[Edge]:
-            stops = stops_of(connection, {item[s] for item in block for s in ("from", "to")})
+            stops = path_frames(connection, {item[s] for item in block for s in ("from", "to")})
             return [
                 _edge(item, stops)
                 for item in block
@@ -361,7 +363,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             items = self.items(connection, job, 0, result["edges"])
             progress = job.progress or {}
             numbers = [progress["source"], progress["target"]]
-            stops = stops_of(connection, {number for run in numbers for number in run})
+            stops = path_frames(connection, {number for run in numbers for number in run})
         distinct = numbers[:1] if numbers[0] == numbers[1] else numbers
         runs = [[stops[n] for n in run if n in stops] for run in distinct]
         chosen = [

@@ -19,7 +19,7 @@ from sceneprint.engine.products.product import BACKGROUND
 from sceneprint.errors import SceneprintError
 from sceneprint.store import Store
 from sceneprint.store.frames import count_states
-from sceneprint.store.maps import list_maps, map_of
+from sceneprint.store.maps import list_maps, map_of_number
 from sceneprint.store.parent_joins import ParentRun, posed_runs, undone_pairs
 from sceneprint.store.queue import enqueue, list_jobs
 from sceneprint.store.tables import JobRow, MapRow
@@ -76,7 +76,7 @@ class JoinUpkeep:
             if _due(connection, row) is None:
                 return True
         with self._store.database.write(map_number=row.number) as connection:
-            row = map_of(connection, row.number)
+            row = map_of_number(connection, row.number)
             request = _due(connection, row)  # another process may have been first
             if request is not None:
                 data = request.model_dump(mode="json", exclude_unset=True)

@@ -42,11 +42,11 @@ from sceneprint.store.frame_queries import (
     PathFrame,
     QueryOrigin,
     numbers_of_runs,
+    path_frames,
     positions_of_map,
-    stops_of,
 )
 from sceneprint.store.frames import count_states
-from sceneprint.store.maps import living_frame, living_map, model_names
+from sceneprint.store.maps import current_map, living_frame, model_names
 from sceneprint.store.queue import items_of
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
@@ -132,7 +132,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         """Query one frame; skip it where that cannot be done."""
         row, number = task.of_map, progress["frames"][progress["done"]]
         with self._store.database.read() as connection:
-            stop = stops_of(connection, [number]).get(number)
+            stop = path_frames(connection, [number]).get(number)
         try:
             if stop is None:
                 raise UnknownFrame(f"Frame number {number} was deleted.")
@@ -175,7 +175,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
     ) -> SliceResult:  # fmt: skip
         """Return plans and counts of all frames; the plans are items behind those of the frames."""
         with self._store.database.read() as connection:
-            row = living_map(connection, task.of_map)
+            row = current_map(connection, task.of_map)
             found = items_of(connection, task.job.number) + items
             plans, cell_m = plans_of(connection, row, found, request.cell_m)
             states = count_states(connection, row.number)
@@ -210,7 +210,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
 
         def records(connection: Connection, block: list[dict[str, Any]]) -> list[CoverageFrame]:
             named = {one for item in block for one in (item["frame"], *item["look_alikes"])}
-            stops = stops_of(connection, named)
+            stops = path_frames(connection, named)
             return [
                 _frame_record(item, stops)
                 for item in block

@@ -20,7 +20,7 @@ from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import DamagedBlob, NotIndexed, UnknownJob
 from sceneprint.store import Store, queue
 from sceneprint.store.audit_log import record_change
-from sceneprint.store.maps import find_map, living_map, map_of
+from sceneprint.store.maps import current_map, find_map, map_of_number
 from sceneprint.store.opaque_ids import row_of
 from sceneprint.store.reencoding_rows import PRIORITY as REENCODING_PRIORITY
 from sceneprint.store.tables import JobRow, MapRow
@@ -123,7 +123,7 @@ class Products(ABC, Generic[Request, Record]):
     def restart(self, row: MapRow, request: Request) -> dict[str, Any]:
         """Return what `start` returns for a map as it is now."""
         with self._store.database.read() as connection:
-            return self.start(connection, living_map(connection, row), request)
+            return self.start(connection, current_map(connection, row), request)
 
     def list_all(self, map_name: str, cursor: str | None = None, limit: int = 100) -> Page[Record]:
         """Return the jobs of a map, the newest first.
@@ -160,7 +160,9 @@ class Products(ABC, Generic[Request, Record]):
             job = self.find(connection, map_name, job_id)
             self.check_removal(connection, job)
             blobs = queue.remove_job(connection, job)
-            name = None if job.map_number is None else map_of(connection, job.map_number).name
+            name = (
+                None if job.map_number is None else map_of_number(connection, job.map_number).name
+            )
             record_change(connection, "job.removed", name, job_id, kind=self.kind)
         collect_deleted_blobs(self._store, blobs)
 

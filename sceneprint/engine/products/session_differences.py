@@ -48,12 +48,12 @@ from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.rigid import transform_points
 from sceneprint.store import Store, queue
 from sceneprint.store.frame_queries import (
-    any_gone,
+    any_purged,
     parents_of_session,
+    path_frames,
     posed_in_session,
-    stops_of,
 )
-from sceneprint.store.maps import geometry_blobs, living_map
+from sceneprint.store.maps import current_map, geometry_blobs
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import sessions as api
@@ -134,7 +134,7 @@ class Differences(Products[NewDifference, Difference]):
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
         """Return whether any frame that a job compares was deleted."""
-        return any_gone(connection, _frames_of(job))
+        return any_purged(connection, _frames_of(job))
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Fuse at least one frame, or have one judge cells; the last slice concludes."""
@@ -142,7 +142,7 @@ class Differences(Products[NewDifference, Difference]):
         request = NewDifference.model_validate(task.data)
         progress = dict(task.progress) or self.restart(task.of_map, request)
         with self._store.database.read() as connection:
-            row = living_map(connection, task.of_map)
+            row = current_map(connection, task.of_map)
             file = queue.files_of(connection, task.job.number).get(STATE)
         parameters = self._signers(row.model_id).model.parameters  # while no connection is held
         progress.setdefault("cell_m", cell_width(parameters.cloud.voxel_size))
@@ -198,7 +198,7 @@ class Differences(Products[NewDifference, Difference]):
     def _posed(self, row: MapRow, number: int, parent: str) -> tuple[Geometry, Floats] | None:
         """The artifact of a frame and its T_parent_sensor; None where it is lost or was edited."""
         with self._store.database.read() as connection:
-            stop = stops_of(connection, [number]).get(number)
+            stop = path_frames(connection, [number]).get(number)
             blob = geometry_blobs(connection, [number], row.model_id).get(number)
         if stop is None or stop.pose is None or stop.parent != parent or blob is None:
             return None

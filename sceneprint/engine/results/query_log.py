@@ -404,11 +404,11 @@ class QueryLog:
             return
         self._tidied, self._bytes_written = time.monotonic(), 0
         try:
-            self.remove_spent()
+            self.remove_surplus()
         except SceneprintError as error:
             log.warning("query removal failed", extra={"error": str(error)})
 
-    def remove_spent(self) -> int:
+    def remove_surplus(self) -> int:
         """Remove old and surplus queries, and the oldest answers where there is too little room;
         returns how many.
         """

@@ -222,7 +222,7 @@ class IndexPlace:
         if self._store is None:
             return
         self._claim(self._store)
-        last = self._store.look(_SWEPT)
+        last = self._store.head(_SWEPT)
         if not now and last is not None and time.time() - last.changed_at < 0.45 * self._purge_s:
             return
         self._store.put(_SWEPT, b"")

@@ -31,7 +31,7 @@ from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare, sign
 from sceneprint.store import Store
-from sceneprint.store.frame_queries import QueryOrigin, passing
+from sceneprint.store.frame_queries import QueryOrigin, passing_frames
 from sceneprint.store.frames import refers_to
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs, list_maps
 from sceneprint.store.signatures import stored_vector
@@ -435,5 +435,5 @@ def _among(
     """Frames of a view that pass a filter; the database may be newer or older than the view."""
     view = place.view
     with store.database.read() as connection:
-        numbers = passing(connection, place.row.number, wanted, asked.taken)
+        numbers = passing_frames(connection, place.row.number, wanted, asked.taken)
     return numbers[view.has(numbers) & ~np.isin(numbers, list(dead))]

@@ -14,7 +14,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from sceneprint.geometry.rigid import mean_direction
-from sceneprint.store.frame_queries import FrameUp, frame_ups, stops_of
+from sceneprint.store.frame_queries import FrameUp, frame_ups, path_frames
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api.coverage import UpSource
@@ -149,7 +149,7 @@ def parent_axes(connection: Connection, row: MapRow, numbers: Sequence[int]) -> 
     numbers = numbers[:: max(len(numbers) // _UP_FRAMES, 1)]
     if (up := parent_up(connection, numbers)) is not None:
         return PlanAxes(plan_axes(up), "frames" if row.up is None else "map")
-    stops = [stop for stop in stops_of(connection, numbers).values() if stop.pose is not None]
+    stops = [stop for stop in path_frames(connection, numbers).values() if stop.pose is not None]
     if not stops:  # all were deleted meanwhile
         return PlanAxes(np.eye(3)[:2], "cameras")
     poses = np.array([stop.pose for stop in stops])

@@ -21,7 +21,7 @@ from pathlib import Path
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store
 from sceneprint.store.blobs.folder import LONGEST_S
-from sceneprint.store.deletion import doom, doomed_blobs, settle
+from sceneprint.store.deletion import clear_doomed, doom, doomed_blobs
 from sceneprint.store.frames import referred_blobs, refers_to
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
             return False
         kept = referred_blobs(connection, block)
         store.blobs.remove(*(blob for blob in block if blob not in kept))
-        settle(connection, block)
+        clear_doomed(connection, block)
         return True
 
 
@@ -80,14 +80,14 @@ def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
                 return False
             kept = referred_blobs(connection, block)
             # a removal that lost its lock may still be at the others, and `holds` must know
-            settle(connection, [*kept], before=time.time() - LONGEST_S)
+            clear_doomed(connection, [*kept], before=time.time() - LONGEST_S)
             gone = [blob for blob in block if blob not in kept]
             at = doom(connection, gone)
         store.blobs.remove(*gone)
     if not gone:
         return True
     with store.database.write() as connection:
-        settle(connection, gone, at)
+        clear_doomed(connection, gone, at)
     return True
 
 

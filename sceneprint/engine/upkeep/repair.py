@@ -22,7 +22,7 @@ from sceneprint.store.blobs.folder import Condition
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import renew_upload
 from sceneprint.store.maps import find_frame, find_map, frames_of, geometry_blobs
-from sceneprint.store.queue import enqueue, last_of
+from sceneprint.store.queue import enqueue, latest_job
 from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import FrameRow, MapRow
 from sceneprint.types import Bytes
@@ -119,7 +119,7 @@ def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[
     found = frames_of(connection, numbers)
     now, due = time.time(), []
     for number in dict.fromkeys(numbers):
-        job = last_of(connection, REENCODE, number, model_id)
+        job = latest_job(connection, REENCODE, number, model_id)
         # a job of the future was made before the clock was set back
         busy = job is not None and (not job.state.over or abs(now - job.created_at) < PAUSE_S)
         if number not in found or busy or is_known_loss(found[number].reason):

@@ -1,4 +1,4 @@
-"""Blobs that rows refer to, each against its digest, and files that nothing refers to."""
+"""Check the blobs that rows refer to against their digests, and find unreferenced files."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from sceneprint.store.events import record_event
 from sceneprint.store.frames import referred_blobs
 from sceneprint.store.queue import PENDING, cancel_jobs, enqueue, remove_parts
 from sceneprint.store.reencoding_rows import REENCODE
-from sceneprint.store.surface_rows import spoil_tile, tile_of_number
+from sceneprint.store.surface_rows import schedule_rebuild, tile_of_number
 from sceneprint.store.tables import frames, job_files, jobs, maps, signatures, surface_tiles
 from sceneprint_client.api import FrameState
 
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
-_KEPT = frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT))
+_HAS_UPLOAD = frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT))
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class BlobReference:
 
     Parameters
     ----------
-    number : of the row
-    name : which blob of the row it is: an artifact's model, a file's name, a tile's place
+    number : number of the row
+    name : which blob of the row: an artifact's model, a file's name, a tile's place
     owner : id of the frame or job
-    state, reason : of the frame, where it is one's
-    on_its_way : whether a job is to make the blob again
+    state, reason : those of the frame, if the row is one's
+    on_its_way : whether a job will compute the blob again
     """
 
     kind: str
@@ -60,16 +60,16 @@ class BlobReference:
 
     @property
     def frame_id(self) -> str | None:
-        """The frame, where it is one's."""
+        """Id of the frame, if the row is one's."""
         return None if self.state is None else self.owner
 
     @property
     def what(self) -> str:
-        """The blob, for people."""
+        """Description of the blob."""
         if self.state is not None:
             return f"the {self.kind} of frame {self.owner} of map {self.map}"
-        of = f"of map {self.map}" if self.owner is None else f"of job {self.owner}"
-        return f"{self.kind} {self.name} {of}"
+        owner = f"map {self.map}" if self.owner is None else f"job {self.owner}"
+        return f"{self.kind} {self.name} of {owner}"
 
 
 def _uploads() -> Select[Any]:
@@ -77,7 +77,7 @@ def _uploads() -> Select[Any]:
     return (
         select(c.number, c.blob, maps.c.name, literal(""), c.id, c.state, c.reason)
         .join(maps, maps.c.number == c.map_number)
-        .where(_KEPT)
+        .where(_HAS_UPLOAD)
     )
 
 
@@ -112,7 +112,7 @@ def _tiles(blob: Column[str]) -> Select[Any]:
     )
 
 
-# What a repair does about a blob that is lost or damaged, and moved away.
+# Repairs after a lost blob, or a damaged one that was moved away.
 
 
 def _note_loss(connection: Connection, one: BlobReference, condition: Condition) -> str:
@@ -126,7 +126,7 @@ def _note_loss(connection: Connection, one: BlobReference, condition: Condition)
     if waiting:
         cancel_jobs(connection, jobs.c.frame_number == one.number)
         record_event(connection, "frame.failed", str(one.map), one.frame_id)
-    return f"the frame is {state}, and says so in its reason"
+    return f"the frame is {state}, and its reason describes the loss"
 
 
 def _clear_loss(connection: Connection, one: BlobReference) -> str:
@@ -143,27 +143,27 @@ def _make_artifact(connection: Connection, one: BlobReference, _: Condition) -> 
         return "its upload is lost too: upload the frame again"
     if not one.on_its_way:
         enqueue(connection, REENCODE, one.number, PRIORITY, one.name)
-    return "a worker makes it again from the upload"
+    return "a worker computes it again from the upload"
 
 
 def _forget_file(connection: Connection, one: BlobReference, _: Condition) -> str:
     remove_parts(connection, one.number, items=False, files=[one.name])
-    return "the job has it no more"
+    return "the file is removed from the job"
 
 
 def _make_tile(connection: Connection, one: BlobReference, _: Condition) -> str:
     tile = tile_of_number(connection, one.number)
     if tile is not None:
-        spoil_tile(connection, tile)
-    return "a worker makes it again from the frames"
+        schedule_rebuild(connection, tile)
+    return "a worker computes it again from the frames"
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of blob: who refers to one, what its loss means, and how it is repaired."""
+    """A kind of blob: its references, the meaning of its loss, and its repair."""
 
     table: Table
-    asked: tuple[Select[Any], ...]
+    references: tuple[Select[Any], ...]
     means: str
     would: str
     repair: Callable[[Connection, BlobReference, Condition], str]
@@ -171,46 +171,46 @@ class _Kind:
 
 _KINDS = {
     "upload": _Kind(
-        frames, (_uploads(),), "the frame cannot be signed again; upload it again to heal",
-        "say so in the frame's reason; one that is not signed yet fails", _note_loss,
+        frames, (_uploads(),), "the frame cannot be signed again; upload it again to repair it",
+        "set the frame's reason; a frame that is not signed yet fails", _note_loss,
     ),
     "artifact": _Kind(
-        frames, (_artifacts(),), "the frame is found, and cannot be validated",
-        "have it made again from the upload", _make_artifact,
+        frames, (_artifacts(),), "queries find the frame, but cannot validate it",
+        "compute it again from the upload", _make_artifact,
     ),
     "job-file": _Kind(
-        jobs, (_job_files(),), "it cannot be given out, nor gone on with",
-        "forget it: begin the job anew", _forget_file,
+        jobs, (_job_files(),), "it cannot be downloaded, and the job cannot continue",
+        "remove it: start the job again", _forget_file,
     ),
     "tile": _Kind(
         surface_tiles, (_tiles(surface_tiles.c.blob), _tiles(surface_tiles.c.draft)),
         "that part of the surface cannot be shown",
-        "have it made again from the frames", _make_tile,
+        "compute it again from the frames", _make_tile,
     ),
 }  # fmt: skip
 
 
 def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobReference]:
-    """Read the references of some rows, in their order."""
+    """Return the references of some rows, in order."""
     number = _KINDS[kind].table.c.number
     return [
         BlobReference(kind, *row)
-        for asked in _KINDS[kind].asked
-        for row in connection.execute(asked.where(number.in_(numbers)).order_by(number))
+        for statement in _KINDS[kind].references
+        for row in connection.execute(statement.where(number.in_(numbers)).order_by(number))
     ]
 
 
 def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Finding]:
-    """Check the blobs of a kind that some rows refer to, each against its digest."""
+    """Check the blobs of a kind that some rows refer to against their digests."""
     blobs = folder.store.blobs
     for one in read_rows(folder, numbers, partial(_read, kind)):
         if isinstance(one, tuple):
-            continue  # found when rows were looked at
+            continue  # `check_rows` reports it
         folder.counts["blobs"] += 1
         folder.counts["bytes"] += 0 if folder.quick else blobs.size(one.digest) or 0
         condition = blobs.condition(one.digest, quick=folder.quick)
-        found = _is_found(one, condition) and not folder.quick
-        if condition == "sound" and not found:
+        recovered = _is_recovered(one, condition) and not folder.quick
+        if condition == "sound" and not recovered:
             continue
         with folder.store.database.read() as connection:
             if _now(connection, one) is None:  # deleted since
@@ -220,11 +220,11 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
             path=blobs.place(one.digest),
         )  # fmt: skip
         means = _KINDS[kind].means
-        if found:
+        if recovered:
             yield finding(
                 kind="found-upload", severity="leftover",
-                means="the frame's reason says that it is lost, and it is there",
-                would="clear the reason, and sign a frame that had failed for that",
+                means="the frame's reason says that it is lost, but it exists",
+                would="clear the reason, and sign the frame if it failed because of that",
                 repair=partial(_repair, folder, one),
             )  # fmt: skip
         elif condition == "missing" and (one.on_its_way or is_known_loss(one.reason)):
@@ -237,8 +237,8 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
             )  # fmt: skip
 
 
-def _is_found(one: BlobReference, condition: Condition) -> bool:
-    """Return whether an upload is there that its frame calls lost."""
+def _is_recovered(one: BlobReference, condition: Condition) -> bool:
+    """Return whether an upload exists that its frame calls lost."""
     return one.kind == "upload" and condition == "sound" and is_known_loss(one.reason)
 
 
@@ -252,16 +252,16 @@ def check_products(folder: Folder) -> Iterator[Finding]:
 
 
 def _now(connection: Connection, one: BlobReference) -> BlobReference | None:
-    """Return the reference as it is now; None where the row refers to the blob no more."""
-    found = _read(one.kind, connection, [one.number])
-    return next((o for o in found if (o.digest, o.name) == (one.digest, one.name)), None)
+    """Return the present reference; None if the row no longer refers to the blob."""
+    references = _read(one.kind, connection, [one.number])
+    return next((o for o in references if (o.digest, o.name) == (one.digest, one.name)), None)
 
 
 def _repair(folder: Folder, one: BlobReference) -> str:
-    # in one transaction: an upload of the same bytes may come, and what it put must stay
+    # in one transaction, so that a new upload of the same bytes stays
     with folder.store.database.write() as connection:
         now, condition = _now(connection, one), folder.store.blobs.condition(one.digest)
-        if now is not None and _is_found(now, condition):
+        if now is not None and _is_recovered(now, condition):
             return _clear_loss(connection, now)
         if now is None or condition == "sound":
             return GONE
@@ -269,16 +269,14 @@ def _repair(folder: Folder, one: BlobReference) -> str:
         return moved + _KINDS[one.kind].repair(connection, now, condition)
 
 
-# What lies where blobs are kept and nothing refers to, or is none of ours.
-
-#: Seconds that a file which is being written is left alone at least, whatever the grace.
+#: Minimum age of an unfinished file in a finding, seconds.
 WRITING_S = 60.0
-#: Files that are looked up in one transaction.
+#: Number of files to look up in one transaction.
 _BATCH = 200
 
 
 def check_files(folder: Folder) -> Iterator[Finding]:
-    """Find what lies where blobs are kept and nothing refers to, or is none of ours."""
+    """Find unreferenced and foreign files where blobs are stored."""
     if folder.map_name is not None:
         return
     now, waiting = time.time(), list[BlobEntry]()
@@ -289,7 +287,7 @@ def check_files(folder: Folder) -> Iterator[Finding]:
         if entry.digest is None and not entry.unfinished:
             yield Finding(
                 "foreign-file", entry.place, "note",
-                "nothing here is called so: it is left alone", path=entry.place,
+                "the store has no file of this name, and ignores it", path=entry.place,
             )  # fmt: skip
         elif entry.changed_at < now - max(folder.grace_s, WRITING_S * entry.unfinished):
             waiting.append(entry)
@@ -301,28 +299,28 @@ def check_files(folder: Folder) -> Iterator[Finding]:
 
 def _unreferenced(folder: Folder, entries: list[BlobEntry]) -> Iterator[Finding]:
     with folder.store.database.read() as connection:
-        kept = referred_blobs(connection, [each.digest for each in entries if each.digest])
-        known = connection.execute(select(frames.c.number).limit(1)).first() is not None
+        referred = referred_blobs(connection, [each.digest for each in entries if each.digest])
+        in_use = connection.execute(select(frames.c.number).limit(1)).first() is not None
     for entry in entries:
-        if entry.digest in kept:
+        if entry.digest in referred:
             continue
         yield Finding(
-            "unreferenced-file", entry.place, "leftover" if known else "note",
-            "no row refers to it: its writer was killed half way, or its frame was deleted"
-            if known else "the database has never held a frame: is it the one of these blobs?",
-            "remove it" if known else None, path=entry.place,
-            repair=partial(_remove, folder, entry) if known else None,
+            "unreferenced-file", entry.place, "leftover" if in_use else "note",
+            "no row refers to it: its writer was killed, or its frame was deleted"
+            if in_use else "the database has never held a frame: is it the one of these blobs?",
+            "remove it" if in_use else None, path=entry.place,
+            repair=partial(_remove, folder, entry) if in_use else None,
         )  # fmt: skip
 
 
 def _remove(folder: Folder, entry: BlobEntry) -> str:
     if entry.digest is None:
-        Path(entry.place).unlink(missing_ok=True)  # of a folder: elsewhere nobody sees one
+        Path(entry.place).unlink(missing_ok=True)  # only folders list unfinished files
         return "removed"
     collect_blobs(folder.store, [entry.digest])
     if not folder.store.blobs.holds(entry.digest):
         return "removed"
     with folder.store.database.read() as connection:
-        if referred_blobs(connection, [entry.digest]):  # its upload was only just committed
+        if referred_blobs(connection, [entry.digest]):  # an upload has just been committed
             return GONE
     raise StoreError(BUSY_BLOBS)

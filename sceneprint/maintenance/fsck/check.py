@@ -1,9 +1,9 @@
-"""A check of a whole data folder: what is lost, damaged or left over, and its repair.
+"""Check a whole data folder for lost, damaged and left-over data, and repair it.
 
-    Settings  --fsck-->  Findings, as they are found
+    Settings  --fsck-->  Findings, as they are discovered
 
-Without repair nothing at all is written. With it each finding is repaired as it comes, in a
-transaction that looks again first: services and workers may be at work meanwhile.
+Without repair nothing is written. With it each finding is repaired at once, in a transaction that
+checks it again, since services and workers may run meanwhile.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from sceneprint.maintenance.fsck.indexes import check_indexes
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, Store, open_store
 from sceneprint.store.maps import find_map
-from sceneprint.store.read_only import look_at, opened_blobs, require_folder
+from sceneprint.store.read_only import inspect_blobs, inspect_database, require_folder
 from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState
 
@@ -54,7 +54,7 @@ def _check_all_frames(folder: Folder) -> Iterator[Finding]:
         yield from check_frames(folder, numbers)
 
 
-#: Files before frames: what a repair of a frame dooms is no leftover.
+#: Files come before frames: blobs that a frame's repair dooms are not left over.
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
     check_database, check_models, check_counts, check_files, _check_all_frames, check_products,
     check_indexes,
@@ -70,25 +70,25 @@ def fsck(
 
     Parameters
     ----------
-    settings : that name the folder
-    map_name : the map to check; None: all of them, and what belongs to none
-    repair : whether to repair what is found; else nothing is changed
-    quick : look only at what is there, and read nothing large
+    settings : settings of the folder
+    map_name : map to check; None: all maps, and data of no map
+    repair : whether to repair findings; else nothing is changed
+    quick : whether to check only that things exist, without reading large ones
     grace_s : see GRACE_S
-    counts : filled with how much was looked at
+    counts : filled with the numbers of checked things
 
     Yields
     ------
-    what was found, as it is found, and repaired
+    findings, after their repair
 
     Raises
     ------
-    UnusableStore, NewerSchema : there is no such folder, or it cannot be read.
-    UnknownMap : no such map.
-    ValueError : a quick look, and a repair: what has not been read is not to be relied upon.
+    UnusableStore, NewerSchema : the folder is missing or cannot be read.
+    UnknownMap : the map does not exist.
+    ValueError : `quick` and `repair` are both set: unread data cannot be repaired.
     """
     if quick and repair:
-        raise ValueError("a quick look cannot repair")
+        raise ValueError("a quick check cannot repair")
     with _open_store(settings, repair=repair) as store:
         counts = Counter() if counts is None else counts
         folder = Folder(settings, store, map_name, quick, grace_s, progress, counts)
@@ -103,7 +103,7 @@ def fsck(
 
 
 def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -> Iterator[Finding]:
-    """Yield what a check finds; that the database cannot be read on is a finding too."""
+    """Yield the findings of a check, including that the database cannot be read."""
     try:
         yield from check(folder)
     except (ValueError, TypeError, KeyError, UnusableStore) as error:
@@ -126,11 +126,14 @@ def _repaired(finding: Finding, trusted: bool) -> Finding:
 
 @contextmanager
 def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
-    # before anything is made: a disk that is not mounted is not a folder that has lost all
+    # first, as a disk that is not mounted looks like a folder without data
     if isinstance(settings.blobs, Path):
         require_folder(settings.blobs)
-    # a repair makes no database
-    with look_at(settings.database) as database, opened_blobs(settings.blobs, database) as blobs:
+    # a repair creates no database
+    with (
+        inspect_database(settings.database) as database,
+        inspect_blobs(settings.blobs, database) as blobs,
+    ):
         if not repair:
             yield Store(database, blobs)
             return
@@ -143,19 +146,19 @@ def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
 
 
 def _require_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
-    """See that a folder without a single blob is not taken for the loss of all.
+    """Check that there is a blob: an empty folder is probably not mounted.
 
     Raises
     ------
-    UnusableStore : frames refer to blobs, and there is none.
+    UnusableStore : frames refer to blobs, but there are none.
     """
-    kept = FrameState.DELETED, FrameState.REDUNDANT
-    refers = select(frames.c.number).where(frames.c.state.not_in(kept)).limit(1)
+    without = FrameState.DELETED, FrameState.REDUNDANT
+    refers = select(frames.c.number).where(frames.c.state.not_in(without)).limit(1)
     with database.read() as connection:
         if connection.execute(refers).first() is None:
             return
     if next(blobs.digests(), None) is None:
         raise UnusableStore(
-            f"{place}: not one upload is there, and nothing was changed. See that its "
-            "disk is mounted, or restore a backup."
+            f"{place}: there are no uploads, and nothing was changed. Check that its disk is "
+            "mounted, or restore a backup."
         )

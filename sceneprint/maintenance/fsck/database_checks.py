@@ -1,7 +1,7 @@
-"""The database itself, and rows that contradict each other, are damaged, or cannot be read.
+"""Check the database itself, and find rows that are contradictory, damaged or unreadable.
 
-Where the database's pages or references are damaged nothing is repaired: what the rows say cannot
-be relied upon, and a repair by them might remove what is sound.
+If pages or references of the database are damaged, nothing is repaired: its rows are not reliable,
+and a repair might remove sound data.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sceneprint.maintenance.fsck.findings import (
 from sceneprint.models import PRESETS, Model, read_model, write_model
 from sceneprint.store.deletion import doom
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import counted_usage, list_maps, next_revision, use_of
+from sceneprint.store.maps import counted_usage, list_maps, map_usage, next_revision
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.queue import PENDING, enqueue
 from sceneprint.store.reencoding_rows import REENCODE
@@ -61,7 +61,7 @@ from sceneprint_client.api import FrameState
 
 #: Kinds of findings after which nothing is repaired.
 FATAL = frozenset({"damaged-database", "dangling-row"})
-#: Findings of one kind that are named.
+#: Maximum number of findings of one kind.
 _MOST = 20
 _RESTORE = (
     "restore a backup of the data folder (`sceneprint restore`); nothing is repaired in a "
@@ -70,15 +70,15 @@ _RESTORE = (
 
 
 def check_database(folder: Folder) -> Iterator[Finding]:
-    """Check the pages and indexes of SQLite, and in either database that each row refers to one.
+    """Check SQLite's pages and indexes, and the foreign keys of either database.
 
-    PostgreSQL enforces foreign keys, but not while a dump is loaded without triggers. Its pages
-    are the concern of its own pg_amcheck.
+    PostgreSQL enforces foreign keys, but not while a dump is loaded without triggers. Its own
+    pg_amcheck checks its pages.
     """
     database = folder.store.database
     folder.progress("database", 0, 1)
     if database.is_sqlite:
-        # it alone reads all indexes: where one differs from its table, no row is relied upon
+        # integrity_check also compares indexes with their tables
         pragma = "quick_check" if folder.quick else "integrity_check"
         with database.read() as connection:
             lines = connection.execute(text(f"PRAGMA {pragma}({_MOST})")).scalars().all()
@@ -103,22 +103,22 @@ def _dangling(folder: Folder, key: ForeignKeyConstraint) -> Iterator[Finding]:
     )
     with folder.store.database.read() as connection:
         allow(connection, 0)
-        found = connection.execute(lost).all()
-    for row in found:
-        named = ", ".join(f"{value!r:.80}" for value in row)
+        rows = connection.execute(lost).all()
+    for row in rows:
+        key_text = ", ".join(f"{value!r:.80}" for value in row)
         yield Finding(
-            "dangling-row", f"row {named} of table {child.name}", "damage",
-            f"it refers to a row of {parent.name} that is not there", _RESTORE,
+            "dangling-row", f"row {key_text} of table {child.name}", "damage",
+            f"it refers to a missing row of {parent.name}", _RESTORE,
         )  # fmt: skip
 
 
 def damaged_database(message: str) -> Finding:
-    """Return the finding that the database cannot be read, or contradicts itself."""
+    """Return the finding that the database is unreadable or contradictory."""
     return Finding("damaged-database", "the database", "damage", message, _RESTORE)
 
 
 def check_models(folder: Folder) -> Iterator[Finding]:
-    """Find models whose file is damaged: nothing can be signed or searched with them."""
+    """Find models with a damaged file, which can neither sign nor search."""
     with folder.store.database.read() as connection:
         stored = connection.execute(select(models.c.id)).scalars().all()
     for model_id in stored:
@@ -128,66 +128,67 @@ def check_models(folder: Folder) -> Iterator[Finding]:
         source = next((name for name in PRESETS if read_model(name).id == model_id), None)
         yield Finding(
             "damaged-model", f"model {model_id[:12]}", "damage",
-            "its file is not the one that was stored: its maps can be neither signed nor searched",
-            "restore a backup" if source is None else f"put the preset {source} in its place",
+            "its file was changed: its maps can be neither signed nor searched",
+            "restore a backup" if source is None else f"replace it by the preset {source}",
             repair=None if source is None else partial(_put_preset, folder, model_id, source),
         )  # fmt: skip
 
 
 def _put_preset(folder: Folder, model_id: str, source: str) -> str:
-    put = update(models).where(models.c.id == model_id)
+    own = update(models).where(models.c.id == model_id)
     with folder.store.database.write() as connection:
-        found = connection.execute(put.values(content=write_model(read_model(source))))
-    return f"the preset {source} is in its place" if found.rowcount else GONE
+        replaced = connection.execute(own.values(content=write_model(read_model(source))))
+    return f"the preset {source} replaces it" if replaced.rowcount else GONE
 
 
 def check_counts(folder: Folder) -> Iterator[Finding]:
-    """Find maps that are counted to hold more or less than they do: quotas use the counts."""
+    """Find maps whose stored use is wrong, on which quotas depend."""
     with folder.store.database.read() as connection:
-        found = list_maps(connection)
-    for row in found:
+        rows = list_maps(connection)
+    for row in rows:
         if folder.quick or folder.map_name not in (None, row.name):
             continue
         with folder.store.database.read() as connection:
             allow(connection, 0)
-            counted, there = use_of(connection, row.number), counted_usage(connection, row.number)
-        if counted != there:
+            stored = map_usage(connection, row.number)
+            counted = counted_usage(connection, row.number)
+        if stored != counted:
             yield Finding(
                 "stale-value", f"map {row.name}", "damage",
-                f"it is counted to hold {counted.frames} frames of {counted.bytes} bytes, and "
-                f"holds {there.frames} of {there.bytes}", "count anew",
-                map=row.name, repair=partial(_count_anew, folder, row.number),
+                f"its stored use is {stored.frames} frames of {stored.bytes} bytes, and it holds "
+                f"{counted.frames} of {counted.bytes}", "count again",
+                map=row.name, repair=partial(_count_again, folder, row.number),
             )  # fmt: skip
 
 
-def _count_anew(folder: Folder, number: int) -> str:
+def _count_again(folder: Folder, number: int) -> str:
     own = update(maps).where(maps.c.number == number)
     with folder.store.database.write() as connection:
-        there = counted_usage(connection, number)
-        connection.execute(own.values(used_frames=there.frames, used_bytes=there.bytes))
-    return f"{there.frames} frames of {there.bytes} bytes are counted"
+        counted = counted_usage(connection, number)
+        connection.execute(own.values(used_frames=counted.frames, used_bytes=counted.bytes))
+    return f"{counted.frames} frames of {counted.bytes} bytes are counted"
 
 
-# Rows of frames, and what other tables say of them.
+# Rows of frames, and related rows of other tables.
 
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
 _GONE = (FrameState.DELETED, FrameState.REDUNDANT, FrameState.REJECTED)
 
 
 @dataclass(frozen=True)
-class _Known:
-    """A frame, and what other tables say of it."""
+class _CheckedFrame:
+    """A frame, and its rows in other tables."""
 
     frame: FrameRow
     map: MapRow
     tags: frozenset[str]
-    signed: dict[str, bool]  # models that it is signed with, and whether that signature is sound
-    busy: bool  # whether a job is to sign it
+    signed: dict[str, bool]  # whether its signatures are sound, by model
+    busy: bool  # whether a job will sign it
 
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Find frames whose rows contradict each other, are damaged, or cannot be read."""
-    for one in read_rows(folder, numbers, partial(_known_frames, folder)):
+    """Find frames whose rows are contradictory, damaged or unreadable."""
+    for one in read_rows(folder, numbers, partial(_read_frames, folder)):
         folder.counts["frames"] += 1
         if isinstance(one, tuple):
             number, error = one
@@ -211,17 +212,17 @@ def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
 
 def _repair_row(folder: Folder, number: int, fault: _Fault) -> str:
     with folder.store.database.write() as connection:
-        for one in _known_frames(folder, connection, [number]):  # somebody may have been at it
+        for one in _read_frames(folder, connection, [number]):  # it may have changed since
             if fault.is_found(one):
                 return fault.fix(folder, connection, one)
     return GONE
 
 
-def _known_frames(folder: Folder, connection: Connection, numbers: list[int]) -> list[_Known]:
-    """Read all that is looked at of some frames, as one transaction sees it."""
+def _read_frames(folder: Folder, connection: Connection, numbers: list[int]) -> list[_CheckedFrame]:
+    """Read the rows of some frames in one transaction."""
     here = frames.c.number.in_(numbers)
     own = select(maps).where(maps.c.number.in_(select(frames.c.map_number).where(here)))
-    known = {row["number"]: map_row(row) for row in connection.execute(own).mappings()}
+    map_rows = {row["number"]: map_row(row) for row in connection.execute(own).mappings()}
     tags, signed = defaultdict[int, set[str]](set), defaultdict[int, dict[str, bool]](dict)
     c = frame_tags.c
     for number, tag in connection.execute(
@@ -235,7 +236,7 @@ def _known_frames(folder: Folder, connection: Connection, numbers: list[int]) ->
     )
     busy = set(connection.execute(waiting).scalars())
     return [
-        _Known(frame_row(row), known[row["map_number"]], frozenset(tags[row["number"]]),
+        _CheckedFrame(frame_row(row), map_rows[row["map_number"]], frozenset(tags[row["number"]]),
                signed[row["number"]], row["number"] in busy)
         for row in connection.execute(select(frames).where(here)).mappings().all()
     ]  # fmt: skip
@@ -243,17 +244,17 @@ def _known_frames(folder: Folder, connection: Connection, numbers: list[int]) ->
 
 def _signatures(folder: Folder, numbers: list[int]) -> Select[Any]:
     c = signatures.c
-    asked = select(c.frame_number, c.model_id).where(c.frame_number.in_(numbers))
+    statement = select(c.frame_number, c.model_id).where(c.frame_number.in_(numbers))
     if folder.quick:
-        return asked
-    # SQLite holds any bytes as text, and cannot read them as such
+        return statement
+    # SQLite accepts any bytes as text, but cannot decode them
     raw = LargeBinary if folder.store.database.is_sqlite else Text
     counts = (cast(one, raw) for one in (c.n_patches, c.n_pairs))
-    return asked.add_columns(cast(c.vector, LargeBinary), c.checksum, *counts)
+    return statement.add_columns(cast(c.vector, LargeBinary), c.checksum, *counts)
 
 
 def _is_sound(model: Model | None, vector: bytes, checksum: int, *counts: str | bytes) -> bool:
-    """Return whether a signature is what was stored, and as long as its model makes them."""
+    """Return whether the checksum and length of a signature are right."""
     try:
         readable = all(isinstance(json.loads(one), list) for one in counts)
         fits = model is None or len(vector) == model.signature_bytes
@@ -262,23 +263,23 @@ def _is_sound(model: Model | None, vector: bytes, checksum: int, *counts: str | 
         return False
 
 
-def _is_indexed(one: _Known) -> bool:
+def _is_indexed(one: _CheckedFrame) -> bool:
     return one.frame.state == FrameState.INDEXED
 
 
-def _damaged(one: _Known) -> set[str]:
-    """Return the models whose signature of an indexed frame is damaged: others are strays."""
+def _damaged(one: _CheckedFrame) -> set[str]:
+    """Return the models whose signature of an indexed frame is damaged; others are stray."""
     own = (one.map.model_id, one.map.next_model_id) if _is_indexed(one) else ()
     return {model_id for model_id, sound in one.signed.items() if not sound and model_id in own}
 
 
-def _stray(one: _Known) -> set[str]:
-    """Return the models that a frame should have no signature of."""
+def _stray(one: _CheckedFrame) -> set[str]:
+    """Return the models of which a frame has a signature that it should not have."""
     if one.frame.deletion is not None:
         return set()  # it may be restored
     if one.frame.state in _GONE:
         return set(one.signed)
-    # another's signature would keep the frame from being signed
+    # a signature of another model would prevent signing
     own = {one.map.model_id} if _is_indexed(one) else set[str]()
     return one.signed.keys() - own - {one.map.next_model_id or ""}
 
@@ -287,35 +288,35 @@ def _place(frame: FrameRow) -> tuple[float | None, ...]:
     return (None,) * 3 if frame.pose is None else tuple(row[3] for row in frame.pose[:3])
 
 
-def _is_stale(one: _Known) -> bool:
-    """Return whether the tags or the position by which a frame is searched are not its own."""
+def _is_stale(one: _CheckedFrame) -> bool:
+    """Return whether the tags or the position that searches use differ from the frame's."""
     frame = one.frame
     placed = (frame.pose_x, frame.pose_y, frame.pose_z) == _place(frame)
     return not placed or (frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags))
 
 
-def _queue(_: Folder, connection: Connection, one: _Known) -> str:
+def _queue(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
     own = update(frames).where(frames.c.number == one.frame.number)
     connection.execute(own.values(state=FrameState.RECEIVED, reason=None))
     return f"job {enqueue(connection, 'sign', one.frame.number).id} is queued"
 
 
-def _sign(folder: Folder, connection: Connection, one: _Known) -> str:
-    """Let a frame without a sound signature be signed from its upload; failed if that is gone."""
+def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
+    """Sign a frame without a sound signature from its upload; set it to failed if that is lost."""
     frame, row, damaged = one.frame, one.map, _damaged(one)
     _remove_signatures(connection, frame.number, damaged)
     if row.model_id in one.signed and row.model_id not in damaged:
-        for model_id in damaged:  # meanwhile the frame is found by its other signature
+        for model_id in damaged:  # meanwhile its other signature is searched
             enqueue(connection, REENCODE, frame.number, PRIORITY, model_id)
-        return "a worker makes it again from the upload"
+        return "a worker computes it again from the upload"
     condition = folder.store.blobs.condition(frame.blob)
     loss = None if condition == "sound" else reason_of_loss(condition, found=False)
     values = {
         "state": FrameState.RECEIVED if loss is None else FrameState.FAILED,
         "reason": loss,
         "indexed_at": None,
-        "novelty": None,  # it was kept once, whatever has come since that is like it
-        # readers and indexes that hold it learn that it is found no more, until it is signed
+        "novelty": None,  # the map has accepted the frame before
+        # readers and indexes remove it until it is signed
         "revision": next_revision(connection, row.number),
     }
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**values))
@@ -327,7 +328,7 @@ def _sign(folder: Folder, connection: Connection, one: _Known) -> str:
     return "a worker signs it again from its upload"
 
 
-def _remove_stray(_: Folder, connection: Connection, one: _Known) -> str:
+def _remove_stray(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
     _remove_signatures(connection, one.frame.number, _stray(one))
     return f"{len(_stray(one))} removed"
 
@@ -337,7 +338,7 @@ def _remove_signatures(connection: Connection, number: int, models: set[str]) ->
         doom(connection, remove_signature(connection, number, model_id))
 
 
-def _write_derived(_: Folder, connection: Connection, one: _Known) -> str:
+def _write_derived(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
     number, (x, y, z) = one.frame.number, _place(one.frame)
     own = update(frames).where(frames.c.number == number)
     connection.execute(own.values(pose_x=x, pose_y=y, pose_z=z))
@@ -349,7 +350,7 @@ def _write_derived(_: Folder, connection: Connection, one: _Known) -> str:
     return "written"
 
 
-def _take_revision(_: Folder, connection: Connection, one: _Known) -> str:
+def _take_revision(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
     revision = next_revision(connection, one.map.number)
     own = update(frames).where(frames.c.number == one.frame.number)
     connection.execute(own.values(revision=revision))
@@ -358,38 +359,38 @@ def _take_revision(_: Folder, connection: Connection, one: _Known) -> str:
 
 @dataclass(frozen=True)
 class _Fault:
-    """What is wrong with a frame; `fix` does what `would` says, and says what it did."""
+    """An error of a frame's rows; `fix` repairs it, and returns what it did."""
 
-    is_found: Callable[[_Known], object]
+    is_found: Callable[[_CheckedFrame], object]
     means: str
     would: str
-    fix: Callable[[Folder, Connection, _Known], str]
+    fix: Callable[[Folder, Connection, _CheckedFrame], str]
 
 
 _FAULTS = {
     "frame-without-job": _Fault(
         lambda one: one.frame.state in _BEING_SIGNED and not one.busy,
-        "it waits to be signed, and no job is to sign it", "queue a job for it", _queue,
+        "it waits to be signed, but has no job", "queue a job for it", _queue,
     ),
     "frame-without-signature": _Fault(
         lambda one: _is_indexed(one) and one.map.model_id not in one.signed,
-        "it is indexed, and has no signature: it is not found",
-        "have it signed again from its upload", _sign,
+        "it is indexed without a signature, so that queries do not find it",
+        "sign it again from its upload", _sign,
     ),
     "damaged-signature": _Fault(
-        _damaged, "the bytes of its signature are not those that were stored: queries pass it over",
-        "remove the signature, and have the frame signed again from its upload", _sign,
+        _damaged, "its signature was changed, so that queries ignore it",
+        "remove the signature, and sign the frame again from its upload", _sign,
     ),
     "stray-signature": _Fault(
-        _stray, "it has a signature of a model, or in a state, that is not its own",
+        _stray, "it has a signature that its model or state does not allow",
         "remove that signature", _remove_stray,
     ),
     "stale-value": _Fault(
-        _is_stale, "the tags or the position by which it is searched are not its own",
-        "write them anew from the frame", _write_derived,
+        _is_stale, "the tags or the position that searches use differ from the frame's",
+        "copy them from the frame", _write_derived,
     ),
     "revision-ahead": _Fault(
         lambda one: (one.frame.revision or 0) > one.map.revision,
-        "its revision is beyond its map's", "give it the map's next revision", _take_revision,
+        "its revision is greater than its map's", "give it the map's next revision", _take_revision,
     ),
 }  # fmt: skip

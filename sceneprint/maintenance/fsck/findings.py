@@ -1,4 +1,4 @@
-"""What a check of a data folder finds, what it looks at, and what several repairs share."""
+"""Findings of a check, the checked folder, and functions that several checks share."""
 
 from __future__ import annotations
 
@@ -19,20 +19,19 @@ from sceneprint.store import Store
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, models
 
-#: damage: something is not as it was stored; leftover: something that nobody needs;
-#: note: known, or harmless.
+#: damage: data is not as it was stored; leftover: data is not needed; note: known, or harmless.
 Severity = Literal["damage", "leftover", "note"]
-#: Called with what is being looked at, how much of it is done, and how much there is.
+#: Function that is called with the checked subject, and its numbers of checked and all things.
 Progress = Callable[[str, int, int], None]
-#: What PostgreSQL says of pages and of indexes that are damaged.
+#: SQLSTATEs of damaged pages and indexes of PostgreSQL.
 _DAMAGED = ("XX001", "XX002")
-#: Seconds in which a file that nothing refers to may be part of an upload that goes on.
+#: Seconds in which an unreferenced file may belong to an unfinished upload.
 GRACE_S = 3600.0
-#: Rows that are read in one transaction.
+#: Number of rows to read in one transaction.
 BLOCK = 64
-#: What a repair says that finds nothing to do.
-GONE = "nothing: it was well again, or gone, when it was to be repaired"
-#: Why a blob stays where it is.
+#: Result of a repair that was not necessary any more.
+GONE = "nothing: it was repaired or deleted meanwhile"
+#: Reason why a blob cannot be moved.
 BUSY_BLOBS = (
     "a backup is being taken, or another process removes blobs; run it again when that is done"
 )
@@ -42,18 +41,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something in a data folder that is not as it should be.
+    """An error in a data folder.
 
     Parameters
     ----------
-    kind : what it is, in kebab-case
+    kind : kind, in kebab-case
     what : the record or file
-    means : what it means
-    would : what a repair would do; None where there is nothing to be done
-    map, frame_id, path : that it is about, where it is about one
-    repair : does it, and says what it did; raises a SceneprintError where it cannot
-    done : what the repair did; None where none was wanted, or there is none
-    error : why it could not be repaired
+    means : consequence
+    would : action of a repair; None: there is none
+    map, frame_id, path : map, frame and file of the error, if any
+    repair : function that repairs it and returns what it did; raises a SceneprintError if it fails
+    done : what the repair did; None: there was none
+    error : why the repair failed
     """
 
     kind: str
@@ -70,22 +69,22 @@ class Finding:
 
     @property
     def left(self) -> bool:
-        """Whether something is still to be done."""
+        """Whether the error remains."""
         return self.severity != "note" and self.done is None
 
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """A data folder that is looked at.
+    """A data folder under check.
 
     Parameters
     ----------
-    settings : that name it
-    store : its database and blobs
-    map_name : the map to look at; None: all, and what belongs to none
-    quick : see only what is there, and read nothing large
-    grace_s : seconds since its last change in which a file may be somebody's unfinished work
-    counts : how much was looked at, by its name
+    settings : settings of the folder
+    store : database and blobs
+    map_name : map to check; None: all maps, and data of no map
+    quick : whether to check only that things exist, without reading large ones
+    grace_s : age below which a file may be an unfinished write, seconds
+    counts : numbers of checked things, by name
     """
 
     settings: Settings
@@ -98,22 +97,22 @@ class Folder:
     _models: dict[str, Model | None] = field(default_factory=dict)
 
     def model(self, model_id: str) -> Model | None:
-        """Return a stored model; None where it is missing, or its file does not give its id."""
+        """Return a stored model; None if it is missing, or its file has another id."""
         if model_id not in self._models:
             with self.store.database.read() as connection:
-                wanted = select(models.c.content).where(models.c.id == model_id)
-                content = connection.execute(wanted).scalar()
+                statement = select(models.c.content).where(models.c.id == model_id)
+                content = connection.execute(statement).scalar()
             try:
-                found = None if content is None else parse_model(content, model_id)
+                model = None if content is None else parse_model(content, model_id)
             except UnreadableModel:
-                found = None
-            self._models[model_id] = found if found and found.id == model_id else None
+                model = None
+            self._models[model_id] = model if model and model.id == model_id else None
         return self._models[model_id]
 
     def numbers(
         self, subject: str, table: Table = frames, *where: ColumnElement[bool]
     ) -> Iterator[list[int]]:
-        """Yield the numbers of all rows that are looked at, in blocks, and report the progress."""
+        """Yield the numbers of all checked rows, in blocks, and report the progress."""
         done, after, number = 0, 0, table.c.number
         with self.store.database.read() as connection:
             if self.map_name is not None:
@@ -135,10 +134,10 @@ class Folder:
 def read_rows(
     folder: Folder, numbers: list[int], read: Callable[[Connection, list[int]], list[T]]
 ) -> Iterator[T | tuple[int, Exception]]:
-    """Yield what is read of rows; of those that cannot be read, their numbers and the errors."""
+    """Yield the rows of some numbers, or number and error of each that cannot be read."""
     try:
         with folder.store.database.read() as connection:
-            found = read(connection, numbers)
+            rows = read(connection, numbers)
     except (ValueError, TypeError, KeyError, UnusableStore) as error:
         if not is_of_rows(error):
             raise
@@ -146,14 +145,14 @@ def read_rows(
             yield numbers[0], error
             return
     else:
-        yield from found
+        yield from rows
         return
-    for number in numbers:  # one row that cannot be read must not hide the others
+    for number in numbers:  # one unreadable row must not hide the others
         yield from read_rows(folder, [number], read)
 
 
 def is_of_rows(error: Exception) -> bool:
-    """Return whether an error came of what is stored in the database, and not of the machine."""
+    """Return whether stored data caused an error, and not the machine."""
     if not isinstance(error, UnusableStore):
         return True
     cause = error.__cause__
@@ -165,12 +164,11 @@ def is_of_rows(error: Exception) -> bool:
 
 
 def quarantine_blob(folder: Folder, digest: str) -> str:
-    """Move a damaged blob out of the way.
+    """Move a damaged blob away, and return a description.
 
     Raises
     ------
-    StoreError : a backup is being taken, which needs all blobs where they are, or another
-        process removes some.
+    StoreError : a backup needs all blobs, or another process is removing some.
     """
     with folder.store.blobs.removing() as allowed:
         if not allowed:

@@ -1,7 +1,4 @@
-"""Search indexes, compared with the database that they were made from.
-
-To remove what is damaged is to repair it: workers make an index again.
-"""
+"""Compare search indexes with the database; workers rebuild a damaged index."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ from sceneprint_client.api import FrameState
 
 
 def check_indexes(folder: Folder) -> Iterator[Finding]:
-    """Check that the newest generation of each map is sound, and holds what the database does."""
+    """Check that the newest index of each map is sound, and equals the database."""
     with folder.store.database.read() as connection:
         rows = [row for row in list_maps(connection) if folder.map_name in (None, row.name)]
     for done, row in enumerate(() if folder.quick else rows):
@@ -33,18 +30,18 @@ def check_indexes(folder: Folder) -> Iterator[Finding]:
         if number is None or model is None:
             continue
         folder.counts["indexes"] += 1
-        found = newest(place, row.model_id, model.signature_bytes)  # reads all its bytes
-        wrong = [] if found is None else list(_differing_frames(folder, row, found))
-        if found is None or found.number < number:
+        index = newest(place, row.model_id, model.signature_bytes)  # reads all its bytes
+        wrong = [] if index is None else list(_differing_frames(folder, row, index))
+        if index is None or index.number < number:
             means = "has a damaged or missing file"
         elif wrong:
             more = " and more" if len(wrong) > 5 else ""
-            means = f"has not the signatures of frames {', '.join(wrong[:5])}{more}"
+            means = f"lacks the signatures of frames {', '.join(wrong[:5])}{more}"
         else:
             continue
         yield Finding(
             "damaged-index", f"the index of map {row.name}", "damage", means,
-            "remove it; a worker makes it again",
+            "remove it; a worker builds it again",
             map=row.name, path=place, repair=partial(_remove, place),
         )  # fmt: skip
 
@@ -55,11 +52,11 @@ def _remove(place: Path) -> str:
     return "the index is removed"
 
 
-def _differing_frames(folder: Folder, row: MapRow, found: Generation) -> Iterator[str]:
-    """Yield the ids of frames whose signature is another in the index, or is not there."""
+def _differing_frames(folder: Folder, row: MapRow, index: Generation) -> Iterator[str]:
+    """Yield the ids of frames whose signature is missing or different in the index."""
     with folder.store.database.read() as connection:
-        generation = trusted(connection, row, found)
-    if generation is None:  # of another history, as after a restore: queries pass it over
+        generation = trusted(connection, row, index)
+    if generation is None:  # queries ignore an index of another history, such as after a restore
         return
     after = 0
     here = (
@@ -80,6 +77,6 @@ def _differing_frames(folder: Folder, row: MapRow, found: Generation) -> Iterato
         rows = generation.vectors_of(keys[held])
         indexed = {key: one.tobytes() for key, one in zip(keys[held].tolist(), rows, strict=True)}
         for number, frame_id in block:
-            # one that is damaged in the database is a finding of its own
+            # damage in the database is another finding
             if number in stored and indexed.get(number) != stored[number]:
                 yield frame_id

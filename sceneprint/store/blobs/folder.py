@@ -1,4 +1,4 @@
-"""Blobs in a folder: written, synced and renamed, so that they survive the loss of power."""
+"""Blobs: their interface, and blobs in a folder that survive a power failure."""
 
 from __future__ import annotations
 
@@ -27,18 +27,15 @@ from sceneprint.atomic_files import (
 from sceneprint.errors import DamagedBlob, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import unusable
 
-# Who needs blobs kept, and who may remove some: one lock for all processes that share them.
-#
-# The lock of a process that dies is free at once: the kernel releases that of a file, and the
-# server that of a connection.
+# One lock for all processes that share the blobs: shared by those that need them, exclusive for
+# removals. The lock of a process that dies is released at once, by the kernel or the server.
 
-
-#: Seconds to wait for the end of a removal: for who has a turn, and for who has none.
+#: Seconds to wait for the end of a removal: with a turn to write, and without one.
 TURN_S, REMOVAL_S = 5.0, 25.0
-#: Seconds after which a removal is over, whatever became of who removes: it begins no request after
+#: Seconds after which a removal has ended, even of a dead process: it sends no request after
 #: REMOVAL_S, and each ends within `object_client.TRIED_S` and `SMALL_S`.
 LONGEST_S = 90.0
-#: Seconds between two looks at the lock of a folder.
+#: Seconds between two attempts to take the lock of a folder.
 _LOOK_S = 0.01
 
 
@@ -47,49 +44,48 @@ class Locks(ABC):
 
     @abstractmethod
     def kept(self) -> AbstractContextManager[None]:
-        """Hold it with others who need all blobs kept."""
+        """Hold the lock with other processes that need all blobs."""
 
     @abstractmethod
     def removing(self) -> AbstractContextManager[bool]:
-        """Hold it alone, if that can be had at once."""
+        """Hold the lock exclusively, if it is free at once."""
 
     @property
     def outlast_turns(self) -> bool:
-        """Whether a removal may go on after the turn in which it began."""
+        """Whether a removal may continue after the turn in which it began."""
         return False
 
     def removals(self) -> int | None:
-        """A number that any removal changes; None where it cannot be told, or one is under way."""
+        """Return a number that every removal changes; None if unknown, or during a removal."""
         return None
 
-    def doubt(self) -> None:  # noqa: B027  (a folder does what it is asked, or does not)
-        """Have the removal of this thread stay under way: what was asked for may be done later."""
+    def mark_uncertain(self) -> None:  # noqa: B027  (removals from a folder end at once)
+        """Leave this thread's removal unfinished: its requests may still be carried out."""
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: B027  (most have none)
-        """Wait for the end of a removal that outlasts its turn, whether it may or lost it, and not
-        for who has died.
+        """Wait for the end of a removal whose turn is over, unless its process died.
 
         Parameters
         ----------
-        digest : the only blob whose removal is waited for; None: any is
-        seconds : to wait at most
+        digest : the only blob to wait for; None: any
+        seconds : maximum seconds to wait
 
         Raises
         ------
-        StoreLocked : it takes longer.
-        UnusableStore : it cannot be told.
+        StoreLocked : the removal takes longer.
+        UnusableStore : the state of the removal is unknown.
         """
 
     def close(self) -> None:  # noqa: B027  (most hold nothing)
-        """Give back what it holds open."""
+        """Close open files and connections."""
 
 
 class FileLocks(Locks):
-    """Of the processes of one machine: the lock of a folder, or of a file that is made.
+    """The lock of the processes of one machine, on a folder or on a file.
 
     Parameters
     ----------
-    make : make a file there where there is none
+    make : whether to create a file at the path
     """
 
     def __init__(self, path: Path, *, make: bool = False) -> None:
@@ -98,7 +94,7 @@ class FileLocks(Locks):
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """See `Locks`; UnusableStore where it cannot be locked."""
+        """See `Locks`; raise UnusableStore if the lock cannot be taken."""
         try:
             descriptor = self._lock(fcntl.LOCK_SH)
         except OSError as error:
@@ -117,7 +113,7 @@ class FileLocks(Locks):
         """See `Locks`."""
         try:
             descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # held by another, or there are no locks: what stays does no harm
+        except OSError:  # in use, or the file system has no locks: remaining blobs do no harm
             yield False
             return
         try:
@@ -126,26 +122,26 @@ class FileLocks(Locks):
             os.close(descriptor)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
-        """See `Locks`: who removes in its turn may lose that, to a server that waits no longer."""
+        """See `Locks`: a removal within a turn may outlast it if a server ends the turn early."""
         until = time.monotonic() + seconds
         while True:
             try:
                 os.close(self._lock(fcntl.LOCK_SH | fcntl.LOCK_NB))
             except BlockingIOError:
                 pass
-            except OSError:  # there are no locks, and so no removals
+            except OSError:  # the file system has no locks, so there are no removals
                 return
             else:
                 return
             if time.monotonic() > until:
                 raise StoreLocked(
-                    f"{self._path}: another process removes blobs for longer than {seconds:.0f} s, "
-                    "and nothing was stored. Come back later."
+                    f"{self._path}: another process has been removing blobs for longer than "
+                    f"{seconds:.0f} s, and nothing was stored. Try again later."
                 )
             time.sleep(_LOOK_S)
 
     def _lock(self, how: int) -> int:
-        # of this call alone: flock then keeps out other threads as well as other processes
+        # a descriptor for each call: flock then excludes other threads as well
         descriptor = os.open(self._path, self._flags | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(descriptor, how)
@@ -155,36 +151,33 @@ class FileLocks(Locks):
         return descriptor
 
 
-# Blobs: bytes kept under the SHA-256 of their content, durable before anything refers to them.
+# Blobs: bytes under the SHA-256 of their content, durable before anything refers to them, in a
+# folder (folder.py) or an object store (object_store.py).
 #
 # bytes  --put-->  digest  --get-->  the same bytes, or an error
-#
-# In a folder (folder.py), or in an object store (object_store.py).
-
-# A blob that comes in parts, such as one that does not fit into memory.
 
 
 class IncomingBlob:
-    """A blob that comes in parts; see `Blobs.incoming`.
+    """A blob written in parts; see `Blobs.incoming`.
 
     Parameters
     ----------
-    file : that it is written to
-    what : to say where that fails
-    keep : makes it durable under its digest
+    file : file to write to
+    what : text of errors
+    keep : function that makes the file durable under its digest
     """
 
     def __init__(self, file: BinaryIO | FileIO, what: str, keep: Callable[[str], None]) -> None:
         self._file, self._what, self._keep = file, what, keep
         self._hashed = hashlib.sha256()
-        #: Bytes so far.
+        #: Bytes written so far.
         self.size = 0
 
     def write(self, data: bytes) -> None:
-        """Add to it."""
+        """Append bytes."""
         try:
             left = memoryview(data)
-            while left:  # a file without a buffer may take a part alone
+            while left:  # an unbuffered file may write only a part
                 left = left[self._file.write(left) or 0 :]
         except OSError as error:
             raise unusable(self._what, error) from error
@@ -192,7 +185,7 @@ class IncomingBlob:
         self.size += len(data)
 
     def keep(self) -> str:
-        """End it; when this returns it survives the loss of power. Returns its digest."""
+        """Make the blob durable, and return its digest."""
         digest = self._hashed.hexdigest()
         try:
             self._keep(digest)
@@ -201,34 +194,33 @@ class IncomingBlob:
         return digest
 
 
-#: What a blob is found to be.
 Condition = Literal["sound", "missing", "damaged"]
 DIGEST = re.compile(r"[0-9a-f]{64}")
-#: Note of whose the blobs are; see `object_store.BucketOwner`.
+#: Name of the file that names the owner of the blobs; see `object_store.BucketOwner`.
 MARK = "sceneprint.json"
 
 
-def is_digest(given: object) -> bool:
-    """Whether it is the name of a blob, whatever of."""
-    return isinstance(given, str) and DIGEST.fullmatch(given) is not None
+def is_digest(value: object) -> bool:
+    """Return whether a value is a digest."""
+    return isinstance(value, str) and DIGEST.fullmatch(value) is not None
 
 
-def require_digest(given: str) -> None:
-    """ValueError for what is no digest: it must not become part of a path or a key."""
-    if not DIGEST.fullmatch(given):
-        raise ValueError(f"{given!r} is no digest")
+def require_digest(text: str) -> None:
+    """Raise ValueError unless a text is a digest, as it becomes part of a path or a key."""
+    if not DIGEST.fullmatch(text):
+        raise ValueError(f"{text!r} is not a digest")
 
 
 @dataclass(frozen=True)
 class BlobEntry:
-    """What lies where blobs are kept.
+    """A file or object where blobs are stored.
 
     Parameters
     ----------
-    place : file or key, for people
-    digest : of the blob that it is; None where it is none
+    place : path or URL for messages
+    digest : digest of the blob; None if it is none
     changed_at : seconds since 1970
-    unfinished : whether a writer writes it, or has left it
+    unfinished : whether a writer is writing it, or abandoned it
     """
 
     place: str
@@ -238,14 +230,14 @@ class BlobEntry:
 
 
 class Blobs(ABC):
-    """Where blobs are kept; safe to share between threads."""
+    """Storage of blobs; safe to share between threads."""
 
     def __init__(self, locks: Locks) -> None:
         self._locks = locks
 
     @abstractmethod
     def put(self, data: bytes) -> str:
-        """Keep bytes; when this returns nothing that the store promises to survive loses them.
+        """Store bytes durably.
 
         Returns
         -------
@@ -253,199 +245,196 @@ class Blobs(ABC):
 
         Raises
         ------
-        StoreFull : there is no room; nothing is left behind.
-        UnusableStore : it may not be written, or is not there.
+        StoreFull : the disk is full; nothing is left behind.
+        UnusableStore : the storage is missing or not writable.
         """
 
     @abstractmethod
     def incoming(self) -> AbstractContextManager[IncomingBlob]:
-        """Take a blob in parts, such as one that does not fit into memory.
+        """Store a blob in parts, such as one that does not fit into memory.
 
-        What is not kept by the end of it is removed.
+        Unless `keep` is called, it is removed at the end.
 
         Raises
         ------
-        StoreFull, UnusableStore : as `put`, also from `write` and `keep`.
+        StoreFull, UnusableStore : see `put`; `write` and `keep` raise them as well.
         """
 
     @abstractmethod
     def get(self, digest: str) -> bytes:
-        """The bytes of a digest, checked against it.
+        """Return the bytes of a digest, checked against it.
 
         Raises
         ------
-        DamagedBlob : they are missing, or others than were stored.
-        UnusableStore : the store is away.
+        DamagedBlob : the blob is missing or damaged.
+        UnusableStore : the storage is unreachable.
         """
 
     @abstractmethod
     def open(self, digest: str) -> BinaryIO:
-        """A blob as a file that can be sought in, unchecked; FileNotFoundError where it is missing.
+        """Return a blob as a seekable file, unchecked; raise FileNotFoundError if it is missing.
 
         Raises
         ------
-        OSError, UnusableStore : it cannot be read, now or later.
+        OSError, UnusableStore : the blob cannot be read; reading may raise them as well.
         """
 
     @abstractmethod
     def holds(self, digest: str) -> bool:
-        """Whether there is a blob of that digest, and will be for who refers to it.
+        """Return whether a blob exists, and will for the caller's reference to it.
 
-        Ask in the transaction that refers to it: no removal begins before its commit, and the end
-        of one that goes on is waited for.
+        Call it in the transaction that writes the reference: no removal begins before the commit,
+        and this waits for the end of one that outlasts its turn.
 
         Raises
         ------
         StoreLocked : such a removal takes too long.
-        UnusableStore : the store is away.
+        UnusableStore : the storage is unreachable.
         """
 
     def ensure(self, digest: str, data: bytes) -> None:
-        """Put a blob once more where a removal took it before the commit of what refers to it.
+        """Store a blob again if a removal took it before the commit of a reference to it.
 
-        After that commit, no removal begins that takes it.
+        No removal that begins after that commit takes it.
 
         Raises
         ------
-        StoreLocked, UnusableStore : see `holds`; also from `put`.
+        StoreLocked, UnusableStore : see `holds` and `put`.
         """
         if not self.holds(digest):
             self.put(data)
 
     @abstractmethod
     def size(self, digest: str) -> int | None:
-        """Bytes of a blob as it lies there, unchecked; None where it is missing."""
+        """Return the size of a blob, unchecked; None if it is missing."""
 
     def kept(self) -> AbstractContextManager[None]:
-        """See that no blob is removed meanwhile; waits for who is removing some.
+        """Prevent removals of blobs; wait for one in progress.
 
-        The lock of a process that dies is free at once, however it dies.
+        The lock of a process that dies is released at once.
 
         Raises
         ------
-        UnusableStore : it cannot be locked.
+        UnusableStore : the lock cannot be taken.
         """
         return self._locks.kept()
 
     def removing(self) -> AbstractContextManager[bool]:
-        """Hold the right to remove blobs; False where somebody needs them kept, or removes some.
+        """Hold the right to remove blobs; yield False if another process needs or removes some.
 
-        Ask for it within a writing transaction: removers then come one after the other, and leave
-        room between them for who waits in `kept`. Hold it beyond that transaction only where
-        `outlast_turns`, and for blobs that it has doomed.
+        Call it within a writing transaction: removals then run one at a time, and leave room for
+        processes that wait in `kept`. Hold it beyond that transaction only if `outlast_turns`, and
+        for blobs that the transaction doomed.
         """
         return self._locks.removing()
 
     @property
     def outlast_turns(self) -> bool:
-        """Whether blobs can be removed after the turn that found nothing to refer to them: who
-        comes to refer to one meanwhile waits for that in `holds`.
-        """
+        """Whether removals may continue after the turn that found no references."""
         return self._locks.outlast_turns
 
     def wait_for_removal(self, digest: str | None = None, seconds: float = REMOVAL_S) -> None:
-        """Wait for the end of a removal that is under way; see `Locks.wait`."""
+        """Wait for the end of a removal in progress; see `Locks.wait`."""
         if self._locks.removals() is None:
             self._locks.wait(digest, seconds)
 
     @abstractmethod
     def remove(self, *digests: str) -> None:
-        """Forget blobs that nothing refers to; only within `removing`."""
+        """Remove blobs without references; call it within `removing`."""
 
     @abstractmethod
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """Whether a blob is as it was stored; read in parts, so that memory is bounded.
+        """Return the condition of a blob, read in parts to limit memory.
 
         Parameters
         ----------
-        digest : of the blob; what is no digest names none
-        quick : see only whether it is there
+        digest : text; one that is not a digest counts as missing
+        quick : whether to check only that the blob exists
 
         Raises
         ------
-        UnusableStore : it may not be read by this user, or the store is away.
+        UnusableStore : this user may not read the blob, or the storage is unreachable.
         """
 
     @abstractmethod
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Move what lies under a digest out of the way, durably; None where there is nothing.
+        """Move a damaged blob away durably, and return its new path; None if it is missing.
 
         Parameters
         ----------
-        digest : of a blob that was found damaged; only within `removing`
-        folder : to move it to; made where missing
+        digest : blob; call this within `removing`
+        folder : destination, created if missing
         """
 
     @abstractmethod
     def place(self, digest: str) -> str:
-        """Where a blob lies, for people to look at."""
+        """Return the path or URL of a blob for messages."""
 
     @abstractmethod
     def digests(self) -> Iterator[str]:
-        """All blobs, in no order."""
+        """Yield the digests of all blobs, in no order."""
 
     @abstractmethod
     def entries(self) -> Iterator[BlobEntry]:
-        """All that lies where blobs are kept, in no order."""
+        """Yield everything where blobs are stored, in no order."""
 
     @property
     def read_only(self) -> bool:
-        """Whether blobs may be read alone, as far as that can be seen without writing."""
+        """Whether the storage is read-only, as far as can be checked without writing."""
         return False
 
     def check(self) -> None:  # noqa: B027
-        """See that a store on the network answers, or did two seconds ago; a folder has nothing
-        to be asked.
+        """Check that a network storage answers, or did two seconds ago; do nothing for a folder.
 
         Raises
         ------
-        UnusableStore : it does not.
+        UnusableStore : it does not answer.
         """
 
     def close(self) -> None:
-        """Give back what it holds open."""
+        """Close open files and connections."""
         self._locks.close()
 
 
-#: What a writer that was killed leaves behind.
+#: Names of unfinished files, which killed writers leave behind.
 PART = re.compile(r"\.[0-9a-f]{12}\.part")
 
 
 class FolderBlobs(Blobs):
-    """A folder of blobs, in 256 folders by their first two digits.
+    """Blobs in 256 subfolders of a folder, named by their first two digits.
 
     Parameters
     ----------
-    folder : made where missing
-    make : whether it is
+    folder : folder
+    make : whether to create it if it is missing
 
     Raises
     ------
-    UnusableStore : it cannot be made.
+    UnusableStore : the folder cannot be created.
     """
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
-        # the folder itself is the lock, so that there is none to make or to clear away
+        # the folder itself is the lock, so there is no file to create or remove
         super().__init__(FileLocks(folder))
         self._folder = folder
-        self._durable: set[str] = set()  # folders in it that this process has synced it for
+        self._durable: set[str] = set()  # subfolders that are durable
         try:
             if make:
                 make_folder(folder)
         except OSError as error:
-            raise unusable(f"{folder}: the folder cannot be made", error) from error
+            raise unusable(f"{folder}: the folder cannot be created", error) from error
 
     @property
     def read_only(self) -> bool:
-        """Whether the folder is there and may not be written, as of a disk that was remounted."""
+        """Whether the folder exists and is not writable, such as on a remounted disk."""
         return self._folder.is_dir() and not os.access(self._folder, os.W_OK)
 
     def put(self, data: bytes) -> str:
-        """Keep bytes; when this returns they survive the loss of power. See `Blobs.put`."""
+        """See `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
         path = self.path(digest)
-        try:  # also where it is there: that one may be damaged, not yet durable, or being removed
-            new = self._made(path.parent)
+        try:  # an existing file may be damaged, not yet durable, or about to be removed
+            new = self._ensure_folder(path.parent)
             write_durable(path, data, folder_is_new=new)
         except OSError as error:
             raise unusable(f"{self._folder}: a blob cannot be written", error) from error
@@ -454,7 +443,7 @@ class FolderBlobs(Blobs):
 
     @contextmanager
     def incoming(self) -> Iterator[IncomingBlob]:
-        """Take a blob in parts; see `Blobs.incoming`."""
+        """See `Blobs.incoming`."""
         part = self._folder / f".{secrets.token_hex(6)}.part"
         what = f"{self._folder}: a blob cannot be written"
         try:
@@ -469,16 +458,16 @@ class FolderBlobs(Blobs):
                 part.unlink(missing_ok=True)
 
     def _keep(self, file: FileIO, part: Path, digest: str) -> None:
-        """Sync a file that is written, and give it the name of its content."""
+        """Sync a written file, and rename it to its digest."""
         os.fsync(file.fileno())
         path = self.path(digest)
-        self._made(path.parent)
+        self._ensure_folder(path.parent)
         os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
         sync_folder(path.parent)
         sync_folder(self._folder)
 
-    def _made(self, folder: Path) -> bool:
-        """See that a folder is there; whether it may not be durable yet."""
+    def _ensure_folder(self, folder: Path) -> bool:
+        """Create a folder if missing; return whether it may not be durable yet."""
         try:
             folder.mkdir(PRIVATE_FOLDER)
         except FileExistsError:
@@ -486,7 +475,7 @@ class FolderBlobs(Blobs):
         return True
 
     def get(self, digest: str) -> bytes:
-        """The bytes of a digest, checked against it; see `Blobs.get`."""
+        """See `Blobs.get`."""
         try:
             data = self.path(digest).read_bytes()
         except OSError as error:
@@ -502,28 +491,28 @@ class FolderBlobs(Blobs):
         return data
 
     def holds(self, digest: str) -> bool:
-        """Whether there is a blob of that digest; see `Blobs.holds`."""
-        self._locks.wait(digest, TURN_S)  # a remover that lost its turn may still be at it
+        """See `Blobs.holds`."""
+        self._locks.wait(digest, TURN_S)  # a removal may continue although its turn was lost
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:
-        """Bytes of a blob as it lies there, unchecked; None where it is missing."""
+        """See `Blobs.size`."""
         try:
             return self.path(digest).stat().st_size
         except OSError:
             return None
 
     def open(self, digest: str) -> BinaryIO:
-        """A blob as a file that can be sought in; see `Blobs.open`."""
+        """See `Blobs.open`."""
         return self.path(digest).open("rb")
 
     def remove(self, *digests: str) -> None:
-        """Forget blobs that nothing refers to; only within `removing`."""
+        """See `Blobs.remove`."""
         for digest in digests:
             self.path(digest).unlink(missing_ok=True)
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """Whether a blob is as it was stored; see `Blobs.condition`."""
+        """See `Blobs.condition`."""
         if not DIGEST.fullmatch(digest):
             return "missing"
         try:
@@ -534,15 +523,15 @@ class FolderBlobs(Blobs):
             return "missing"
         except PermissionError as error:
             raise UnusableStore(
-                f"{self.path(digest)}: may not be read. Run it as the user who owns the data "
-                "folder."
+                f"{self.path(digest)}: this user may not read the blob. Run the command as the "
+                "user who owns the data folder."
             ) from error
-        except OSError:  # the disk cannot read it, or a folder has its name
+        except OSError:  # a disk error, or a folder with its name
             pass
         return "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Move what lies under a digest out of the way; see `Blobs.quarantine`."""
+        """See `Blobs.quarantine`."""
         path, place = self.path(digest), folder / f"blob-{digest}"
         make_folder(folder)
         try:
@@ -559,11 +548,11 @@ class FolderBlobs(Blobs):
         return place
 
     def place(self, digest: str) -> str:
-        """As `path`, whatever keeps the blobs."""
+        """See `Blobs.place`."""
         return str(self._folder / digest[:2] / digest)
 
     def digests(self) -> Iterator[str]:
-        """All blobs, in no order."""
+        """See `Blobs.digests`."""
         for folder in self._folder.iterdir():
             if folder.is_dir():
                 for name in os.listdir(folder):  # noqa: PTH208  (a path for each would cost)
@@ -571,26 +560,26 @@ class FolderBlobs(Blobs):
                         yield name
 
     def entries(self) -> Iterator[BlobEntry]:
-        """All files below the folder, in no order; those that vanish meanwhile are left out."""
+        """See `Blobs.entries`; files that vanish meanwhile are skipped."""
         folders = [self._folder]
         while folders:
-            with os.scandir(folders.pop()) as found:
-                for one in found:
-                    path = Path(one.path)
-                    if one.is_dir(follow_symlinks=False):
+            with os.scandir(folders.pop()) as entries:
+                for entry in entries:
+                    path = Path(entry.path)
+                    if entry.is_dir(follow_symlinks=False):
                         folders.append(path)
                         continue
                     if path == self._folder / MARK:
                         continue
                     try:
-                        changed_at = one.stat(follow_symlinks=False).st_mtime
+                        changed_at = entry.stat(follow_symlinks=False).st_mtime
                     except FileNotFoundError:
                         continue
-                    own = DIGEST.fullmatch(one.name) and self.path(one.name) == path
-                    part = PART.fullmatch(one.name) is not None
-                    yield BlobEntry(one.path, one.name if own else None, changed_at, part)
+                    own = DIGEST.fullmatch(entry.name) and self.path(entry.name) == path
+                    part = PART.fullmatch(entry.name) is not None
+                    yield BlobEntry(entry.path, entry.name if own else None, changed_at, part)
 
     def path(self, digest: str) -> Path:
-        """Where a blob lies; ValueError for what is no digest."""
+        """Return the path of a blob; raise ValueError for a text that is not a digest."""
         require_digest(digest)
         return self._folder / digest[:2] / digest

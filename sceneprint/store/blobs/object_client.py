@@ -1,11 +1,11 @@
-"""Object storage by URL: bytes under keys, in a store that others operate.
+"""Object stores by URL: bytes under keys, in a store of another operator.
 
-URL  --open_objects-->  Objects  --put | get | list | delete-->  a store
+    URL  --open_objects-->  Objects  --put | get | list | delete-->  a store
 
-Every call ends: a request has a time limit, all tries of one together have another, and after a
-store was found away the next callers are told at once for a moment. What is large goes in parts,
-so that memory is bounded. Messages name the store and what it said, never a key or a token: the
-library's own hold whole URLs.
+Every call ends: each request has a time limit, and so have all its attempts together. After a store
+was found unreachable, calls fail at once for a moment. Large objects are sent in parts, so that
+memory is bounded. Messages contain the store and its error, never a key or a token, which the
+library's own messages may contain.
 """
 
 from __future__ import annotations
@@ -30,19 +30,17 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
 
-# A file that lies elsewhere and is fetched a range at a time.
-
-#: Bytes that are fetched at once at least.
+#: Minimum number of bytes to fetch at once.
 AHEAD = 1 << 20
 
 
 class RangeFile(io.RawIOBase):
-    """To be read and sought in; see `buffered`.
+    """A remote file that is read in ranges; see `buffered`.
 
     Parameters
     ----------
-    size : bytes of it
-    fetch : its bytes from a place on, so many
+    size : size in bytes
+    fetch : function that returns a number of bytes from a position
     """
 
     def __init__(self, size: int, fetch: Callable[[int, int], bytes]) -> None:
@@ -51,19 +49,19 @@ class RangeFile(io.RawIOBase):
 
     @classmethod
     def buffered(cls, size: int, fetch: Callable[[int, int], bytes]) -> BinaryIO:
-        """With a buffer, so that small reads cost no request each."""
+        """Return a file with a buffer, so that small reads send no request each."""
         return cast("BinaryIO", io.BufferedReader(cls(size, fetch), AHEAD))
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Go elsewhere; beyond the end there is nothing to read."""
+        """Move the position, possibly beyond the end."""
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError("before the beginning")
@@ -71,11 +69,11 @@ class RangeFile(io.RawIOBase):
         return self._place
 
     def tell(self) -> int:
-        """The place that is read next."""
+        """Return the position."""
         return self._place
 
     def readinto(self, buffer: WriteableBuffer, /) -> int:
-        """Read what there is, as much as the buffer takes."""
+        """Read up to the end of the buffer or the file."""
         view = memoryview(buffer).cast("B")
         length = min(len(view), self._size - self._place)
         if length <= 0:
@@ -85,31 +83,31 @@ class RangeFile(io.RawIOBase):
         return length
 
 
-#: Bytes that one request carries at most; what has more goes in parts, so many at once.
+#: Maximum bytes of a request, above which objects are sent in parts, and concurrent parts.
 PART, AT_ONCE = 8 << 20, 3
-#: Most parts that a store takes of one object.
+#: Maximum number of parts of an object.
 MOST_PARTS = 9_000
-#: Most keys that one request removes.
+#: Maximum number of keys in one request to remove objects.
 MOST_KEYS = 500
-#: Seconds for which nobody tries again a store that was just found away.
+#: Seconds for which calls fail at once after a store was found unreachable.
 AWAY_S = 1.0
 _REFUSED = ("PermissionDeniedError", "UnauthenticatedError")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
 _FULL = re.compile(
     r"\b507\b|StorageFull|QuotaExceeded|InsufficientStorage|os error (?:27|28|122)\b", re.IGNORECASE
 )
-_SAID = re.compile(
+_REASON = re.compile(
     r"<Code>(\w{1,60})</Code>|(?:HTTP error: )([a-z ]{3,60})|\b([45]\d\d [A-Z][\w ]{2,40})"
 )
 
 
 @dataclass(frozen=True)
 class ListedObject:
-    """An object as a store lists it.
+    """An object in a store's list.
 
     Parameters
     ----------
-    key : within the store's prefix
+    key : key within the store's prefix
     size : bytes
     changed_at : seconds since 1970, by the store's clock
     """
@@ -124,14 +122,14 @@ class Objects:
 
     Parameters
     ----------
-    small, large : the store, for requests of a few bytes and for those of many
-    once : for those that are not tried again
-    url : to show
-    variables : of the environment that it is configured by, to show
-    folder : where it is one
+    small, large : clients for requests of few and of many bytes
+    once : client for requests that must not be repeated
+    url : URL for messages
+    variables : environment variables of its configuration, for messages
+    folder : folder, if the store is one
 
-    Every method raises UnusableStore where the store is away or refuses, StoreFull where it has
-    no room.
+    Every method raises UnusableStore if the store is unreachable or refuses the request, and
+    StoreFull if it is full.
     """
 
     def __init__(
@@ -140,22 +138,22 @@ class Objects:
     ) -> None:  # fmt: skip
         self._small, self._large, self._once, self._folder = small, large, once, folder
         self._variables = variables
-        #: Where it is, to show; there are no credentials in it.
+        #: URL for messages, without credentials.
         self.url = url
-        self._away = (0.0, "")  # until when, and what was said
+        self._away = (0.0, "")  # end of the pause, and the store's message
 
     def put(self, key: str, data: bytes, *, create: bool = False) -> bool:
-        """Keep bytes under a key; when this returns the store has acknowledged them.
+        """Store bytes under a key; the store has acknowledged them on return.
 
         Parameters
         ----------
-        key : within the prefix
-        data : in place of what is there
-        create : only where nothing is there
+        key : key within the prefix
+        data : bytes, which replace those under the key
+        create : whether to store them only if the key is new
 
         Returns
         -------
-        done : False where `create` found something
+        done : False if `create` found an object
         """
         import obstore
         from obstore.exceptions import AlreadyExistsError
@@ -175,12 +173,12 @@ class Objects:
         return True
 
     def put_file(self, key: str, file: Path | BinaryIO) -> None:
-        """Keep a file under a key, in parts; it is there whole, or not at all.
+        """Store a file under a key, in parts; the object appears whole or not at all.
 
         Parameters
         ----------
-        key : within the prefix
-        file : read from where it stands to its end
+        key : key within the prefix
+        file : file, read from its position to its end
         """
         import obstore
 
@@ -199,68 +197,65 @@ class Objects:
             self._make_durable(key)
 
     def get(self, key: str) -> bytes:
-        """All bytes under a key; FileNotFoundError where there are none."""
+        """Return the bytes under a key; raise FileNotFoundError if there are none."""
         import obstore
 
         with self._explained(f"{key} cannot be read"):
-            found = obstore.get(self._small, key)
-            if found.meta["size"] <= 1 << 20:
-                return bytes(found.bytes())
-            size = found.meta["size"]
-            del found  # each part has a request of its own, and the time for it
+            answer = obstore.get(self._small, key)
+            size = answer.meta["size"]
+            if size <= 1 << 20:
+                return bytes(answer.bytes())
+            del answer  # each part gets a request of its own, with its own time limit
         return b"".join(self.chunks(key, size))
 
-    def part(self, key: str, start: int, length: int) -> bytes:
-        """Some bytes of an object; FileNotFoundError where there is none.
+    def read_range(self, key: str, start: int, length: int) -> bytes:
+        """Return a range of an object; raise FileNotFoundError if it does not exist.
 
         Parameters
         ----------
-        key : within the prefix
-        start, length : within the object, `length` more than 0
+        key : key within the prefix
+        start, length : range within the object; `length` is positive
         """
         import obstore
 
         with self._explained(f"{key} cannot be read"):
-            found = obstore.get_range(self._large, key, start=start, length=length)
-        if len(found) != length:
+            data = obstore.get_range(self._large, key, start=start, length=length)
+        if len(data) != length:
             raise UnusableStore(
                 f"{self.url}: {key} cannot be read (it ended early). Another program changed it "
                 "meanwhile: try again."
             )
-        return bytes(found)
+        return bytes(data)
 
     def chunks(self, key: str, size: int | None = None) -> Iterator[bytes]:
-        """The bytes of an object in order, a part at a time; FileNotFoundError where there is none.
+        """Yield the parts of an object in order; raise FileNotFoundError if it does not exist.
 
         Parameters
         ----------
-        key : within the prefix
-        size : of the object, where it is known
+        key : key within the prefix
+        size : size of the object, if known
         """
         total = self.size(key) if size is None else size
         if total is None:
             raise FileNotFoundError(key)
         for start in range(0, total, PART):
-            yield self.part(key, start, min(PART, total - start))
+            yield self.read_range(key, start, min(PART, total - start))
 
     def get_file(self, key: str, path: Path) -> None:
-        """Write an object into a file that is made; FileNotFoundError where there is none."""
+        """Write an object to a new file; raise FileNotFoundError if it does not exist."""
         with os.fdopen(create_private(path), "wb") as file:
             for chunk in self.chunks(key):
                 file.write(chunk)
 
     def open(self, key: str) -> BinaryIO:
-        """An object as a file that can be sought in, read a part at a time.
-
-        FileNotFoundError where there is none.
-        """
+        """Return an object as a seekable file; raise FileNotFoundError if it does not exist."""
         size = self.size(key)
         if size is None:
             raise FileNotFoundError(key)
-        return RangeFile.buffered(size, lambda start, length: self.part(key, start, length))
+        return RangeFile.buffered(size, lambda start, length: self.read_range(key, start, length))
 
-    def look(self, key: str) -> ListedObject | None:
-        """What is under a key; None where there is nothing."""
+    def head(self, key: str) -> ListedObject | None:
+        """Return the properties of an object; None if it does not exist."""
         import obstore
 
         with self._explained(f"{key} cannot be looked at"):
@@ -273,12 +268,12 @@ class Objects:
         return ListedObject(key, one["size"], one["last_modified"].timestamp())
 
     def size(self, key: str) -> int | None:
-        """Bytes of an object; None where there is none."""
-        found = self.look(key)
-        return None if found is None else found.size
+        """Return the bytes of an object; None if it does not exist."""
+        listed = self.head(key)
+        return None if listed is None else listed.size
 
     def list(self, prefix: str) -> Iterator[ListedObject]:
-        """All objects whose keys lie below a prefix, a page at a time, in the store's order."""
+        """Yield the objects whose keys begin with a prefix, by pages, in the store's order."""
         import obstore
 
         pages = iter(obstore.list(self._small, prefix, chunk_size=1000))
@@ -291,36 +286,36 @@ class Objects:
                 yield ListedObject(one["path"], one["size"], one["last_modified"].timestamp())
 
     def delete(self, *keys: str, seconds: float = math.inf, once: bool = False) -> None:
-        """Remove objects; of no consequence where there are none.
+        """Remove objects; ignore missing ones.
 
         Parameters
         ----------
-        keys : within the prefix
-        seconds : after which no further request is begun; StoreAway where keys are left then
-        once : do not try again what failed: a request without an answer may be carried out after
-            the one that was tried again, and this would not tell of it
+        keys : keys within the prefix
+        seconds : time after which no request is sent; StoreAway is raised if keys are left
+        once : whether not to repeat failed requests: an unanswered one may be carried out after its
+            repetition, unnoticed
         """
         import obstore
 
         until = time.monotonic() + seconds
         for start in range(0, len(keys), MOST_KEYS):
-            some = keys[start : start + MOST_KEYS]
-            with self._explained(f"{some[0]} cannot be removed"):
+            block = keys[start : start + MOST_KEYS]
+            with self._explained(f"{block[0]} cannot be removed"):
                 if start and time.monotonic() > until:
-                    raise self._fault(some[0], "too slow", StoreAway)
+                    raise self._error(block[0], "too slow", StoreAway)
                 try:
-                    obstore.delete(self._once if once else self._small, some)
+                    obstore.delete(self._once if once else self._small, block)
                 except FileNotFoundError as error:
                     if _NO_BUCKET.search(str(error)):
                         raise
-                    if len(some) > 1:  # it stopped at the first that was gone
-                        for key in some:
+                    if len(block) > 1:  # the store stopped at the first missing object
+                        for key in block:
                             if time.monotonic() > until:
-                                raise self._fault(key, "too slow", StoreAway) from None
+                                raise self._error(key, "too slow", StoreAway) from None
                             self.delete(key, once=once)
 
     def _make_durable(self, key: str) -> None:
-        """Of a folder: the library does not sync what it writes."""
+        """Sync an object in a folder, as the library does not."""
         if self._folder is None:
             return
         path = self._folder / key
@@ -334,58 +329,54 @@ class Objects:
     def _explained(self, what: str) -> Iterator[None]:
         from obstore.exceptions import BaseError
 
-        until, said = self._away
+        until, reason = self._away
         if time.monotonic() < until:
-            raise self._fault(what, said, StoreAway)
+            raise self._error(what, reason, StoreAway)
         try:
             yield
         except FileNotFoundError as error:
             if _NO_BUCKET.search(str(error)):
-                raise self._fault(what, "there is no such bucket") from None
+                raise self._error(what, "there is no such bucket") from None
             raise FileNotFoundError(f"{self.url}: there is no {what.split(' ')[0]}") from None
         except (BaseError, OSError) as error:
-            raise self._of(what, error) from None  # the library's text holds whole URLs
+            raise self._translate(what, error) from None  # the library's text contains whole URLs
 
-    def _of(self, what: str, error: Exception) -> UnusableStore:
+    def _translate(self, what: str, error: Exception) -> UnusableStore:
         text = str(error)
-        found = _SAID.search(text)
-        said = next(filter(None, found.groups())).strip() if found else type(error).__name__
+        match = _REASON.search(text)
+        reason = next(filter(None, match.groups())).strip() if match else type(error).__name__
         if isinstance(error, OSError) and error.strerror:
-            said = error.strerror
-        refused = type(error).__name__ in _REFUSED or re.search(r"\b40[13]\b", said)
+            reason = error.strerror
+        refused = type(error).__name__ in _REFUSED or re.search(r"\b40[13]\b", reason)
         if _FULL.search(text):
-            return StoreFull(f"{self.url}: {what} ({said}). The store has no room: make some.")
+            return StoreFull(f"{self.url}: {what} ({reason}). The store is full: free some space.")
         if refused:
             return UnusableStore(
-                f"{self.url}: {what} ({said}). The store refuses us: see that the credentials in "
-                f"the environment ({self._variables}) are right and allow to read, write, list "
+                f"{self.url}: {what} ({reason}). The store refuses access: check that the "
+                f"credentials in the environment ({self._variables}) allow to read, write, list "
                 "and delete."
             )
-        if not re.match(r"4\d\d ", said) and self._folder is None:
-            self._away = (time.monotonic() + AWAY_S, said)
-            return self._fault(what, said, StoreAway)
-        return self._fault(what, said)
+        if not re.match(r"4\d\d ", reason) and self._folder is None:
+            self._away = (time.monotonic() + AWAY_S, reason)
+            return self._error(what, reason, StoreAway)
+        return self._error(what, reason)
 
-    def _fault(
-        self, what: str, said: str, kind: type[UnusableStore] = UnusableStore
+    def _error(
+        self, what: str, reason: str, kind: type[UnusableStore] = UnusableStore
     ) -> UnusableStore:
         return kind(
-            f"{self.url}: {what} ({said}). See that the store is there and can be reached from "
-            f"here, and that its settings in the environment ({self._variables}) are "
-            "right."
+            f"{self.url}: {what} ({reason}). Check that the store exists and can be reached from "
+            f"here, and its settings in the environment ({self._variables})."
         )
 
 
-# URLs of object stores: what they may hold, and how they are opened.
-#
-# Credentials and settings come from the environment alone.
+# Opening a store. Credentials and settings come from the environment only.
 
-#: Seconds for a connection, for a request of a few bytes, and for one of a part; and seconds after
-#: which no request is tried again.
+#: Time limits of connections, small requests, parts, and of repetitions, seconds.
 CONNECT_S, SMALL_S, PART_S, TRIED_S = 3, 10, 60, 8
-#: How often one is at most.
+#: Maximum number of repetitions of a request.
 RETRIES = 8
-#: Kinds of stores, and the beginnings of the environment variables they are configured by.
+#: Schemes of URLs, and the prefixes of the environment variables that configure the store.
 VARIABLES = {
     "s3": "AWS_", "s3a": "AWS_", "gs": "GOOGLE_", "az": "AZURE_", "azure": "AZURE_",
     "abfs": "AZURE_", "abfss": "AZURE_", "file": "", "memory": "",
@@ -394,16 +385,16 @@ _ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 
 
 def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
-    """See that a URL names an object store, and nothing that must not be in it.
+    """Check that a URL names an object store, without credentials.
 
     Parameters
     ----------
-    url : such as s3://bucket/prefix
-    setting : that it is of, for messages; the URL itself is not shown, it may hold a password
+    url : URL such as s3://bucket/prefix
+    setting : name of the setting, for messages, which omit the URL: it may contain a password
 
     Raises
     ------
-    UnusableStore : it does not.
+    UnusableStore : the URL is not valid.
     """
     try:
         parts = urlsplit(url)
@@ -412,8 +403,8 @@ def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
         named, netloc, parts = "", "", urlsplit("")
     if "@" in netloc or parts.query or parts.fragment:
         raise UnusableStore(
-            f"{setting} holds a user, a password or a query. Credentials are read from the "
-            "environment alone (AWS_..., GOOGLE_..., AZURE_...): leave them out of it."
+            f"{setting} holds a user, a password or a query. Credentials are read only from the "
+            "environment (AWS_..., GOOGLE_..., AZURE_...): leave them out of it."
         )
     steps = unquote(parts.path).split("/")
     wrong = any(one in (".", "..") for one in steps) or not unquote(parts.path).isprintable()
@@ -428,17 +419,17 @@ def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
 
 
 def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
-    """Open an object store; nothing is asked of it yet.
+    """Open an object store without contacting it.
 
     Parameters
     ----------
     url : s3://bucket/prefix, gs://bucket/prefix, az://account/container/prefix, file:///folder, or
-        memory:/// for what ends with the process; credentials come from the environment
-    setting : that it is of, for messages
+        memory:/// for a store that ends with the process; credentials come from the environment
+    setting : name of the setting, for messages
 
     Raises
     ------
-    UnusableStore : it is none, or cannot be opened with this environment.
+    UnusableStore : the URL is not valid, or the store cannot be opened with this environment.
     """
     check_url(url, setting)
     try:
@@ -453,8 +444,8 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
     plain = [name for name in _ENDPOINTS if os.environ.get(name, "").startswith("http://")]
     if kind.startswith("s3") and plain and not _allows_http():
         raise UnusableStore(
-            f"{plain[0]} names a server without TLS. Set AWS_ALLOW_HTTP=true where nobody can "
-            "listen in between, or give it as https://."
+            f"{plain[0]} names a server without TLS. Set AWS_ALLOW_HTTP=true if the network is "
+            "trusted, or use https://."
         )
     if kind == "memory":
         memory = MemoryStore()
@@ -465,7 +456,7 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
             make_folder(folder)
         except OSError as error:
             raise UnusableStore(
-                f"{folder}: the folder cannot be made ({error.strerror}). Check its permissions."
+                f"{folder}: the folder cannot be created ({error.strerror}). Check its permissions."
             ) from error
         local = LocalStore(folder)
         return Objects(local, local, local, url, folder=folder)
@@ -475,9 +466,9 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
             for seconds, most in ((SMALL_S, RETRIES), (PART_S, RETRIES), (SMALL_S, 0))
         )
     except (BaseError, ValueError) as error:
-        said = str(error).partition("\n")[0]
+        reason = str(error).partition("\n")[0]
         raise UnusableStore(
-            f"{url}: the store cannot be opened ({said:.200}). See {setting} and the variables "
+            f"{url}: the store cannot be opened ({reason:.200}). Check {setting} and the variables "
             f"{VARIABLES[kind]}... of the environment."
         ) from None
     return Objects(small, large, once, url, f"{VARIABLES[kind]}...")
@@ -485,7 +476,7 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
 
 def _client(seconds: int) -> ClientConfig:
     return {
-        "allow_http": _allows_http(),  # takes the place of what the library finds itself
+        "allow_http": _allows_http(),  # overrides the library's own setting
         "connect_timeout": timedelta(seconds=CONNECT_S),
         "timeout": timedelta(seconds=seconds),
         "user_agent": "sceneprint",
@@ -505,11 +496,11 @@ def _retries(most: int) -> RetryConfig:
 
 
 def check_objects(objects: Objects) -> float:
-    """Write, read and remove a small object; returns the seconds it took.
+    """Write, read and remove a small object; return the seconds it took.
 
     Raises
     ------
-    UnusableStore : one of that is not possible, or what is read is not what was written.
+    UnusableStore : an operation failed, or returned other bytes.
     """
     key, data = f"check/{os.urandom(8).hex()}", os.urandom(64)
     begun = time.perf_counter()
@@ -522,7 +513,7 @@ def check_objects(objects: Objects) -> float:
         objects.delete(key)
     if not same:
         raise UnusableStore(
-            f"{objects.url}: what is written is not what is read at once afterwards. Use a store "
-            "that is strongly consistent, as S3, GCS and Azure are."
+            f"{objects.url}: an object that was read after it was written has other bytes. Use a "
+            "store that is strongly consistent, such as S3, GCS and Azure."
         )
     return time.perf_counter() - begun

@@ -1,11 +1,10 @@
 """Blobs in an object store that a fleet shares.
 
     PREFIX/blobs/ab/abcdef...   a blob under its digest
-    PREFIX/sceneprint.json      the database they belong to
+    PREFIX/sceneprint.json      the database that the blobs belong to
 
-A blob is put in one step, or in parts that are not there before the last: what was not
-acknowledged leaves nothing behind that could be read. It is put also where one is there, which may
-be damaged, or about to be removed.
+A blob appears whole or not at all, even if it is sent in parts. It is also sent if one exists,
+which may be damaged, or about to be removed.
 """
 
 from __future__ import annotations
@@ -41,19 +40,19 @@ from sceneprint.store.blobs.folder import (
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.database_errors import unusable
 
-# Whose a prefix of an object store is, or the folder of a fleet: two databases on one would sweep
-# each other's blobs.
+# The owner of a prefix, or of a fleet's folder: two databases on one would remove each other's
+# blobs.
 #
-#     PREFIX/sceneprint.json   {"store": its name, "restoring": while one is restored there}
+#     PREFIX/sceneprint.json   {"store": its name, "restoring": true during a restore}
 #
-# The name goes with the database's secret, so a restored store has that of the one that was backed
-# up: a restore therefore takes no prefix that is in use, even one of the same name.
+# The name comes from the database's secret, so a restored store has the name of its original. A
+# restore therefore refuses a prefix in use, even one with the same name.
 
 
 class BucketOwner:
-    """The mark of a prefix.
+    """The owner's mark of a prefix.
 
-    Every method raises UnusableStore where the prefix is another's, or cannot be used.
+    Every method raises UnusableStore if the prefix belongs to another database or cannot be used.
     """
 
     def __init__(self, objects: Objects) -> None:
@@ -61,81 +60,81 @@ class BucketOwner:
 
     @classmethod
     def of_folder(cls, folder: Path) -> BucketOwner:
-        """The mark of a folder of blobs."""
+        """Return the mark of a folder of blobs."""
         return cls(open_objects(f"file://{quote(str(folder.absolute()))}"))
 
     def claim(self, owner: str, *, anew: bool) -> bool:
-        """See that the prefix is a store's; whether it is marked so now.
+        """Check that the prefix belongs to a store; return whether it is marked now.
 
         Parameters
         ----------
-        owner : the store
-        anew : mark it where it is nobody's yet
+        owner : name of the store
+        anew : whether to mark an unclaimed prefix
         """
         for _ in range(2):  # another process may be the first
-            found = self._found()
-            if found is None:
+            mark = self._read()
+            if mark is None:
                 if not anew:
                     return False
                 if self._put(owner, create=True):
                     return True
                 continue
-            if found.get("store") != owner:
-                raise self._of_another("another database")
+            if mark.get("store") != owner:
+                raise self._conflict("another database")
             return True
         return False
 
     def begin(self, owner: str, before: str) -> None:
-        """Take the prefix for a store that is to be restored there.
+        """Claim the prefix for a store that is to be restored there.
 
         Parameters
         ----------
-        owner : the store
-        before : name of the empty database that it is restored to: what a service has marked so,
-            and never used, is free
+        owner : name of the store
+        before : name of the empty database that it is restored to: a service may have claimed the
+            prefix with it, without using it
         """
-        found = self._found()
-        free = found is not None and before != owner and found.get("store") == before
-        if found is None or free:
-            if not self._put(owner, create=found is None, restoring=True):
-                raise self._of_another("another database")  # at the same time
-        elif found.get("store") != owner:
-            raise self._of_another("another database")
-        elif found.get("restoring") is not True:
-            raise self._of_another("the store that the snapshot was taken of, or its copy")
+        mark = self._read()
+        free = mark is not None and before != owner and mark.get("store") == before
+        if mark is None or free:
+            if not self._put(owner, create=mark is None, restoring=True):
+                raise self._conflict("another database")  # which claimed it at the same time
+        elif mark.get("store") != owner:
+            raise self._conflict("another database")
+        elif mark.get("restoring") is not True:
+            raise self._conflict("the store that the snapshot was taken of, or its copy")
 
     def end(self, owner: str) -> None:
-        """Say that it is restored."""
+        """Record the end of the restore."""
         self._put(owner)
 
-    def _found(self) -> dict[str, Any] | None:
-        """What is there; None where nothing is."""
+    def _read(self) -> dict[str, Any] | None:
+        """Return the mark; None if there is none."""
         try:
-            found = json.loads(self._objects.get(MARK))
+            mark = json.loads(self._objects.get(MARK))
         except FileNotFoundError:
             return None
         except (ValueError, RecursionError):
             return {}
-        return found if isinstance(found, dict) else {}
+        return mark if isinstance(mark, dict) else {}
 
     def _put(self, owner: str, *, create: bool = False, restoring: bool = False) -> bool:
         record = {"kind": "sceneprint blobs", "store": owner}
         more = {"restoring": True} if restoring else {}
         return self._objects.put(MARK, json.dumps(record | more).encode(), create=create)
 
-    def _of_another(self, whose: str) -> UnusableStore:
+    def _conflict(self, other: str) -> UnusableStore:
         return UnusableStore(
-            f"{self._objects.url}: the blobs there are of {whose}, which would lose them to this "
-            "one. Give each database a prefix of its own in SCENEPRINT_BLOB_URL. If that database "
-            f"is gone for good, remove {MARK} there."
+            f"{self._objects.url}: the blobs there belong to {other}, which would lose them to "
+            "this one. Give each database a prefix of its own in SCENEPRINT_BLOB_URL. If that "
+            f"database no longer exists, remove {MARK} there."
         )
 
 
-#: Under the prefix: the blobs.
+#: Key prefix of the blobs.
 FOLDER = "blobs/"
-#: Blobs that this process has put last, of which it knows whether any can have been removed since.
-_KNOWN = 4_096
-#: Seconds for which `check` tells what it found last.
+#: Number of stored blobs to remember, of which it is known whether any was removed since.
+_REMEMBERED = 4_096
+#: Seconds for which `check` repeats its last result.
 CHECK_S = 2.0
 
 
@@ -144,9 +143,9 @@ class ObjectBlobs(Blobs):
 
     Parameters
     ----------
-    objects : of the prefix
-    locks : of all that share it
-    owner : tells what the store is called that they belong to
+    objects : objects under the prefix
+    locks : lock of all processes that share the prefix
+    owner : function that returns the name of the blobs' store
     """
 
     def __init__(self, objects: Objects, locks: Locks, owner: Callable[[], str]) -> None:
@@ -154,24 +153,24 @@ class ObjectBlobs(Blobs):
         self.objects = objects
         self._owner = owner
         self._claimed = False
-        self._put: OrderedDict[str, int] = OrderedDict()  # removals until then, by digest
+        self._put: OrderedDict[str, int] = OrderedDict()  # number of removals before, by digest
         self._lock = threading.Lock()
-        self._asking = threading.Lock()  # for `check`, and what it found when
+        self._checking = threading.Lock()
         self._wrong: UnusableStore | None = None
         self._answered = -math.inf
 
     def claim(self, *, anew: bool = True) -> None:
-        """See that the prefix is this store's, and mark it where it is nobody's yet.
+        """Check that the prefix belongs to this store, and mark it if it is unclaimed.
 
         Raises
         ------
-        UnusableStore : it is another's, or the object store cannot be used.
+        UnusableStore : the prefix belongs to another database, or the object store cannot be used.
         """
         if not self._claimed:
             self._claimed = BucketOwner(self.objects).claim(self._owner(), anew=anew)
 
     def put(self, data: bytes) -> str:
-        """Keep bytes; when this returns the store has acknowledged them. See `Blobs.put`."""
+        """See `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
         with self._putting(digest):
             self.objects.put(_key(digest), data)
@@ -179,10 +178,10 @@ class ObjectBlobs(Blobs):
 
     @contextmanager
     def incoming(self) -> Iterator[IncomingBlob]:
-        """Take a blob in parts; see `Blobs.incoming`.
+        """See `Blobs.incoming`.
 
-        It waits in the folder of temporary files, without a name, until its digest is known:
-        stores do not copy what is larger than 5 GB from one key to another in one step.
+        The blob is a temporary file without a name until its digest is known, as stores do not copy
+        objects above 5 GB from one key to another.
         """
         place = tempfile.gettempdir()
         what = f"{place}: a blob cannot be written"
@@ -208,11 +207,11 @@ class ObjectBlobs(Blobs):
             self._put.pop(digest, None)
             if before is not None:
                 self._put[digest] = before
-            if len(self._put) > _KNOWN:
+            if len(self._put) > _REMEMBERED:
                 self._put.popitem(last=False)
 
     def get(self, digest: str) -> bytes:
-        """The bytes of a digest, checked against it; see `Blobs.get`."""
+        """See `Blobs.get`."""
         require_digest(digest)
         try:
             data = self.objects.get(_key(digest))
@@ -229,20 +228,20 @@ class ObjectBlobs(Blobs):
         return data
 
     def open(self, digest: str) -> BinaryIO:
-        """A blob as a file that can be sought in, read a part at a time; see `Blobs.open`."""
+        """See `Blobs.open`."""
         require_digest(digest)
         return self.objects.open(_key(digest))
 
     def holds(self, digest: str) -> bool:
-        """Whether there is a blob of that digest; see `Blobs.holds`.
+        """See `Blobs.holds`.
 
-        Asked in writing transactions, for which others wait: where this process has put it, and
-        nothing was removed since, the database alone is asked.
+        Writing transactions call this while others wait. If this process stored the blob, and none
+        was removed since, only the database is queried.
         """
         return self._holds(digest, TURN_S)
 
     def ensure(self, digest: str, data: bytes) -> None:
-        """Put a blob once more where a removal took it; see `Blobs.ensure`."""
+        """See `Blobs.ensure`."""
         if not self._holds(digest, REMOVAL_S):
             self.put(data)
 
@@ -253,17 +252,17 @@ class ObjectBlobs(Blobs):
         now = self._locks.removals()
         if before is not None and before == now:
             return True
-        if now is None:  # it may be there still, and go a moment later
+        if now is None:  # a removal may be about to take the blob
             self._locks.wait(digest, seconds)
         return self.objects.size(_key(digest)) is not None
 
     def size(self, digest: str) -> int | None:
-        """Bytes of a blob, unchecked; None where it is missing."""
+        """See `Blobs.size`."""
         require_digest(digest)
         return self.objects.size(_key(digest))
 
     def remove(self, *digests: str) -> None:
-        """Forget blobs that nothing refers to, by few requests; only within `removing`."""
+        """See `Blobs.remove`."""
         for digest in digests:
             require_digest(digest)
         self.claim()
@@ -273,11 +272,11 @@ class ObjectBlobs(Blobs):
         try:
             self.objects.delete(*map(_key, digests), seconds=REMOVAL_S, once=True)
         except BaseException:
-            self._locks.doubt()
+            self._locks.mark_uncertain()
             raise
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """Whether a blob is as it was stored; see `Blobs.condition`."""
+        """See `Blobs.condition`."""
         if not DIGEST.fullmatch(digest):
             return "missing"
         size, hashed = self.objects.size(_key(digest)), hashlib.sha256()
@@ -293,7 +292,7 @@ class ObjectBlobs(Blobs):
         return "sound" if hashed.hexdigest() == digest else "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Fetch what lies under a digest into a folder of this machine, durably, and remove it."""
+        """Move a damaged blob to a folder of this machine, durably; see `Blobs.quarantine`."""
         require_digest(digest)
         place = folder / f"blob-{digest}"
         make_folder(folder)
@@ -312,18 +311,18 @@ class ObjectBlobs(Blobs):
         return place
 
     def place(self, digest: str) -> str:
-        """Where a blob lies, for people to look at."""
+        """See `Blobs.place`."""
         return f"{self.objects.url}/{_key(digest)}"
 
     def digests(self) -> Iterator[str]:
-        """All blobs, a page at a time."""
+        """See `Blobs.digests`."""
         return (one.digest for one in self.entries() if one.digest is not None)
 
     def entries(self) -> Iterator[BlobEntry]:
-        """All objects where blobs are kept, a page at a time.
+        """Yield all objects where blobs are stored, by pages.
 
-        What a writer left that was killed is not among them: stores do not show the parts of an
-        object that has no end. Let the bucket's lifecycle abort those after a day.
+        Stores do not list unfinished objects of killed writers. Let the bucket's lifecycle abort
+        incomplete uploads after a day.
         """
         for one in self.objects.list(FOLDER):
             name = one.key.rpartition("/")[2]
@@ -332,23 +331,23 @@ class ObjectBlobs(Blobs):
             yield BlobEntry(place, name if own else None, one.changed_at)
 
     def check(self) -> None:
-        """See that the store answers; see `Blobs.check`."""
-        if self._asking.acquire(blocking=False):  # else somebody asks, and the last answer holds
+        """See `Blobs.check`."""
+        if self._checking.acquire(blocking=False):  # else another thread is checking
             try:
                 if time.monotonic() - self._answered > CHECK_S:
                     self._wrong = self._look()
                     self._answered = time.monotonic()
             finally:
-                self._asking.release()
+                self._checking.release()
         if self._wrong is not None:
             raise type(self._wrong)(str(self._wrong))
 
     def _look(self) -> UnusableStore | None:
         try:
-            if self.objects.look(MARK) is None and self._claimed:
+            if self.objects.head(MARK) is None and self._claimed:
                 return UnusableStore(
-                    f"{self.objects.url}: {MARK} is gone, which was there before: the bucket was "
-                    "emptied or replaced. Bring its objects back."
+                    f"{self.objects.url}: {MARK} has disappeared: the bucket was emptied or "
+                    "replaced. Restore its objects."
                 )
         except UnusableStore as error:
             return error

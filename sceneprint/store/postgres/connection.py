@@ -1,12 +1,12 @@
-"""How PostgreSQL is set up: what a connection is told, and how a turn is taken.
+"""PostgreSQL: how connections are configured, and how writers take turns.
 
-Writers take turns as they do in SQLite: each begins with one advisory lock of the database, held
-until its commit. So what a transaction reads stays true until it writes, and numbers that it is
-given are in the order of the commits.
+Writers take turns as in SQLite: each transaction begins with an advisory lock of the database, held
+until its commit. So a transaction's reads stay true until it writes, and its numbers are in commit
+order.
 
-Writers of one map alone share that lock, and have their map's to themselves: those of other maps
-write at the same time. What they read of their map stays true, and its revisions are in the order
-of the commits. Their events get no number before they are committed (see `events`).
+Writers of a single map share that lock and lock their map exclusively, so that writers of other
+maps run at the same time. Their reads of the map stay true, and its revisions are in commit order.
+Their events get numbers after the commit (see `events`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sqlalchemy import URL, Connection, Dialect, Engine, create_engine, event, text
 from sqlalchemy.engine import ExceptionContext
@@ -26,37 +26,60 @@ from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.database_errors import database_label, is_of_old_plan
 from sceneprint.store.sqlite import BUSY_S
 
-if TYPE_CHECKING:
-    pass
-
-
-#: Advisory locks are two numbers: this one, which is ours alone, and what is locked.
+#: First number of the advisory locks; the second is one of the next.
 LOCKS = 0x5CE7E
-#: Whose turn it is to write.
+#: Lock of the writers' turns.
 TURN = 1
-#: Who numbers events (see `events`).
+#: Lock of the process that numbers events (see `events`).
 EVENTS = 8
-#: The first number of locks of single maps; the second is that of the map.
+_EVENT = "at, kind, map, frame_id, job_id, data"
+#: Functions and a trigger of the schema: `number_pending_events` holds its lock until the commit,
+#: so that numbers are in commit order. It also runs before other events are inserted, so that the
+#: events of a map stay in order.
+NUMBERING = (
+    f"""
+    CREATE FUNCTION number_pending_events() RETURNS void LANGUAGE plpgsql AS $$
+    BEGIN
+        PERFORM pg_advisory_xact_lock({LOCKS}, {EVENTS});
+        PERFORM set_config('sceneprint.numbering', 'on', true);
+        WITH pending AS (DELETE FROM pending_events RETURNING *)
+        INSERT INTO events ({_EVENT}) SELECT {_EVENT} FROM pending ORDER BY number;
+        PERFORM set_config('sceneprint.numbering', '', true);
+    END $$
+    """,
+    """
+    CREATE FUNCTION number_pending_events_first() RETURNS trigger LANGUAGE plpgsql AS $$
+    BEGIN
+        PERFORM number_pending_events();
+        RETURN NULL;
+    END $$
+    """,
+    """
+    CREATE TRIGGER number_pending_events_first BEFORE INSERT ON events FOR EACH STATEMENT
+    WHEN (current_setting('sceneprint.numbering', true) IS DISTINCT FROM 'on')
+    EXECUTE FUNCTION number_pending_events_first()
+    """,
+)
+#: First number of the locks of single maps; the second is the map's.
 MAP_LOCKS = 0x5CE7F
-#: Of maps whose numbers have the same last bits, writers take turns.
+#: Bits of a map's number in its lock; maps with equal bits share one.
 LOCK_BITS = 0x7FFFFFFF
-#: Seconds for one statement, and for a transaction in which nothing is asked: a client that fell
-#: silent must not keep the turn from all others.
+#: Time limits of a statement, and of an idle transaction, seconds: a silent client must not keep
+#: the turn.
 STATEMENT_S, IDLE_S = 60.0, 30.0
-#: Seconds that a new schema may wait for its turn: another process may be making it.
+#: Seconds that a migration waits for its turn: another process may be migrating.
 MIGRATION_S = 600.0
-#: Seconds a writer waits after somebody has waited in vain: the queue is of the whole fleet, and
-#: who leaves it after a moment, and begins at its end again, would never get through.
+#: Seconds that a writer waits after another has timed out. The whole fleet is in one queue: writers
+#: that leave it too early, and start at its end again, would never succeed.
 HELD_S = 2.0
-#: Connections that a process keeps, and has at most.
+#: Minimum and maximum number of pooled connections of a process.
 KEPT, MOST = 8, 32
-#: Seconds without use after which a connection is tried before it is used: that costs a round trip.
-#: One that the server ended is found out at once.
+#: Seconds without use after which a connection is tested, which costs a round trip. Connections
+#: that the server closed are noticed at once.
 UNTRIED_S = 1.0
-#: Seconds after which a connection is made anew, so that servers added since get their share.
+#: Seconds after which a connection is replaced, so that new servers get their share.
 _OLD_S = 1800
-#: What of libpq is set where the URL does not: a server that is gone, and sent no word, is found
-#: out within ten seconds.
+#: Defaults of libpq's options: an unreachable server is noticed within ten seconds.
 _CONNECT = {
     "connect_timeout": "3",
     "application_name": "sceneprint",
@@ -66,21 +89,21 @@ _CONNECT = {
     "keepalives_count": "3",
     "tcp_user_timeout": "9000",
 }
-#: Oldest version that is known to do.
+#: Oldest supported version.
 _OLDEST = 14
 _WARNED, _USED = "sceneprint_warned", "sceneprint_used"
-#: Option of a connection: its only statement is a transaction of its own.
+#: Option of a connection: its only statement is a whole transaction.
 SINGLE = "sceneprint_single"
-#: Option of a statement: it is several, of which the last one has the answer.
+#: Option of a statement: it consists of several, the last of which returns the rows.
 _MESSAGE = "sceneprint_message"
 
 
 def open_postgres(url: URL) -> Engine:
-    """An engine whose connections are told what all are told; none is opened yet."""
+    """Return an engine with configured connections, none of which is open yet."""
     engine = create_engine(
         url,
         connect_args=connect_options(url),
-        isolation_level="READ COMMITTED",  # a writer's statements see all that was committed
+        isolation_level="READ COMMITTED",  # a writer's statements see all commits
         pool_recycle=_OLD_S,
         pool_size=KEPT,
         max_overflow=MOST - KEPT,
@@ -94,56 +117,56 @@ def open_postgres(url: URL) -> Engine:
     event.listen(engine, "do_execute_no_params", _refuse_single)
     event.listen(engine, "do_executemany", _refuse_single)
     event.listen(engine, "commit", forget_warnings)
-    event.listen(engine, "handle_error", _leave_behind)
+    event.listen(engine, "handle_error", _drop_connections)
     return engine
 
 
 def connect_options(url: URL) -> dict[str, str]:
-    """What of libpq is set beside what a URL says."""
+    """Return the options of libpq that a URL does not set."""
     return {name: value for name, value in _CONNECT.items() if name not in url.query}
 
 
 def configure(connection: Any, _record: object = None) -> None:
-    """Tell a connection of psycopg what all of them are told.
+    """Configure a connection of psycopg.
 
     Raises
     ------
-    UnusableStore : the server is too old, or its database is not of UTF-8.
+    UnusableStore : the server is too old, or the encoding of its database is not UTF-8.
     """
     version = connection.info.server_version // 10_000
     encoding = connection.info.parameter_status("server_encoding")
     if version < _OLDEST or encoding != "UTF8":
         connection.close()
         raise UnusableStore(
-            f"The server is PostgreSQL {version}, and the database of encoding {encoding}. Version "
-            f"{_OLDEST} or later is needed, and a database made with ENCODING 'UTF8'."
+            f"The server is PostgreSQL {version}, and its database has the encoding {encoding}. "
+            f"Use version {_OLDEST} or later, and a database created with ENCODING 'UTF8'."
         )
     connection.adapters.register_dumper(str, _texts())
-    given = {**_CONNECT, **connection.info.get_parameters()}
+    options = {**_CONNECT, **connection.info.get_parameters()}
     before, connection.autocommit = connection.autocommit, True
     connection.execute(
         "SELECT set_config('default_transaction_isolation', 'read committed', false),"
         " set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
         " set_config('idle_in_transaction_session_timeout', %s, false),"
-        # the server gives up a client whose host is gone as soon as the client would give it up:
-        # locks of its session would else stay for hours
+        # the server notices an unreachable client as fast as the reverse: locks of its session
+        # would otherwise stay for hours
         " set_config('tcp_keepalives_idle', %s, false),"
         " set_config('tcp_keepalives_interval', %s, false),"
         " set_config('tcp_keepalives_count', %s, false),"
-        # a commit that was acknowledged survives the power, and the fall of the server where a
-        # standby is waited for: more than `on` is left as it is
+        # an acknowledged commit survives a power failure, and with a synchronous standby the loss
+        # of the server: values stronger than `on` stay
         " set_config('synchronous_commit', CASE current_setting('synchronous_commit')"
         " WHEN 'off' THEN 'on' ELSE current_setting('synchronous_commit') END, false)",
         [
             *(_milliseconds(seconds) for seconds in (BUSY_S, STATEMENT_S, IDLE_S)),
-            *(given[f"keepalives_{name}"] for name in ("idle", "interval", "count")),
+            *(options[f"keepalives_{name}"] for name in ("idle", "interval", "count")),
         ],
     )
     connection.autocommit = before
 
 
 def timeline_of(connection: Any) -> str | None:
-    """Return the timeline that the server of a psycopg connection writes; None of a standby."""
+    """Return the timeline of the server of a psycopg connection; None of a standby."""
     before, connection.autocommit = connection.autocommit, True
     row = connection.execute(
         "SELECT CASE WHEN pg_is_in_recovery() THEN NULL"
@@ -155,10 +178,10 @@ def timeline_of(connection: Any) -> str | None:
 
 @cache
 def _texts() -> type[Any]:
-    """How texts are handed over: PostgreSQL has none with NUL, and nothing is found by such a one.
+    """Return the dumper of texts, which replaces NUL: PostgreSQL stores none.
 
-    What is stored has none: the API refuses it. In what is only noted, such as whom a request was
-    about, another character takes its place.
+    The API refuses NUL in stored texts; unchecked ones, such as those of the audit log, may contain
+    it.
     """
     from psycopg.types.string import StrDumperUnknown
 
@@ -173,7 +196,7 @@ def _texts() -> type[Any]:
 
 
 def allow(connection: Connection, seconds: float) -> None:
-    """Let statements of this transaction, and pauses between them, take so long; 0: any time."""
+    """Set the time limits of this transaction's statements and pauses, seconds; 0: none."""
     if connection.dialect.name == "postgresql":
         for name in ("statement_timeout", "idle_in_transaction_session_timeout"):
             connection.execute(
@@ -183,18 +206,18 @@ def allow(connection: Connection, seconds: float) -> None:
 
 
 def begin(connection: Connection, *statements: str) -> Any:
-    """Begin a transaction, in one message with its first statements, of which each sees what was
-    committed before it.
+    """Begin a transaction, in one message with its first statements, each of which sees earlier
+    commits.
 
     Parameters
     ----------
-    connection : that commits each statement at once, as its `isolation_level` says: what begins
-        transactions by itself takes a round trip for that
-    statements : without parameters
+    connection : connection that commits each statement at once (`isolation_level`): beginning a
+        transaction separately would take a round trip
+    statements : statements without parameters
 
     Returns
     -------
-    row : of the last statement; None where it has none
+    row : first row of the last statement; None without rows
     """
     message = "; ".join(("BEGIN", *statements))
     answer = connection.exec_driver_sql(message, execution_options={_MESSAGE: True})
@@ -202,23 +225,23 @@ def begin(connection: Connection, *statements: str) -> Any:
 
 
 class MapsInUse(Exception):
-    """Another transaction had a map for longer than was waited for it; nothing was written."""
+    """Another transaction held a map for longer than the wait; nothing was written."""
 
 
 @dataclass(eq=False)
 class SingleStatement:
-    """A transaction of one statement: it takes its turn, is executed and committed in one round
-    trip. Others of its maps wait for that long, wherever the client is.
+    """A transaction of one statement that waits for its turn, executes and commits in one round
+    trip.
 
-    It sees what was committed before its turn.
+    Other writers of its maps wait only for that long, wherever the client is. It sees the commits
+    before its turn.
 
     Parameters
     ----------
-    map_numbers : of the only maps that are written to
-    wait_s : seconds to wait for the turn
-    maps_wait_s : seconds to wait for one of the maps, once it is the turn of writers of maps; None:
-        as long as for that
-    schema : what this process knows of the schema; None: that is not looked at
+    map_numbers : numbers of the only maps that it writes to
+    wait_s : maximum seconds to wait for the turn
+    maps_wait_s : maximum seconds to wait for each map afterwards; None: `wait_s`
+    schema : last known schema; None: do not check it
     executed : whether it was sent
     """
 
@@ -229,13 +252,13 @@ class SingleStatement:
     executed: bool = False
 
     def execute(self, cursor: Any, statement: str, parameters: Any) -> None:
-        """Execute it on a cursor of psycopg that commits each statement.
+        """Execute the statement on a cursor of psycopg whose connection commits each statement.
 
         Raises
         ------
-        NewerSchema : another version has brought the store beyond what this one may write.
-        MapsInUse : a map was not free within `maps_wait_s`.
-        ValueError : it is the second.
+        NewerSchema : another version migrated the store beyond what this one may write.
+        MapsInUse : a map was in use for longer than `maps_wait_s`.
+        ValueError : it is the second statement.
         """
         import psycopg
 
@@ -243,15 +266,15 @@ class SingleStatement:
             raise ValueError("a transaction of a single statement has a second one")
         self.executed = True
         if self.schema is not None and self.schema.found is None:
-            self.schema.look(cursor.connection)
+            self.schema.read(cursor.connection)
         sent = None if self.schema is None else self.schema.found
         try:
             self._send(cursor, statement, parameters)
         except psycopg.errors.DivisionByZero:  # nothing was written
             if self.schema is None:
                 raise
-            self.schema.look(cursor.connection)
-            if self.schema.found == sent:  # another thread may have found the new one before
+            self.schema.read(cursor.connection)
+            if self.schema.found == sent:  # another thread may have read the new one before
                 raise
             self._send(cursor, statement, parameters)
 
@@ -259,15 +282,15 @@ class SingleStatement:
         import psycopg
 
         connection = cursor.connection
-        # in one order, so that nobody waits for one who waits for him
+        # sorted against deadlocks
         locks = sorted({number & LOCK_BITS for number in self.map_numbers})
         maps_wait_s = self.wait_s if self.maps_wait_s is None else self.maps_wait_s
         turn = connection.cursor()
         try:
-            # without a BEGIN, all up to the end of the pipeline is one transaction
+            # without a BEGIN, the pipeline is one transaction
             with connection.pipeline():
-                # a commit that waits for its standby would be cut off by the limit of statements,
-                # and be acknowledged although the standby may lack it
+                # the time limit of statements would end a commit that waits for its standby, and
+                # acknowledge it although the standby may lack it
                 turn.execute(
                     "SELECT set_config('statement_timeout', '0', true),"
                     " set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s),"
@@ -288,10 +311,10 @@ class SingleStatement:
 
 #: The schema of a store, and the oldest one whose processes may write to it.
 SCHEMA = "SELECT version_num, least_revision FROM alembic_version, schema_range"
-#: The locks of maps, one after the other.
+#: Locks the maps, one after the other.
 _MAPS, _NUMBERS = "SELECT pg_advisory_xact_lock(%s, number)", "FROM unnest(%s::integer[]) AS number"
-#: Divides by zero if the schema is another one, so that the rest of the transaction fails. The
-#: schema stays the same while this process has its turn.
+#: Divides by zero if the schema has changed, so that the transaction fails. The schema cannot
+#: change while this process has its turn.
 _MAPS_AND_SCHEMA = (
     f"{_MAPS}, (SELECT 1 / count(*) FROM alembic_version, schema_range"
     f" WHERE version_num = %s AND least_revision = %s) {_NUMBERS}"
@@ -299,33 +322,26 @@ _MAPS_AND_SCHEMA = (
 
 
 class KnownSchema:
-    """The schema of a store, as a process found it last, and may write to it.
+    """The schema of a store as this process last read it.
 
     Parameters
     ----------
-    check : raises where it may not write to the one that was found
+    check : function that raises an error if this process may not write to a schema
     """
 
     def __init__(self, check: Callable[[Any], None]) -> None:
         self._check = check
         self.found: tuple[str, str] | None = None
 
-    def look(self, connection: Any) -> None:
-        """Find it again, by a connection of psycopg.
-
-        Raises
-        ------
-        Exception : of `check`
-        """
-        found = connection.execute(SCHEMA).fetchone()
-        self._check(found)
-        self.found = found
+    def read(self, connection: Any) -> None:
+        """Read the schema again on a connection of psycopg; raise the error of `check`."""
+        row = connection.execute(SCHEMA).fetchone()
+        self._check(row)
+        self.found = row
 
 
 def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool:
-    """Execute what is several statements, and go to the answer of the last one; or what is a
-    transaction of its own. Any other statement is SQLAlchemy's.
-    """
+    """Execute statements with the options `_MESSAGE` or SINGLE; return whether this has done so."""
     if _MESSAGE in context.execution_options:
         cursor.execute(statement)
         while cursor.nextset():
@@ -339,29 +355,28 @@ def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool
 
 
 def _refuse_single(_cursor: Any, _statement: str, *others: Any) -> None:
-    """See that what is no single statement with parameters is not sent as one."""
+    """Raise ValueError for SINGLE with a statement that has no parameters, or several sets."""
     if others[-1].execution_options.get(SINGLE) is not None:
-        raise ValueError("a transaction of a single statement has one with parameters")
+        raise ValueError("a transaction of a single statement needs one with parameters")
 
 
 def take_turn(
-    connection: Connection, wait_s: float, asked: str | None = None, map_number: int | None = None
+    connection: Connection, wait_s: float, query: str | None = None, map_number: int | None = None
 ) -> Any:
-    """Begin a transaction, and wait for a writer's turn.
+    """Begin a transaction, and wait for a writer's turn, in one message.
 
-    All of it is one message: once the turn is there, nobody else writes until what is sent next has
-    come, and that takes a round trip.
+    From the turn to the next message, which takes a round trip, nobody else writes.
 
     Parameters
     ----------
     connection : see `begin`
-    wait_s : seconds to wait
-    asked : a query of one row, answered when it is its turn
-    map_number : of the only map that is written to; None: anything may be
+    wait_s : maximum seconds to wait
+    query : query of one row, executed in the turn
+    map_number : number of the only map that is written to; None: all maps
 
     Returns
     -------
-    row : of `asked`
+    row : row of `query`
     """
     message = ["SET LOCAL statement_timeout = 0"]  # see SingleStatement
     turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"
@@ -373,28 +388,28 @@ def take_turn(
     if wait_s == BUSY_S:
         message.append(turn)
     else:
-        # what is waited for so long is done without haste; others find the usual time again
+        # a migration, which waits longer than BUSY_S, has no time limit afterwards
         after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
         message += [f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}", turn]
         message.append(f"SET LOCAL lock_timeout = {after}")
-    row = begin(connection, *message, *(() if asked is None else (asked,)))
+    row = begin(connection, *message, *(() if query is None else (query,)))
     if wait_s > BUSY_S:
         allow(connection, 0)
-    return None if asked is None else row
+    return None if query is None else row
 
 
 def require_synchronous(connection: Connection) -> None:
-    """See that what was committed is where a commit has to be.
+    """Check that the server waited for its standby at the commit.
 
     Raises
     ------
-    StoreAway : somebody ended the wait for a standby; the server says so in passing.
+    StoreAway : an operator ended the wait, of which the server only warns.
     """
     if _WARNED in connection.info:
         raise StoreAway(
-            f"{database_label(connection.engine.url)}: the wait for a standby was ended by "
-            "hand. What was written is there, and lost if the server falls before a standby "
-            "follows. Bring the standby back, or take it out of synchronous_standby_names."
+            f"{database_label(connection.engine.url)}: an operator ended the wait for a standby. "
+            "The commit is stored, and lost if the server fails before a standby follows. Restart "
+            "the standby, or remove it from synchronous_standby_names."
         )
 
 
@@ -403,11 +418,13 @@ def _note_use(_connection: Any, record: Any) -> None:
 
 
 def _require_alive(dialect: Dialect, connection: Any, record: Any, _proxy: object) -> None:
-    """Try a connection that was not used for a while, or to which the server has said something
-    since: as a rule that it ends. Where it is broken, none is kept.
+    """Test a connection that was idle, or on which the server sent input, usually that it closes
+    it.
+
+    If it is broken, all pooled connections are dropped.
     """
     used = record.info.get(_USED)
-    if used is None:  # it is new
+    if used is None:  # the connection is new
         return
     if time.monotonic() - used < UNTRIED_S and not _has_input(connection):
         return
@@ -420,14 +437,14 @@ def _require_alive(dialect: Dialect, connection: Any, record: Any, _proxy: objec
 
 
 def _has_input(connection: Any) -> bool:
-    """Whether a server has sent something that was not asked for."""
-    found = select.poll()
-    found.register(connection.fileno(), select.POLLIN)
-    return bool(found.poll(0))
+    """Return whether the server has sent unrequested input."""
+    poll = select.poll()
+    poll.register(connection.fileno(), select.POLLIN)
+    return bool(poll.poll(0))
 
 
 def _watch_commits(connection: Any, record: Any) -> None:
-    """Note warnings: a COMMIT has one only where it does not wait for its standby any more."""
+    """Record warnings: a COMMIT has one only if the wait for its standby ended early."""
     if not hasattr(connection, "add_notice_handler"):
         return
 
@@ -439,13 +456,14 @@ def _watch_commits(connection: Any, record: Any) -> None:
 
 
 def forget_warnings(connection: Connection) -> None:
-    """Before a COMMIT, those of the statements before it."""
+    """Forget the warnings of statements before a COMMIT."""
     connection.info.pop(_WARNED, None)
 
 
-def _leave_behind(context: ExceptionContext) -> None:
-    """Give all connections up whose server is a standby, as the next may lead to the one that
-    writes; and those that prepared statements for tables that another process changed.
+def _drop_connections(context: ExceptionContext) -> None:
+    """Drop all connections if the server is a standby, as the next may lead to the primary.
+
+    Do the same if prepared statements are outdated.
     """
     error = context.original_exception
     if getattr(error, "sqlstate", None) in ("25006", "26000") or is_of_old_plan(error):

@@ -1,6 +1,6 @@
-"""Locks that last as long as a connection: of a fleet's blobs, and of who builds an index.
+"""Session locks: of a fleet's blobs, and of the processes that build an index.
 
-The server gives them back when a connection ends, however its process dies.
+The server releases them when the connection ends, however its process dies.
 """
 
 from __future__ import annotations
@@ -23,21 +23,20 @@ if TYPE_CHECKING:
 
     from sceneprint.store.database import Database
 
-#: What of `LOCKS` is locked: uploads that are stored or removed (see `blobs/`).
+#: Number within `LOCKS` of the lock of blobs (see `blobs/`).
 BLOBS = 2
-#: First number of locks of who builds the index of a map for its fleet; the second is that of the
-#: map.
+#: First number of the locks of index builds; the second is the map's.
 INDEX_LOCKS = 0x5CE80
 
 log = logging.getLogger(__name__)
 
-#: Counts removals: odd while one is under way. No transaction takes it back, so it tells of those
-#: of removers that died, too.
+#: Counts removals, and is odd during one. Sequences are not rolled back, so removals of dead
+#: processes count as well.
 _COUNTER = "sceneprint_removals"
 _MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
 _READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
-#: As `nextval`, which the server's log has in advance: after a crash it would go on 32 further, and
-#: an odd number be an even one. Only who removes counts, and has the lock.
+#: Used instead of `nextval`, which after a crash skips up to 32 numbers, so that odd and even would
+#: mix. Only the holder of the lock counts.
 _NEXT = (
     f"SELECT setval('{_COUNTER}', CASE WHEN is_called THEN last_value ELSE 0 END + 1)"
     f" FROM {_COUNTER}"
@@ -45,7 +44,7 @@ _NEXT = (
 _SHARE = "SELECT pg_advisory_lock_shared(%s, %s)"
 _TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
 _GIVE = "SELECT pg_advisory_unlock(%s, %s)"
-#: Seconds since a blob was doomed; infinity where it is not.
+#: Seconds since a blob was doomed; infinity if it is not.
 _DOOMED = (
     "SELECT coalesce(extract(epoch FROM clock_timestamp()) - max(at), 'infinity')::float"
     " FROM doomed WHERE blob = %s"
@@ -55,28 +54,29 @@ _WAIT = "SELECT set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shar
 
 
 class SessionLocks(Locks):
-    """Of all processes of all hosts that share a database of PostgreSQL.
+    """The lock of all hosts that share a PostgreSQL database.
 
-    A pooler that hands one connection to several clients takes them away: connect to the server
-    itself, or let the pooler keep whole sessions."""
+    A pooler that assigns one connection to several clients breaks it: connect to the server itself,
+    or let the pooler assign whole sessions.
+    """
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._alone = threading.Lock()  # of who removes in this process
-        self._removes, self._reads = _Line(database), _Line(database)
-        self._doubted = False
-        # an odd number of `_COUNTER`, and since when this process has seen it
+        self._alone = threading.Lock()  # of the removing thread
+        self._remover, self._reader = _Connection(database), _Connection(database)
+        self._uncertain = False
+        # an odd number of `_COUNTER`, and the time since this process has seen it
         self._odd: tuple[int, float] | None = None
 
     def close(self) -> None:
-        """Give back the connections."""
-        self._removes.drop()
-        self._reads.drop()
+        """Close the connections."""
+        self._remover.close()
+        self._reader.close()
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """See `Locks`; UnusableStore where it cannot be had, or was lost meanwhile."""
-        # of its own: a lock of the connection that removes would be no lock to that one
+        """See `Locks`; raise UnusableStore if the lock cannot be taken, or was lost meanwhile."""
+        # another connection than that of removals, for which its own lock would be free
         connection = self._database.driver_connection()
         try:
             with self._database.explained():
@@ -93,8 +93,8 @@ class SessionLocks(Locks):
             connection.execute("SELECT 1")
         except psycopg.Error as error:
             raise UnusableStore(
-                f"{self._database.shown}: the connection was lost that kept blobs from being "
-                "removed, and some that were needed may be gone. Do it again."
+                f"{self._database.shown}: the connection was lost that prevented removals of "
+                "blobs, and needed blobs may be missing. Run the command again."
             ) from error
 
     @contextmanager
@@ -104,7 +104,7 @@ class SessionLocks(Locks):
             yield False
             return
         try:
-            allowed, self._doubted = self._begin(), False
+            allowed, self._uncertain = self._begin(), False
             try:
                 yield allowed
             finally:
@@ -113,9 +113,9 @@ class SessionLocks(Locks):
         finally:
             self._alone.release()
 
-    def doubt(self) -> None:
-        """See `Locks`: nobody begins another one, or takes it to be over, for LONGEST_S."""
-        self._doubted = True
+    def mark_uncertain(self) -> None:
+        """See `Locks`: no removal begins, and this one does not count as over, for LONGEST_S."""
+        self._uncertain = True
 
     @property
     def outlast_turns(self) -> bool:
@@ -123,16 +123,16 @@ class SessionLocks(Locks):
         return True
 
     def removals(self) -> int | None:
-        """A number that any removal changes; None where it cannot be told, or one is under way."""
-        number = self._reads.ask(_READ)
+        """See `Locks`."""
+        number = self._reader.query(_READ)
         return number if number is not None and number % 2 == 0 else None
 
     def wait(self, digest: str | None, seconds: float) -> None:
-        """See `Locks`: who dies gives the lock back, although the counter stays odd."""
-        # what is removed after its turn is doomed until the removal has ended
-        if digest is not None and self._reads.ask(_DOOMED, digest) == math.inf:
+        """See `Locks`: a dead process loses the lock, although the counter stays odd."""
+        # a blob that is removed after the turn is doomed until the removal has ended
+        if digest is not None and self._reader.query(_DOOMED, digest) == math.inf:
             return
-        # of its own: other threads ask `removals` meanwhile
+        # another connection, as other threads call `removals` meanwhile
         connection = self._database.driver_connection()
         try:
             with self._database.explained():
@@ -140,35 +140,38 @@ class SessionLocks(Locks):
         finally:
             connection.close()
         if digest is not None and self.removals() is None:
-            # whoever removed it has lost its lock: it is dead, or cut off, and then its requests
-            # may still be on their way
-            age_s = self._reads.ask(_DOOMED, digest)
+            # the removing process has lost its lock: it is dead or disconnected, and its requests
+            # may still arrive
+            age_s = self._reader.query(_DOOMED, digest)
             if age_s is None or age_s < LONGEST_S:
                 raise StoreLocked(
                     f"{self._database.shown}: a process that removes the same bytes lost its "
-                    "connection, and may still remove them. Nothing was stored. Come back in a "
+                    "connection, and may still remove them. Nothing was stored. Try again in a "
                     "minute or two."
                 )
 
     def _begin(self) -> bool:
-        if not self._removes.ask(_TAKE, LOCKS, BLOBS):
+        if not self._remover.query(_TAKE, LOCKS, BLOBS):
             return False
-        if not self._is_over(self._removes.ask(_READ, same=True)):
-            self._removes.drop()
+        if not self._is_over(self._remover.query(_READ, same=True)):
+            self._remover.close()
             return False
-        # who puts a blob while it is removed must find out: without the counter, nothing goes
-        for _ in range(2):  # it is odd already after a remover that died
-            number = self._removes.ask(_NEXT, same=True)
-            if number is None:  # with the connection the lock is gone
+        # without the counter, no removal begins: writers of the same blobs would not notice it
+        for _ in range(2):  # the number is odd already after the death of a remover
+            number = self._remover.query(_NEXT, same=True)
+            if number is None:  # the connection is lost, and so is the lock
                 break
             if number % 2 == 1:
                 return True
-        self._removes.drop()
+        self._remover.close()
         return False
 
     def _is_over(self, number: int | None) -> bool:
-        """Whether the removal of before is over: an odd number is of one whose remover died or was
-        cut off, or whose requests failed, and these may still be carried out."""
+        """Return whether the former removal is over.
+
+        An odd number remains of a process that died or was disconnected, or whose requests failed:
+        these may still be carried out.
+        """
         if number is None:
             return False
         if number % 2 == 0:
@@ -178,30 +181,29 @@ class SessionLocks(Locks):
         return time.monotonic() - self._odd[1] >= LONGEST_S
 
     def _end(self) -> None:
-        if self._doubted:  # the number stays odd
-            self._removes.drop()
+        if self._uncertain:  # leave the number odd
+            self._remover.close()
             return
-        # another connection has no lock: who has it now would be counted to the end
-        ended = self._removes.ask(_NEXT, same=True) is not None
-        if not ended or not self._removes.ask(_GIVE, LOCKS, BLOBS, same=True):
+        # only on the same connection: on another, this would count the present holder's removal
+        ended = self._remover.query(_NEXT, same=True) is not None
+        if not ended or not self._remover.query(_GIVE, LOCKS, BLOBS, same=True):
             log.warning("blob lock lost")
-            self._removes.drop()  # the lock goes with its connection
+            self._remover.close()
 
 
 @contextmanager
 def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], None] | None]:
-    """Have the turn to build a map's index for the fleet, as long as a connection lasts.
+    """Hold the turn to build a map's index for the fleet, as long as a connection lasts.
 
-    SQLite is of one machine, whose builders have the lock of the index's folder.
+    On SQLite, the lock of the index's folder is enough.
 
     Yields
     ------
-    what sees that the turn was not lost, and raises UnusableStore where it was; None where
-    somebody else has the turn
+    check : function that raises UnusableStore if the turn was lost; None if another process has it
 
     Raises
     ------
-    UnusableStore : the database cannot be asked.
+    UnusableStore : the database cannot be reached.
     """
     import psycopg
 
@@ -215,8 +217,8 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
             connection.execute("SELECT 1")
         except psycopg.Error as error:
             raise UnusableStore(
-                f"{database.shown}: the connection was lost that kept others from building the "
-                "same index. It is built again."
+                f"{database.shown}: the connection was lost that prevented others from building "
+                "the same index. It is built again."
             ) from error
 
     try:
@@ -228,23 +230,23 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
         connection.close()
 
 
-class _Line:
-    """A connection that lasts, opened when it is needed and anew where it broke."""
+class _Connection:
+    """A lasting connection, opened on demand, and again after it broke."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._lock = threading.Lock()
         self._held: list[psycopg.Connection[Any]] = []  # at most one
-        # not by __del__: the driver warns of what is collected while it is open
+        # not in __del__: the driver warns of open connections that are collected
         weakref.finalize(self, _close, self._held)
 
-    def ask(self, statement: str, *values: int | str, same: bool = False) -> Any:
-        """The value that answers; None where there is none, for whatever reason.
+    def query(self, statement: str, *values: int | str, same: bool = False) -> Any:
+        """Return the value of a query; None if there is none, for whatever reason.
 
         Parameters
         ----------
-        statement, values : to execute
-        same : by no other connection than the one of before, which has locks
+        statement, values : query and its parameters
+        same : whether to use only the former connection, which holds locks
         """
         import psycopg
 
@@ -258,7 +260,7 @@ class _Line:
                 try:
                     return _one(connection, statement, values)
                 except psycopg.errors.UndefinedTable:
-                    # another process may be making it
+                    # another process may create the sequence at the same time
                     with suppress(psycopg.errors.UniqueViolation, psycopg.errors.DuplicateTable):
                         connection.execute(_MAKE)
                     return _one(connection, statement, values)
@@ -267,8 +269,8 @@ class _Line:
                 _close(self._held)
                 return None
 
-    def drop(self) -> None:
-        """Close it; a lock that it holds is free."""
+    def close(self) -> None:
+        """Close the connection, which releases its locks."""
         with self._lock:
             _close(self._held)
 

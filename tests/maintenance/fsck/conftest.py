@@ -20,7 +20,7 @@ from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.maintenance.fsck.findings import Finding
 from sceneprint.models import Model, open_table, write_model
 from sceneprint.settings import Settings
-from sceneprint.store.maps import add_map, keep_model
+from sceneprint.store.maps import add_map, store_model
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import FrameMeta, GivenPose, JobState, Query
 
@@ -146,7 +146,7 @@ def master(
     open_table(small_whitened, house.settings.cache_dir)
     with Engine(house.settings) as engine:
         with engine.store.database.write() as connection:
-            keep_model(connection, small_whitened.id, "small", write_model(small_whitened))
+            store_model(connection, small_whitened.id, "small", write_model(small_whitened))
             for name in ("hall", "attic"):
                 add_map(connection, name, None, small_whitened.id)
 

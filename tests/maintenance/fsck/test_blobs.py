@@ -62,10 +62,10 @@ def lost(house: Any) -> Callable[[str], tuple[Path, str]]:
 
 
 REPAIRS = {
-    "upload": "the frame is indexed, and says so in its reason",
-    "artifact": "a worker makes it again from the upload",
-    "job-file": "the job has it no more",
-    "tile": "a worker makes it again from the frames",
+    "upload": "the frame is indexed, and its reason describes the loss",
+    "artifact": "a worker computes it again from the upload",
+    "job-file": "the file is removed from the job",
+    "tile": "a worker computes it again from the frames",
 }
 
 

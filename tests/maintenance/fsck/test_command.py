@@ -56,8 +56,8 @@ def test_it_says_what_it_would_do_and_what_it_did(
     lines = fsck("--json", record, expect=1).splitlines()
     assert house.files() == before
     assert lines[1] == (
-        f"damage    stale-value  frame {frame} of map hall: the tags or the position by which it "
-        "is searched are not its own; would: write them anew from the frame"
+        f"damage    stale-value  frame {frame} of map hall: the tags or the position that "
+        "searches use differ from the frame's; would: copy them from the frame"
     )
     assert lines[0].startswith("note      foreign-file  ")
     assert lines[-1] == (

@@ -42,7 +42,7 @@ def test_an_index_that_differs_from_the_database_is_made_again(house: Any, uploa
     (found,) = house.look(repair=True)
     ((first,),) = house.sql("SELECT id FROM frames WHERE number = 1")
     assert (found.kind, found.left) == ("damaged-index", False)
-    assert found.means == f"has not the signatures of frames {first}"
+    assert found.means == f"lacks the signatures of frames {first}"
     assert house.look() == []
     with Engine(house.settings) as engine:
         assert engine.publish_due() == 1
