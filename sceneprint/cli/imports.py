@@ -271,18 +271,17 @@ def add_map_options(command: argparse.ArgumentParser) -> None:
 def check_map_options(options: argparse.Namespace) -> None:
     """See that options are of the kind of upload; InvalidRequest where they are not."""
     is_whole = options.as_map or any(map(is_archive_file, options.paths))
-    if options.depth_scale is not None and is_whole:
-        raise InvalidRequest(
-            "--depth-scale is for depth images and recordings, and not for a map or an archive. In "
-            'an archive, put it as "depth_scale" into intrinsics.json.',
-            (("depth_scale", "of a map or an archive"),),
-        )
-    if options.row is not None and is_whole:
-        raise InvalidRequest(
-            "--row is for .bin files, and not for a map or an archive. In an archive, put the "
-            'names as "row" into clouds.json.',
-            (("row", "of a map or an archive"),),
-        )
+    for name, kind, place in (
+        ("depth_scale", "depth images and recordings",
+         'it as "depth_scale" into intrinsics.json'),
+        ("row", ".bin files", 'the names as "row" into clouds.json'),
+    ):  # fmt: skip
+        if getattr(options, name) is not None and is_whole:
+            raise InvalidRequest(
+                f"--{name.replace('_', '-')} is for {kind}, and not for a map or an archive. In an "
+                f"archive, put {place}.",
+                ((name, "of a map or an archive"),),
+            )
     if options.as_map:
         folders = [str(path) for path in options.paths if path.is_dir()]
         if folders:

@@ -1,17 +1,16 @@
-"""Opening a signer for a command: which model, and a word before the machine goes quiet."""
+"""Signers of commands: the model that options name, and messages while kernels are compiled."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
+from sceneprint.cli.output import print_error, progress_bar
 from sceneprint.engine.compilation import ALL, DEPTH, compile_kernels
 from sceneprint.errors import FrameError
 from sceneprint.models import PRESETS, Model, read_model
@@ -21,7 +20,7 @@ from sceneprint.types import DepthFrame, Intrinsics
 
 
 def add_model_options(command: argparse.ArgumentParser) -> None:
-    """`--preset` or `--model`."""
+    """Add `--preset` and `--model`."""
     choice = command.add_mutually_exclusive_group()
     choice.add_argument(
         "--preset", choices=PRESETS,
@@ -31,18 +30,10 @@ def add_model_options(command: argparse.ArgumentParser) -> None:
 
 
 def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = False) -> Signer:
-    """The signer the options ask for, its code loaded and its table open.
+    """Return the signer of the model that `add_model_options` named, with its code compiled and
+    its table open; UnreadableModel if there is no such model.
 
-    Says so before the machine goes quiet to compile, and shows the table being built.
-
-    Parameters
-    ----------
-    options : of `add_model_options`
-    psi : sign with psi itself; of the preset `paper` where no model is named
-
-    Raises
-    ------
-    UnreadableModel : no such model.
+    With `psi`, it signs with psi itself, by default of the preset `paper`.
     """
     compile_kernels(settings.cache_dir, ("signing",), _print)
     chosen = options.model or options.preset or ("paper" if psi else PRESETS[0])
@@ -57,15 +48,14 @@ def prepare_presets(
     settings: Settings, say: Callable[[str], None] | None = None, *, clouds: bool = False,
     stop: threading.Event | None = None,
 ) -> None:  # fmt: skip
-    """See that code is compiled and the presets' tables are built, once an installation.
-
-    So that a service's first frame does not wait for what a person can watch now.
+    """Compile kernels and build the tables of the presets, once after an installation, so that the
+    first frame of a service does not wait for them.
 
     Parameters
     ----------
-    say : what tells of each step, as it takes a while (default: lines on standard error)
-    clouds : compile what clouds need as well; else the first cloud waits for that
-    stop : once it is set, nothing more is compiled or built
+    say : function that reports each step (default: prints on standard error)
+    clouds : whether to compile the kernels of clouds, for which the first cloud waits otherwise
+    stop : event that ends the preparation
     """
     parts = ALL if clouds else DEPTH
     compile_kernels(settings.cache_dir, parts, say or _print, stop)
@@ -75,18 +65,11 @@ def prepare_presets(
 
 
 def _print(text: str) -> None:
-    print(f"sceneprint: {text}", file=sys.stderr)
+    print_error(f"sceneprint: {text}")
 
 
 def _open_signer(model: Model, name: str, settings: Settings) -> Signer:
-    name = f"pair table of {name}"
-    # no bar among the lines of a log
-    with tqdm(desc=name, unit="bin", unit_scale=True, delay=0.5, disable=None) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with progress_bar(f"pair table of {name}", "bin", unit_scale=True, delay=0.5) as progress:
         return open_signer(model, settings.cache_dir, progress)
 
 
