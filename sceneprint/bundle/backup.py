@@ -13,9 +13,10 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from itertools import islice
 from typing import IO, Any, Literal, TypeVar
@@ -23,7 +24,17 @@ from typing import IO, Any, Literal, TypeVar
 from sqlalchemy import Connection
 
 from sceneprint.bundle.place import BundleManifest, BundlePlace, Part
-from sceneprint.bundle.rows import last_numbers, read_rows, row_parts, table_parts, tables
+from sceneprint.bundle.rows import (
+    Row,
+    cut_rows,
+    fetch_rows,
+    last_numbers,
+    read_rows,
+    read_table,
+    table_part,
+    tables,
+    write_part,
+)
 from sceneprint.errors import BundleError, DamagedBlob, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database
@@ -37,7 +48,7 @@ from sceneprint_client.api import FrameState
 #: Parts and blobs that are written at once: each waits for its disk, or for the network.
 THREADS = 8
 #: Blobs that one thread copies after the other: most are there already.
-_TOGETHER = 32
+_TOGETHER = 256
 #: Bytes above which a blob is copied in parts, and not held in memory.
 LARGE = 8 << 20
 #: Rows and blobs that are done, and all of them.
@@ -49,10 +60,10 @@ BLOB_COLUMNS = ("digest", "bytes", "lost")
 _REFERRED = (
     "SELECT blob AS digest FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
-    " UNION SELECT geometry FROM signatures"
-    " UNION SELECT blob FROM job_files"
-    " UNION SELECT blob FROM surface_tiles WHERE blob IS NOT NULL"
-    " UNION SELECT draft FROM surface_tiles WHERE draft IS NOT NULL"
+    " UNION ALL SELECT geometry FROM signatures"
+    " UNION ALL SELECT blob FROM job_files"
+    " UNION ALL SELECT blob FROM surface_tiles WHERE blob IS NOT NULL"
+    " UNION ALL SELECT draft FROM surface_tiles WHERE draft IS NOT NULL"
 )
 
 A = TypeVar("A")
@@ -147,7 +158,9 @@ class _Backup:
 
     def __init__(self, place: BundlePlace, progress: Progress) -> None:
         self._place, self._progress = place, progress
-        self._done = self._total = self._written = 0
+        self._done = self._total = self._written = self._blob_bytes = 0
+        self._lost = list[LostBlob]()
+        self._known = _known_parts(place)
 
     def write(self, database: Database, blobs: Blobs) -> Bundle:
         begun, parts = datetime.now(UTC), list[Part]()
@@ -155,86 +168,106 @@ class _Backup:
             with database.read() as connection:
                 allow(connection, 0)  # what is on the way may be large, and the place slow
                 check_sound(connection, database.shown)
-                self._total = _count(connection)
-                for table in tables():
-                    parts += self._parts(f"rows/{table.name}", table_parts(connection, table))
-                summary = summary_of(connection)
+                self._total = sum(_rows_of(connection, one.name) for one in tables())
                 for digest in referred(connection):
                     digests.write(f"{digest}\n".encode())
+                    self._total += 1
+                for table in tables():
+                    keys = [i for i, one in enumerate(table.columns) if one.primary_key]
+                    rows = cut_rows(read_table(connection, table), keys)
+                    parts += self._parts(f"rows/{table.name}", rows, partial(table_part, table))
+                summary = summary_of(connection)
             digests.seek(0)
-            listed = _Listed()
-            rows = self._blobs(blobs, digests, listed)
-            parts += self._parts("blobs", row_parts(BLOB_COLUMNS, rows))
+            rows = cut_rows(self._blobs(blobs, digests), [0])
+            lists = [*self._parts("blobs", rows, partial(write_part, BLOB_COLUMNS))]
         manifest = BundleManifest(
             created_at=begun, sceneprint=version("sceneprint"),
             schema_revision=known_revisions()[0],
-            blobs=listed.count, blob_bytes=listed.bytes, lost=len(listed.lost),
-            parts=tuple(parts), **summary,
+            blobs=sum(one.rows for one in lists) - len(self._lost), blob_bytes=self._blob_bytes,
+            lost=len(self._lost), parts=(*parts, *lists), **summary,
         )  # fmt: skip
         self._place.publish(manifest)
-        return Bundle(manifest, tuple(listed.lost), self._written)
+        return Bundle(manifest, tuple(self._lost), self._written)
 
-    def _parts(self, kind: str, found: Iterable[tuple[bytes, int]]) -> Iterator[Part]:
-        for (digest, new), size, rows in in_order(
-            lambda one: (self._place.put(one[0]), len(one[0]), one[1]), found
-        ):
-            self._written += size if new else 0
+    def _parts(
+        self, kind: str, found: Iterable[tuple[list[Row], str]],
+        write: Callable[[list[Row]], bytes],
+    ) -> Iterator[Part]:  # fmt: skip
+        """Write the parts that are not of the same rows as one of the bundle before."""
+
+        def changed() -> Iterator[Part | tuple[bytes, int, str]]:
+            for rows, source in found:
+                known = self._known.get((kind, source))
+                if known is not None and self._place.size(known.digest) == known.bytes:
+                    yield known
+                else:
+                    yield write(rows), len(rows), source
+
+        def put(one: Part | tuple[bytes, int, str]) -> tuple[Part, bool]:
+            if isinstance(one, Part):
+                return one, False
+            data, rows, source = one
+            digest, new = self._place.put(data)
+            size = len(data)
+            return Part(kind=kind, digest=digest, bytes=size, rows=rows, source=source), new
+
+        for part, new in in_order(put, changed()):
+            self._written += part.bytes if new else 0
             if kind != "blobs":
-                self._go_on(rows)
-            yield Part(kind=kind, digest=digest, bytes=size, rows=rows)
+                self._go_on(part.rows)
+            yield part
 
-    def _blobs(
-        self, blobs: Blobs, digests: IO[bytes], listed: _Listed
-    ) -> Iterator[tuple[str, ListedBlob]]:
-        """Copy blobs, and yield the rows of the list of them."""
+    def _blobs(self, blobs: Blobs, digests: IO[bytes]) -> Iterator[ListedBlob]:
+        """Copy blobs, and yield the list of them."""
         names = (line.decode().rstrip("\n") for line in digests)
         some = iter(lambda: list(islice(names, _TOGETHER)), [])
         for found in in_order(lambda block: [self._copy(blobs, one) for one in block], some):
-            for digest, size, why, new in found:
-                listed.add(digest, size, why)
-                self._written += size if new else 0
-                yield digest, (digest, size, why)
+            for listed, new in found:
+                digest, size, why = listed
+                if why is not None:
+                    self._lost.append(LostBlob(digest, why))
+                self._blob_bytes += size
+                self._written += new
+                yield listed
             self._go_on(len(found))
 
-    def _copy(self, blobs: Blobs, digest: str) -> tuple[str, int, Loss | None, bool]:
-        """Copy a blob unless it is there; return its size, and why it cannot be copied."""
+    def _copy(self, blobs: Blobs, digest: str) -> tuple[ListedBlob, int]:
+        """Copy a blob unless it is there; return how it is listed, and the bytes written."""
         if not is_digest(digest):  # of a database that somebody has edited
-            return digest, 0, "missing", False
+            return (digest, 0, "missing"), 0
         there = self._place.size(digest)
         if there is not None:
-            return digest, there, None, False
+            return (digest, there, None), 0
         size = blobs.size(digest)
         if size is not None and size > LARGE:
             condition = blobs.condition(digest)
             if condition != "sound":
-                return digest, 0, condition, False
+                return (digest, 0, condition), 0
             with closing(blobs.open(digest)) as file:
                 self._place.put_file(digest, file)
-            return digest, size, None, True
+            return (digest, size, None), size
         try:
             data = blobs.get(digest)
         except DamagedBlob:
-            return digest, 0, "damaged" if blobs.holds(digest) else "missing", False
+            return (digest, 0, "damaged" if blobs.holds(digest) else "missing"), 0
         self._place.put(data)
-        return digest, len(data), None, True
+        return (digest, len(data), None), len(data)
 
     def _go_on(self, rows: int) -> None:
         self._done += rows
         self._progress(self._done, max(self._total, self._done))
 
 
-class _Listed:
-    """Counts the blobs of a bundle."""
+def _known_parts(place: BundlePlace) -> dict[tuple[str, str], Part]:
+    """Return the parts of the newest bundle by kind and source.
 
-    def __init__(self) -> None:
-        self.count = self.bytes = 0
-        self.lost = list[LostBlob]()
-
-    def add(self, digest: str, size: int, why: Loss | None) -> None:
-        if why is not None:
-            self.lost.append(LostBlob(digest, why))
-            return
-        self.count, self.bytes = self.count + 1, self.bytes + size
+    Another version may have written the same rows in another way: its parts are none of them.
+    """
+    with suppress(BundleError):  # there is none, or it is damaged
+        manifest, own = place.read(), (version("sceneprint"), known_revisions()[0])
+        if (manifest.sceneprint, manifest.schema_revision) == own:
+            return {(one.kind, one.source): one for one in manifest.parts}
+    return {}
 
 
 def in_order(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
@@ -257,10 +290,9 @@ def referred(connection: Connection) -> Iterator[str]:
     """Yield the digests of all blobs that have to be there, each once, in order."""
     # as text, whatever a database that somebody has edited holds
     order = ' COLLATE "C"' if connection.dialect.name == "postgresql" else ""
-    statement = f"SELECT CAST(digest AS TEXT){order} AS d FROM ({_REFERRED}) AS found ORDER BY d"
-    options = {"stream_results": True}
-    for (digest,) in connection.exec_driver_sql(statement, execution_options=options):
-        yield digest
+    text = f"CAST(digest AS TEXT){order}"
+    statement = f"SELECT DISTINCT {text} AS d FROM ({_REFERRED}) AS found ORDER BY d"
+    yield from (digest for (digest,) in fetch_rows(connection, statement))
 
 
 def listed_blobs(place: BundlePlace, manifest: BundleManifest) -> Iterator[ListedBlob]:
@@ -312,13 +344,6 @@ def check_sound(connection: Connection, shown: str) -> None:
             f"{shown}: the database is damaged ({' '.join(wrong.split())}), and a backup of it "
             "could not be restored. Run `sceneprint fsck`, or restore an earlier bundle."
         )
-
-
-def _count(connection: Connection) -> int:
-    """Return the number of rows and blobs that a backup goes through."""
-    blobs = f"SELECT count(*) FROM ({_REFERRED}) AS found"
-    rows = sum(_rows_of(connection, one.name) for one in tables())
-    return rows + int(connection.exec_driver_sql(blobs).scalar_one())
 
 
 def _rows_of(connection: Connection, name: str) -> int:

@@ -27,7 +27,7 @@ from urllib.parse import quote
 from pydantic import Field
 
 from sceneprint.atomic_files import folder_turn, make_folder
-from sceneprint.errors import BundleError, DamagedBundle
+from sceneprint.errors import BundleError, DamagedBundle, UnusableStore
 from sceneprint.sealed_record import StrictRecord, seal, unseal
 from sceneprint.store.blobs.folder import Condition, is_digest
 from sceneprint.store.blobs.object_client import Objects, open_objects
@@ -49,12 +49,14 @@ class Part(StrictRecord):
     digest : SHA-256 of its bytes, by which it is named
     bytes : its size
     rows : number of rows in it
+    source : digest of its rows as they are in the store, which no other rows have
     """
 
     kind: str = Field(pattern=r"^(rows/[a-z_]{1,63}|blobs)$")
     digest: str = Field(pattern="^[0-9a-f]{64}$")
     bytes: int = Field(ge=0)
     rows: int = Field(ge=0)
+    source: str = Field(pattern="^[0-9a-f]{64}$")
 
 
 class BundleManifest(StrictRecord):
@@ -295,9 +297,18 @@ class BundlePlace:
         return len(found)
 
     def _list(self, first: str) -> dict[str, int]:
-        return {
-            one.key.rpartition("/")[2]: one.size for one in self._objects.list(f"{_PARTS}{first}/")
-        }
+        folder = f"{_PARTS}{first}/"
+        if self._folder is None:
+            return {one.key.rpartition("/")[2]: one.size for one in self._objects.list(folder)}
+        try:  # half the cost of the same through the store of objects
+            with os.scandir(self._folder / folder) as found:
+                return {one.name: one.stat().st_size for one in found}
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise UnusableStore(
+                f"{self.shown}/{folder} cannot be listed ({error.strerror})."
+            ) from error
 
 
 def _key(digest: str) -> str:

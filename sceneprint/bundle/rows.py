@@ -1,21 +1,26 @@
 """Rows of tables as parts of a bundle, the same from SQLite and from PostgreSQL.
 
-    rows of a table  --row_parts-->  JSON lines, compressed  --read_rows-->  the same rows
+    rows of a table  --cut_rows-->  rows of each part, and their digest
+    --write_part-->  JSON lines, compressed  --read_rows-->  the same rows
 
 A part ends after a row whose key has a hash of a certain kind. So a row that comes, changes or goes
 changes the part that it is in, and no other: what did not change is in the bundle before already.
+The digest tells so before the part is written, which costs several times as much as to read it.
 """
 
 from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import json
+import marshal
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from functools import cache
 from itertools import islice
+from operator import itemgetter
 from typing import Any
 
 from sqlalchemy import (
@@ -39,6 +44,8 @@ _ROWS, _BYTES = 1024, 8 << 20
 _MOST_BYTES = 1 << 28
 #: Rows that are read or written at once; a signature may have 125,000 bytes.
 _BLOCK = 200
+#: Rows whose bytes are counted at once while a part grows.
+_TOGETHER = 32
 
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
@@ -65,28 +72,37 @@ def column_names(table: Table) -> str:
 
 
 def read_table(connection: Connection, table: Table) -> Iterator[Row]:
-    """Yield all rows of a table in the order of their keys, documents (JSON) as text.
+    """Yield all rows of a table in the order of their keys, as the driver has them.
+
+    Documents (JSON) are text, and on PostgreSQL truth values are numbers, as they are on SQLite.
 
     Parameters
     ----------
     connection : of a transaction that sees one state
     """
     server = connection.dialect.name == "postgresql"
-    columns = ", ".join(
-        f'"{one.name}"::text' if server and isinstance(one.type, JSON) else f'"{one.name}"'
-        for one in table.columns
-    )
+    columns = ", ".join(f'"{one.name}"' + (_cast(one) if server else "") for one in table.columns)
     order = ", ".join(  # SQLite orders texts by their bytes
         f'"{one.name}"' + (' COLLATE "C"' if server and isinstance(one.type, String) else "")
         for one in table.primary_key.columns
     )
-    options = {"stream_results": True}
-    statement = f"SELECT {columns} FROM {table.name} ORDER BY {order}"
-    with closing(connection.exec_driver_sql(statement, execution_options=options)) as found:
-        while block := found.fetchmany(_BLOCK):
-            yield from block
+    yield from fetch_rows(connection, f"SELECT {columns} FROM {table.name} ORDER BY {order}")
     if server and table is events:
         yield from _pending(connection)
+
+
+def fetch_rows(connection: Connection, statement: str) -> Iterator[Row]:
+    """Yield the rows of a statement as tuples, a block at a time."""
+    options = {"stream_results": True}
+    with closing(connection.exec_driver_sql(statement, execution_options=options)) as found:
+        while block := found.fetchmany(_BLOCK):
+            yield from map(tuple, block)
+
+
+def _cast(column: Column[Any]) -> str:
+    if isinstance(column.type, JSON):
+        return "::text"
+    return "::integer" if isinstance(column.type, Boolean) else ""
 
 
 def _pending(connection: Connection) -> Iterator[Row]:
@@ -118,40 +134,54 @@ def last_numbers(connection: Connection) -> dict[str, int]:
     return found
 
 
-def row_parts(
-    columns: Sequence[str], rows: Iterable[tuple[str, Row]]
-) -> Iterator[tuple[bytes, int]]:
-    """Yield the bytes of one part after the other, and the number of rows in each.
+def cut_rows(rows: Iterable[Row], keys: Sequence[int]) -> Iterator[tuple[list[Row], str]]:
+    """Yield the rows of one part after the other, and a digest that no other rows have.
 
     Parameters
     ----------
-    columns : names
-    rows : the key of each row, and its values
+    rows : of texts, bytes and numbers
+    keys : places of the values in a row by which the rows are in order
     """
-    head = json.dumps(list(columns)).encode()
-    lines, size = [head], 0
-    for key, row in rows:
-        lines.append(_encode(row).encode())
-        size += len(lines[-1])
-        if zlib.crc32(key.encode()) % _ROWS == 0 or size >= _BYTES:
-            yield _compress(lines), len(lines) - 1
-            lines, size = [head], 0
-    if len(lines) > 1:
-        yield _compress(lines), len(lines) - 1
+    key = itemgetter(*keys)
+    part, size, hashed = list[Row](), 0, hashlib.sha256()
+    for row in rows:
+        part.append(row)
+        ends = zlib.crc32(repr(key(row)).encode()) % _ROWS == 0
+        if ends or len(part) % _TOGETHER == 0:
+            size += _add(hashed, part)
+        if ends or size >= _BYTES:
+            yield part, hashed.hexdigest()
+            part, size, hashed = [], 0, hashlib.sha256()
+    if part:
+        _add(hashed, part)
+        yield part, hashed.hexdigest()
 
 
-def table_parts(connection: Connection, table: Table) -> Iterator[tuple[bytes, int]]:
-    """Yield the parts of a table; see `row_parts`.
+def _add(hashed: hashlib._Hash, part: list[Row]) -> int:
+    """Add the last rows of a part to its digest; return their bytes."""
+    first = (len(part) - 1) // _TOGETHER * _TOGETHER
+    packed = marshal.dumps(part[first:], 2)  # the last version without references between values
+    hashed.update(packed)
+    return len(packed)
+
+
+def write_part(columns: Sequence[str], rows: Iterable[Row]) -> bytes:
+    """Return the bytes of a part: the names of the columns and each row, as lines of JSON."""
+    from isal import isal_zlib
+
+    lines = "\n".join([json.dumps(list(columns)), *map(_encode, rows)])
+    return bytes(isal_zlib.compress(lines.encode(), 1))
+
+
+def table_part(table: Table, rows: Iterable[Row]) -> bytes:
+    """Return the bytes of a part of a table; see `write_part`.
 
     Raises
     ------
     UnusableStore : a value is not of its column's type, as after somebody has edited the database.
     """
-    keys = [i for i, one in enumerate(table.columns) if one.primary_key]
-    rows = encoded_rows(table.columns, read_table(connection, table))
     try:
-        keyed = ((repr([row[i] for i in keys]), row) for row in rows)
-        yield from row_parts([one.name for one in table.columns], keyed)
+        return write_part([one.name for one in table.columns], encoded_rows(table.columns, rows))
     except (TypeError, ValueError) as error:
         raise UnusableStore(
             f"A row of table {table.name} cannot be read ({error}). Run `sceneprint fsck`."
@@ -176,18 +206,12 @@ def _encoder(column: Column[Any]) -> Callable[[Any], Any] | None:
     return None
 
 
-def _compress(lines: list[bytes]) -> bytes:
-    from isal import isal_zlib
-
-    return bytes(isal_zlib.compress(b"\n".join(lines), 1))
-
-
 def read_rows(data: bytes, columns: Sequence[str]) -> Iterator[Row]:
     """Yield the rows of a part.
 
     Parameters
     ----------
-    data : of `row_parts`
+    data : of `write_part`
     columns : that it must have
 
     Raises

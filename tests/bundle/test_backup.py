@@ -30,7 +30,7 @@ from sceneprint.bundle import place as place_module
 from sceneprint.bundle.backup import listed_blobs, take_backup
 from sceneprint.bundle.place import BundlePlace
 from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
-from sceneprint.bundle.rows import row_parts
+from sceneprint.bundle.rows import cut_rows
 from sceneprint.engine import Engine
 from sceneprint.errors import BundleError, UnusableStore
 from sceneprint.settings import Settings
@@ -110,17 +110,97 @@ def test_the_blobs_are_those_that_no_sweep_would_remove(master, place, settings)
 
 def test_parts_end_where_their_rows_say():
     """A row that comes in between changes its own part, and no other."""
-    rows = [(str(i), [i, "x" * 50]) for i in range(20_000)]
-    before = list(row_parts(["number", "text"], rows))
-    assert sum(count for _, count in before) == 20_000
+    rows = [(i, "x" * 50) for i in range(20_000)]
+    before = list(cut_rows(rows, [0]))
+    assert [row for part, _ in before for row in part] == rows
     ends = [i for i in range(20_000) if zlib.crc32(str(i).encode()) % 1024 == 0]
-    assert len(before) == len(ends) + 1 > 10
-    rows.insert(10_000, ("new", [-1, "y"]))
-    after = list(row_parts(["number", "text"], rows))
-    changed = {data for data, _ in after} - {data for data, _ in before}
+    assert [part[-1][0] for part, _ in before] == [*ends, 19_999]
+    assert len(ends) > 10
+    rows.insert(10_000, (-1, "y"))
+    after = list(cut_rows(rows, [0]))
+    changed = {source for _, source in after} - {source for _, source in before}
     assert len(changed) == 1
-    large = list(row_parts(["text"], [(f"{i}-", ["x" * (3 << 20)]) for i in range(7)]))
-    assert [count for _, count in large] == [3, 3, 1]  # of 8 MiB and what is over
+    large = list(cut_rows([("key", "x" * (100 << 10))] * 200, [0]))
+    assert [len(part) for part, _ in large] == [96, 96, 8]  # of 8 MiB and what is over
+
+
+@pytest.mark.parametrize(
+    ("row", "other"),
+    [
+        ((1, "ab", "c"), (1, "a", "bc")),
+        ((1, "2"), (1, 2)),
+        ((1, 2), (1, 2.0)),
+        ((1, "a"), (1, b"a")),
+        ((1, None), (1, "None")),
+        ((1, 0.1 + 0.2), (1, 0.3)),
+    ],
+)  # fmt: skip
+def test_other_rows_have_another_digest(row, other):
+    ((_, source),) = cut_rows([row, (5,)], [0])
+    ((_, same),) = cut_rows([(*row,), (5,)], [0])
+    ((_, changed),) = cut_rows([other, (5,)], [0])
+    assert source == same != changed
+
+
+@file_only
+@pytest.mark.parametrize("column", ["title", "quota_bytes", "up"])
+def test_a_row_that_changes_alone_is_in_the_next_bundle(data, tmp_path, settings, column):
+    folder = str(tmp_path / "place")
+    take_backup(settings(data), folder)
+    for value in (1, 2):
+        with closing(sqlite3.connect(data / "sceneprint.db")) as database:
+            database.execute(f"UPDATE maps SET {column} = '{value}'")
+            database.commit()
+        assert take_backup(settings(data), folder).written > 0
+        restore_to_folder(folder, new := tmp_path / str(value))
+        with closing(sqlite3.connect(new / "sceneprint.db")) as database:
+            assert str(database.execute(f"SELECT {column} FROM maps").fetchone()[0]) == str(value)
+
+
+@file_only
+def test_a_part_that_is_gone_or_cut_is_written_again(data, tmp_path, settings):
+    """Its rows are those of the bundle before: that bundle is whole again as well."""
+    folder = tmp_path / "place"
+    first = take_backup(settings(data), str(folder))
+    held = parts_in(folder)
+    for part, left in zip(first.manifest.parts[:2], (None, b"x"), strict=True):
+        path = folder / "parts" / part.digest[:2] / part.digest
+        path.unlink() if left is None else path.write_bytes(left)
+    again = take_backup(settings(data), str(folder))
+    assert again.written == sum(one.bytes for one in first.manifest.parts[:2])
+    assert parts_in(folder) == held
+    assert verify_bundle(str(folder), first.manifest.name).lost == ()
+
+
+@file_only
+def test_parts_of_another_version_or_of_a_damaged_bundle_are_read_again(
+    data, tmp_path, settings, monkeypatch
+):
+    """None is believed to be what it names: a part without rows, named as the keys'."""
+    folder = tmp_path / "place"
+    for change in ("version", "damage"):
+        taken = take_backup(settings(data), str(folder))
+        path = folder / "bundles" / f"{taken.manifest.name}.json"
+        wrong = taken.manifest.model_copy(
+            update={
+                "parts": tuple(
+                    one.model_copy(
+                        update={
+                            "digest": taken.manifest.parts[0].digest,
+                            "bytes": taken.manifest.parts[0].bytes,
+                        }
+                    )
+                    for one in taken.manifest.parts
+                )
+            }
+        )
+        if change == "version":
+            wrong = wrong.model_copy(update={"sceneprint": "0.0.1"})
+        BundlePlace.open(str(folder)).publish(wrong)
+        if change == "damage":
+            path.write_bytes(path.read_bytes().replace(b'"maps": 1', b'"maps": 2'))
+        take_backup(settings(data), str(folder))
+        assert verify_bundle(str(folder)).manifest.blobs == 9
 
 
 @file_only
@@ -288,6 +368,11 @@ def test_a_row_that_is_none_is_named(data, tmp_path, settings):
         database.execute("UPDATE maps SET title = x'00ff'")
         database.commit()
     with pytest.raises(UnusableStore, match=r"A row of table maps cannot be read .*fsck"):
+        take_backup(settings(data), str(tmp_path / "place"))
+    with closing(sqlite3.connect(data / "sceneprint.db")) as database:
+        database.execute("UPDATE maps SET title = CAST(x'ff' AS TEXT)")
+        database.commit()
+    with pytest.raises(UnusableStore, match="Could not decode to UTF-8 column 'title'"):
         take_backup(settings(data), str(tmp_path / "place"))
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import JSON, Connection
 
 from sceneprint.atomic_files import make_folder, write_durable
-from sceneprint.bundle.rows import Row, decoded_rows, encoded_rows, read_rows, row_parts
+from sceneprint.bundle.rows import Row, cut_rows, decoded_rows, encoded_rows, read_rows, write_part
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, NotFound, UnknownMap
 from sceneprint.models import parse_model
@@ -59,9 +59,9 @@ _NAMES = [one.name for one in COLUMNS]
 
 def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes, int]]:
     """Yield digest, bytes and number of rows of each part of a map's indexed frames."""
-    rows = encoded_rows(COLUMNS, copied_rows(connection, row))
-    for data, count in row_parts(_NAMES, ((one[0], one) for one in rows)):
-        yield hashlib.sha256(data).hexdigest(), data, count
+    for rows, _ in cut_rows(encoded_rows(COLUMNS, copied_rows(connection, row)), [0]):
+        data = write_part(_NAMES, rows)
+        yield hashlib.sha256(data).hexdigest(), data, len(rows)
 
 
 class MapCopies:
