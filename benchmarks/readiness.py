@@ -17,10 +17,13 @@ import numpy as np
 from benchmarks.indexed_frames import fill
 from benchmarks.machine import own_bytes, sum_over_processes
 from benchmarks.search import signatures
-from sceneprint.engine import Engine
+from sceneprint.engine.context import open_context
+from sceneprint.engine.maps.map_lifecycle import create_map
+from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.models import read_model
 from sceneprint.settings import Settings
+from sceneprint.store.maps import find_map
 from sceneprint_client import Client
 from sceneprint_client.api import NewMap
 from sceneprint_client.api.maps import Preset
@@ -33,13 +36,16 @@ FRAMES = 10_000
 
 def fill_map(data: Path, frames: int, model: Preset) -> None:
     """Create the map with frames whose signatures are in groups, as those of places are."""
-    with Engine(Settings(data_dir=data)) as engine:
-        engine.create_map(NewMap(name=MAP, model=model))
+    with open_context(Settings(data_dir=data)) as context:
+        store = context.store
+        create_map(store, NewMap(name=MAP, model=model))
         if frames:
             vectors = signatures(np.arange(frames), read_model(model).signature_bytes)
-            blob = engine.store.blobs.put(b"none")
-            fill(engine.store.database, MAP, read_model(model), vectors, blob=blob)
-            engine.rebuild_index(MAP)
+            blob = store.blobs.put(b"none")
+            fill(store.database, MAP, read_model(model), vectors, blob=blob)
+            with store.database.read() as connection:
+                row = find_map(connection, MAP)
+            Upkeep(store, context.signers, context.settings, context.indexes).rebuild(row)
 
 
 def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[str]:

@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,11 +20,12 @@ from sqlalchemy import insert, select
 
 from benchmarks.indexed_frames import fill
 from benchmarks.waiting import until
-from sceneprint.engine import Engine
+from sceneprint.engine.maps.map_lifecycle import create_map
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.formats.export import write_ply
 from sceneprint.models import read_model
 from sceneprint.settings import Settings
+from sceneprint.store import open_store
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, jobs, signatures
 from sceneprint.types import Floats, Intrinsics
@@ -165,9 +167,10 @@ def multiply(data: Path, source: str, name: str, count: int) -> None:
     count : of its frames
     """
     rng = np.random.default_rng(SEED)
-    with Engine(Settings(data_dir=data)) as engine:
-        database = engine.store.database
-        engine.create_map(NewMap(name=name, title=f"{count:,} frames", model="depth"))
+    settings = Settings(data_dir=data)
+    with closing(open_store(settings.database, settings.blobs)) as store:
+        database = store.database
+        create_map(store, NewMap(name=name, title=f"{count:,} frames", model="depth"))
         with database.read() as connection:
             row, other = find_map(connection, name), find_map(connection, source)
             first = select(frames).where(frames.c.map_number == other.number)

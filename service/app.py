@@ -1,4 +1,4 @@
-"""The application: routes around one engine."""
+"""The application: its routes, and the concerns that they call."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ import asyncio
 import logging
 import threading
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import asynccontextmanager, nullcontext, suppress
 from typing import Any
 
 from anyio import to_thread
 from fastapi import FastAPI
+from fastapi.concurrency import contextmanager_in_threadpool
 from fastapi.openapi.utils import get_openapi
 from pydantic.json_schema import models_json_schema
 
 from sceneprint import __version__
-from sceneprint.engine import Engine
 from sceneprint.engine.compilation import compile_kernels
+from sceneprint.engine.context import Context, open_context
+from sceneprint.engine.upkeep.purge import MemoryPurging
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
-from sceneprint.store.database_errors import open_patiently
+from sceneprint.store.database_errors import PATIENCE_S
 from sceneprint_client.api import (
     Diversity,
     Filter,
@@ -44,11 +46,10 @@ from sceneprint_client.api.results import KeepOptions
 from sceneprint_client.api.sessions import NewAssociation, NewDifference
 from sceneprint_client.api.surface import NewReconstruction
 from service import dashboard, problems, static_files
-from service.auth import Context, RefusalFilter
+from service.auth import RefusalFilter
 from service.browser_security import origins_of
-from service.event_stream import Feed
-from service.limits import Gate, RateLimits
-from service.metrics import Metrics, housekeeping
+from service.metrics import EVERY_S as SAMPLED_S
+from service.metrics import Metrics
 from service.middleware import RequestMiddleware
 from service.routes import (
     admin,
@@ -65,6 +66,7 @@ from service.routes import (
     sessions,
     surface,
 )
+from service.running_service import Service
 
 # The OpenAPI document: FastAPI's, and the records that only bodies of our own reading use.
 
@@ -128,8 +130,6 @@ ROUTERS = (
     reconstructions.router, jobs.router,
     jobs.events_router, admin.operations_router, admin.keys_router,
 )  # fmt: skip
-#: Uploads that are in hand at once, so that one wait for the disk is enough for all of them.
-UPLOADS = 12
 
 DESCRIPTION = """\
 Where have I seen this before? Upload depth frames or point clouds to a map, and ask where another
@@ -141,30 +141,58 @@ their sensor. Refusals are problem documents (RFC 9457) that say what happened, 
 
 
 @asynccontextmanager
-async def warming(engine: Engine) -> AsyncIterator[None]:
+async def warming(context: Context) -> AsyncIterator[None]:
     """Compile or load kernels and tables in the background, so that the service answers at once."""
     stop = threading.Event()
-    engine.signers.hold()
-    task = asyncio.create_task(to_thread.run_sync(_warm, engine, stop))
+    context.signers.hold()
+    task = asyncio.create_task(to_thread.run_sync(_warm, context, stop))
     try:
         yield
     finally:
         stop.set()
-        await task  # the engine must outlast it
+        await task  # the store must outlast it
 
 
-def _warm(engine: Engine, stop: threading.Event) -> None:
+def _warm(context: Context, stop: threading.Event) -> None:
     try:
-        compile_kernels(engine.settings.cache_dir, say=log.info, stop=stop)
+        compile_kernels(context.settings.cache_dir, say=log.info, stop=stop)
     finally:
-        engine.signers.release()
+        context.signers.release()
     if stop.is_set():
         return
-    engine.store.decoders.start()
+    context.store.decoders.start()
     try:
-        engine.warm()
+        context.signers.warm()
     except SceneprintError as error:  # the first requests load what they need, or say the same
         log.info("store unreachable", extra={"error": str(error)})
+
+
+@asynccontextmanager
+async def housekeeping(service: Service) -> AsyncIterator[None]:
+    """Write figures and uses of keys, and drop what is held of deleted frames, now and then."""
+    database, sampler = service.context.store.database, service.metrics.sampler
+    purging = MemoryPurging(service.context)
+
+    async def keep() -> None:
+        while True:
+            await asyncio.sleep(SAMPLED_S)
+            await to_thread.run_sync(sampler.flush, database)
+            try:
+                await to_thread.run_sync(purging.run)
+                await to_thread.run_sync(service.key_uses.write, database)
+            except SceneprintError as error:
+                log.info("store unreachable", extra={"error": str(error)})
+
+    task = asyncio.create_task(keep())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+        await to_thread.run_sync(sampler.flush, database)
+        with suppress(SceneprintError):  # of a store that is away
+            await to_thread.run_sync(service.key_uses.write, database)
 
 
 def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
@@ -179,31 +207,17 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        # it was there when the process began, and may have gone since
-        engine = await to_thread.run_sync(open_patiently, lambda: Engine(settings))
-        try:
-            gate = Gate(settings.concurrency, settings.waiting, settings.wait_s)
-            # they mostly wait for the disk: the engine sees to how many are decoded at once
-            uploads = Gate(
-                max(UPLOADS, settings.concurrency), settings.waiting, settings.wait_s,
-                max(settings.concurrency // 2, 1), rests=True,
-            )  # fmt: skip
-            places = settings.concurrency + settings.waiting
+        # its server was there when the process began, and may have gone since
+        opened = open_context(settings, PATIENCE_S)
+        async with contextmanager_in_threadpool(opened) as context:
+            service = Service(context, figures)
             # more than the requests of one tenant hold, so that others find a thread
-            to_thread.current_default_thread_limiter().total_tokens += places
-            feed = Feed(engine.store.database, settings.event_streams, settings.events_kept)
-            limits = RateLimits(settings.requests_per_s, settings.failed_keys_per_minute)
-            app.state.context = Context(
-                engine, gate, uploads, figures, settings.asks_for_keys, feed=feed, limits=limits,
-                places=places, wait_s=settings.wait_s,
-            )  # fmt: skip
-            loading = warming(engine) if warm else nullcontext()
-            app.state.refusals = RefusalFilter()
-            async with housekeeping(engine, figures.sampler), loading:
+            to_thread.current_default_thread_limiter().total_tokens += service.places
+            app.state.service, app.state.refusals = service, RefusalFilter()
+            loading = warming(context) if warm else nullcontext()
+            async with housekeeping(service), loading:
                 yield
-            feed.close()
-        finally:
-            await to_thread.run_sync(engine.close)
+            service.feed.close()
 
     # a path with a slash too many is not there: a redirection has no problem document, and would
     # lead whoever follows it, with a key, to where Host says, and behind a proxy away from TLS

@@ -1,6 +1,6 @@
 """Who asks, and what they may: one path for all routes.
 
-    request  --caller-->  Caller, with the Context of the service  --may_read | may_write-->  a map
+    request  --caller-->  Caller, with the Service  --may_read | may_write-->  a map
     refusal  --record_refusal-->  a line of the audit log
 
 What depends on nothing slow is asked in the event loop: a thread's turn comes late where many
@@ -16,35 +16,27 @@ import math
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from functools import partial, wraps
 from inspect import iscoroutinefunction
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any
 
-from anyio import CapacityLimiter, to_thread
+from anyio import to_thread
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi.routing import APIRoute
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.types import Scope as AsgiScope
 
-from sceneprint.engine import Engine
 from sceneprint.errors import Forbidden, KeyRequired, SceneprintError
-from sceneprint.process import NOBODY, Actor, current_tenant, set_actor, set_tenant
+from sceneprint.process import NOBODY, Actor, set_actor, set_tenant
 from sceneprint.store.maps import unknown_map
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api import Job, Page
 from sceneprint_client.api.admin import EVERY, SCOPES, Scope
-from service.event_stream import Feed
 from service.limits import (
     ROWS_PER_COST,
-    BodySpool,
-    Gate,
-    Holdings,
-    RateLimits,
-    SharedLooks,
     TokenBucket,
-    Turns,
     enforce_rate_limit,
     is_import,
     network_of,
@@ -54,7 +46,7 @@ from service.limits import (
     take_turn,
     too_many_requests,
 )
-from service.metrics import Metrics
+from service.running_service import Here, Service
 
 log = logging.getLogger(__name__)
 
@@ -71,83 +63,6 @@ def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> 
     least = SCOPES.index(scope)
     held = [grants[name] for name in (EVERY, map_name) if name in grants]
     return any(SCOPES.index(one) >= least for one in held)
-
-
-# What the routes share: the engine, the gates, the figures.
-
-T = TypeVar("T")
-
-#: Threads that look keys up, beside those that all other work shares.
-LOOKUPS = 4
-#: Turns of requests that work in shared threads, such as lists: they compete for one interpreter,
-#: so that one beside another tenant has one.
-READS, READS_BESIDE = 8, 1
-#: Maximum age of what `/readyz` says, seconds.
-READY_S = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Context:
-    """Of one running service.
-
-    Parameters
-    ----------
-    uploads : the gate of uploads and of edits of many frames, which wait for the disk and for other
-        writers: of their own, so that no query waits behind them
-    keys : whether callers must show one
-    feed : of events
-    limits : how often callers may ask
-    places : of requests that a tenant may have in progress three quarters of
-    wait_s : seconds to wait for a turn
-    requests : that tenants have in progress
-    reads : turns of requests that work in shared threads
-    spool : bodies that are kept on disk until they are read
-    lookups : threads that look keys up
-    looks : at the state of the service, shared by those who ask for it
-    """
-
-    engine: Engine
-    gate: Gate
-    uploads: Gate
-    metrics: Metrics
-    keys: bool
-    feed: Feed
-    limits: RateLimits
-    places: int
-    wait_s: float
-    requests: Holdings = field(default_factory=Holdings)
-    reads: Turns = field(default_factory=lambda: Turns(READS, READS_BESIDE, rests=True))
-    spool: BodySpool = field(default_factory=BodySpool)
-    lookups: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(LOOKUPS))
-    looks: SharedLooks = field(default_factory=lambda: SharedLooks(READY_S))
-
-    async def run(self, do: Callable[..., T], *given: object, patient: bool = False) -> T:
-        """Do it in a shared thread, when it is the tenant's turn; not while a turn is held.
-
-        Parameters
-        ----------
-        do, given : the work, and its arguments
-        patient : wait for as long as it takes
-
-        Raises
-        ------
-        Busy : its turn did not come in time; nothing was begun.
-        """
-        tenant = current_tenant()
-        if tenant == NOBODY:  # nobody to share with
-            return await to_thread.run_sync(do, *given)
-        held = await take_turn(self.reads, tenant, None if patient else self.wait_s)
-        try:
-            return await to_thread.run_sync(do, *given)
-        finally:
-            self.reads.release(tenant, held)
-
-
-async def _context(request: Request) -> Context:
-    return cast(Context, request.app.state.context)
-
-
-Here = Annotated[Context, Depends(_context)]
 
 
 # Who asks, and what they may.
@@ -255,7 +170,7 @@ async def caller(
             raise KeyRequired(_why(request, here))
         set_actor(Actor("", address_of(request) or None))
         return anybody()
-    key = await to_thread.run_sync(here.engine.find_key, given.credentials, limiter=here.lookups)
+    key = await to_thread.run_sync(here.find_key, given.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_REFUSED_KEY)
@@ -267,7 +182,7 @@ async def caller(
     )
 
 
-async def _admit(request: Request, here: Context, tenant: str) -> None:
+async def _admit(request: Request, here: Service, tenant: str) -> None:
     """Count a request for its tenant, before its body is read, until it is answered."""
     set_tenant(tenant)
     enforce_rate_limit(request, here.limits.requests, tenant, request_cost(request))
@@ -293,7 +208,7 @@ def release_place(request: Request) -> None:
         place()
 
 
-async def hold_read(request: Request, here: Context, tenant: str) -> None:
+async def hold_read(request: Request, here: Service, tenant: str) -> None:
     """Wait for a turn of the shared threads, held until the answer begins; Busy.
 
     Parameters
@@ -495,13 +410,13 @@ async def record_refusal(scope: AsgiScope, status: int) -> None:
     data["operation"] = getattr(scope.get("route"), "name", None) or "request"
     if missed:
         data["not_noted_before"] = missed
-    context: Context = scope["app"].state.context
+    service: Service = scope["app"].state.service
     write = partial(
-        context.engine.audit.record_refusal, actor, state.get("tenant", NOBODY),
+        service.audit.record_refusal, actor, state.get("tenant", NOBODY),
         path.get("map_name"), targets[-1] if targets else None, state["request_id"], **data,
     )  # fmt: skip
     try:
         # however long its turn takes: who asks much must not get rid of what is noted
-        await context.run(write, patient=True)
+        await service.run(write, patient=True)
     except SceneprintError as error:
         log.error("audit entry not written", extra={"action": "refused", "error": str(error)})

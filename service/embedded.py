@@ -22,7 +22,9 @@ import httpx
 from starlette.types import Message, Scope
 from threadpoolctl import threadpool_limits
 
-from sceneprint.engine import Engine
+from sceneprint.engine.context import Context
+from sceneprint.engine.jobs.job_runner import JobRunner
+from sceneprint.engine.upkeep.housekeeping import Housekeeping
 from sceneprint.settings import Settings
 from service.app import create_app
 
@@ -74,11 +76,12 @@ class LocalService(httpx.BaseTransport):
         self._jobs = itertools.count(1)
         # this thread computes as well as those of the service: sums have one order everywhere
         self._limits = threadpool_limits(1)
-        opened: Future[Engine] = Future()
+        opened: Future[Context] = Future()
         self._thread = threading.Thread(target=self._serve, args=(opened,), name=self._name)
         self._thread.start()
         try:
-            self._engine = opened.result()
+            context = opened.result()
+            self._runner, self._housekeeping = JobRunner(context), Housekeeping(context)
         except BaseException:
             self.close()
             raise
@@ -103,17 +106,17 @@ class LocalService(httpx.BaseTransport):
 
     def work(self, pause_s: float) -> None:
         """Do a job, or wait so long where there is none to do."""
-        claimed = self._engine.claim(self._name)
+        claimed = self._runner.claim(self._name)
         if claimed is None:
             time.sleep(pause_s)
             return
         try:
-            self._engine.run(claimed)
+            self._runner.run(claimed)
         except BaseException:  # such as Ctrl-C: another need not wait for the lease to run out
-            self._engine.put_back(claimed)
+            self._runner.put_back(claimed)
             raise
         if next(self._jobs) % _UPKEEP == 0:
-            self._engine.publish_due()
+            self._housekeeping.run()
 
     def close(self) -> None:
         """End all requests, and give back what was opened."""
@@ -122,14 +125,14 @@ class LocalService(httpx.BaseTransport):
         self._thread.join()
         self._limits.restore_original_limits()
 
-    def _serve(self, opened: Future[Engine]) -> None:
+    def _serve(self, opened: Future[Context]) -> None:
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
             runner.run(self._live(opened))
 
-    async def _live(self, opened: Future[Engine]) -> None:
+    async def _live(self, opened: Future[Context]) -> None:
         try:
             async with self._app.router.lifespan_context(self._app):
-                opened.set_result(self._app.state.context.engine)
+                opened.set_result(self._app.state.service.context)
                 while not self._stop.is_set() and threading.main_thread().is_alive():
                     with suppress(TimeoutError):
                         await asyncio.wait_for(self._stop.wait(), _LOOK_S)

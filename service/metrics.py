@@ -6,22 +6,18 @@ store (frames, jobs, indexes, disk) is the same in each of them.
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import platform
 import socket
 import threading
 from collections import Counter as Tally
-from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Mapping
 from typing import Any
 
-from anyio import to_thread
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from sceneprint import __version__
-from sceneprint.engine import Engine
 from sceneprint.engine.admin.statistics import SERVICE, Figures
 from sceneprint.errors import SceneprintError
 from sceneprint.process import NOBODY, Latencies
@@ -85,32 +81,6 @@ class Sampler:
             log.info("metrics sample not stored", extra={"error": str(error)})
             return False
         return True
-
-
-@asynccontextmanager
-async def housekeeping(engine: Engine, sampler: Sampler) -> AsyncIterator[None]:
-    """What a service does now and then, as long as it lasts; and once more at its end."""
-    task = asyncio.create_task(_keep(engine, sampler))
-    try:
-        yield
-    finally:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-        await to_thread.run_sync(sampler.flush, engine.store.database)
-        with suppress(SceneprintError):  # of a store that is away
-            await to_thread.run_sync(engine.key_uses.write, engine.store.database)
-
-
-async def _keep(engine: Engine, sampler: Sampler) -> None:
-    while True:
-        await asyncio.sleep(EVERY_S)
-        await to_thread.run_sync(sampler.flush, engine.store.database)
-        try:
-            await to_thread.run_sync(engine.forget_gone)
-            await to_thread.run_sync(engine.key_uses.write, engine.store.database)
-        except SceneprintError as error:
-            log.info("store unreachable", extra={"error": str(error)})
 
 
 EVENTS = "/v1/events"

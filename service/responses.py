@@ -14,8 +14,8 @@ from starlette.background import BackgroundTask
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.errors import DamagedBlob, InvalidRequest
 from sceneprint.store.queue import JobFile
-from service.auth import Context
 from service.problems import declared, problem
+from service.running_service import Service
 
 # What a request asks of a representation: its type, and whether it is still the one it knows.
 #
@@ -95,7 +95,7 @@ def file_responses(
     return {200: done, 304: known, **declared(*statuses)}
 
 
-async def look(here: Context, find: Callable[[], Output[T]]) -> Output[T]:
+async def look(here: Service, find: Callable[[], Output[T]]) -> Output[T]:
     """Look for it in a thread."""
     return await here.run(find)
 
@@ -106,7 +106,7 @@ def tagged(output: Output[Any]) -> dict[str, str]:
 
 
 async def sent(
-    request: Request, here: Context, output: Output[bytes], kind: str,
+    request: Request, here: Service, output: Output[bytes], kind: str,
     name: str | None = None, **headers: str,
 ) -> Response:  # fmt: skip
     """An output; made only where the caller does not have it yet, and when it is its turn."""
@@ -199,7 +199,7 @@ def send_file(
 
 
 def send_product_file(
-    request: Request, here: Context, find: Callable[[], JobFile], name: str
+    request: Request, here: Service, find: Callable[[], JobFile], name: str
 ) -> Response:
     """Return a file that a job has made, or the range that the request names; see `send_file`.
 
@@ -212,7 +212,7 @@ def send_product_file(
     ------
     DamagedBlob : its bytes are lost.
     """
-    file, blobs = find(), here.engine.store.blobs
+    file, blobs = find(), here.context.store.blobs
     if is_known(request, file.blob) or blobs.condition(file.blob) == "sound":
         with suppress(FileNotFoundError):
             return send_file(

@@ -440,7 +440,7 @@ def _load(settings: Settings) -> FastAPI:
 
 def _close_feed(front: Front) -> None:
     if front.app is not None:
-        front.app.state.context.feed.close()
+        front.app.state.service.feed.close()
 
 
 class _Server(uvicorn.Server):

@@ -13,10 +13,10 @@ import pytest
 
 from benchmarks.postgres import Server, binaries, of_nobody
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
+from tests.whole_engine import Engine
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "deployment.md").read_text()
 #: Folders that commands of the product run from, and that of PostgreSQL's.
@@ -101,7 +101,7 @@ def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> N
         run(backup, SCENEPRINT_DATABASE_URL=url)
         run(back, SCENEPRINT_DATABASE_URL=url, FOLDER=str(tmp_path / "again"))
         with Engine(Settings(data_dir=tmp_path / "again")) as engine:
-            assert [one.name for one in engine.list_maps().items] == ["building"]
+            assert [one.name for one in engine.list_maps()] == ["building"]
             assert [one.name for one in list_keys(engine.store).items] == ["operator", "robot-7"]
     finally:
         run(f"pg_ctl stop --mode immediate --silent --pgdata {standby_data}")

@@ -6,7 +6,7 @@ import sys
 
 from pydantic import ValidationError
 
-from sceneprint.engine.engine import open_engine
+from sceneprint.engine.context import require_writable
 from sceneprint.errors import SceneprintError
 from sceneprint.process import log_as_json
 from sceneprint.settings import Settings
@@ -18,8 +18,7 @@ def main() -> int:
     log_as_json()
     try:
         settings = Settings()
-        with open_engine(settings) as engine:  # what is wrong is said once, and not by every worker
-            engine.store.database.require_writable()
+        require_writable(settings)  # what is wrong is said once, and not by every worker
         run(settings)
     except (SceneprintError, ValidationError) as error:
         print(f"worker: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201

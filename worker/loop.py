@@ -11,13 +11,15 @@ import random
 import time
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing.reduction import DupFd
 from typing import Any
 
-from sceneprint.engine import Engine
-from sceneprint.engine.engine import open_engine
+from sceneprint.engine.admin.statistics import record_start
+from sceneprint.engine.context import Context, open_context
+from sceneprint.engine.jobs.job_runner import JobRunner
+from sceneprint.engine.upkeep.housekeeping import Housekeeping
 from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
 from sceneprint.maintenance.scrub import Scrub
 from sceneprint.process import (
@@ -66,15 +68,16 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         stop.wait(seconds)
         return not stop.asked and os.getppid() == parent
 
-    try:  # without an end: its place would be given to another that waits
-        opened = open_engine(settings, math.inf, may_go_on)
-    except StoreAway:
-        return
-    with opened as engine, engine.bell.listen() as listener:
-        engine.warm()
+    with ExitStack() as stack:
+        try:  # without an end: its place would be given to another that waits
+            context = stack.enter_context(open_context(settings, math.inf, may_go_on))
+        except StoreAway:
+            return
+        listener = stack.enter_context(context.bell.listen())
+        context.signers.warm()
         limit_memory(settings.worker_bytes)
-        worker = Worker(engine, listener, trace, stop)
-        engine.operations.statistics.began(worker.name)
+        worker = Worker(context, listener, trace, stop)
+        record_start(context.store, worker.name)
         log.info("worker ready", extra={"worker": worker.name})
         while not (stop.asked or worker.unsound) and os.getppid() == parent:
             worker.turn()
@@ -89,13 +92,17 @@ class Worker:
 
     Parameters
     ----------
-    engine, trace, stop : see there
-    listener : of the engine's bell
+    context, trace, stop : see there
+    listener : of the bell
     """
 
-    def __init__(self, engine: Engine, listener: Listening, trace: Trace, stop: StopSignal) -> None:
-        self._engine, self._listener, self._trace, self._stop = engine, listener, trace, stop
-        self._scrub = Scrub(engine.settings, engine.store)
+    def __init__(
+        self, context: Context, listener: Listening, trace: Trace, stop: StopSignal
+    ) -> None:
+        self._job_s = context.settings.job_s
+        self._jobs, self._housekeeping = JobRunner(context), Housekeeping(context)
+        self._scrub = Scrub(context.settings, context.store)
+        self._listener, self._trace, self._stop = listener, trace, stop
         self.name = process_name()
         self.unsound = False  # an error came that nobody raised on purpose
         # frames first: where publishing kills every worker, each still signs for a while
@@ -120,20 +127,19 @@ class Worker:
 
     def _work(self) -> bool:
         """Do a job; whether there was one."""
-        claimed = self._engine.claim(self.name)
+        claimed = self._jobs.claim(self.name)
         if claimed is None:
             return False
         if self._stop.asked:
-            self._engine.put_back(claimed)
+            self._jobs.put_back(claimed)
             return True
         held = claimed.job
         asked = held.data or {}
-        seconds = self._engine.settings.job_s
         with (
             of_request(asked.get("request_id")),
-            self._trace.job(held.id, held.token, seconds),
+            self._trace.job(held.id, held.token, self._job_s),
         ):
-            self._engine.run(claimed, self._break)
+            self._jobs.run(claimed, self._break)
         return True
 
     def _break(self) -> None:
@@ -150,7 +156,7 @@ class Worker:
             return not rung
 
         try:
-            self._engine.publish_due()
+            self._housekeeping.run()
             self._scrub.run(is_quiet)
         except MemoryError:  # the next process would have no more
             log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_BYTES")
@@ -159,7 +165,7 @@ class Worker:
 
     def _pause(self) -> float:
         """Seconds until there may be something to do, if nobody rings."""
-        due_s = self._engine.due_in_s()
+        due_s = self._jobs.due_in_s()
         left = LONGEST_S if due_s is None else min(due_s, LONGEST_S)
         left = min(left, self._upkeep_at - time.monotonic())
         return max(left, SHORTEST_S * random.uniform(1, 2))  # not all workers at the same moment

@@ -9,15 +9,15 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from types import FrameType
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import worker_died
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
+from sceneprint.store import open_store
 from worker.loop import Left, Trace, work
 
 log = logging.getLogger(__name__)
@@ -133,8 +133,9 @@ class Supervisor:
         counts = -code not in _FROM_OUTSIDE
         text = left.text or "It left no traceback."
         try:
-            with Engine(self._settings) as engine:
-                worker_died(engine.store, left.job_id, left.token, error, text, counts=counts)
+            store = open_store(self._settings.database, self._settings.blobs)
+            with closing(store):
+                worker_died(store, left.job_id, left.token, error, text, counts=counts)
         except SceneprintError as trouble:  # its lease will end it
             log.error("store unreachable", extra={"error": str(trouble)})
 

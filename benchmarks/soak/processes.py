@@ -37,11 +37,14 @@ DISK_BYTES = 384 << 20
 #: Creates a key that may do everything.
 _CREATE_KEY = """
 import sys
-from sceneprint.engine import Engine
+from contextlib import closing
+from sceneprint.engine.admin.operations import create_key
 from sceneprint.settings import Settings
+from sceneprint.store import open_store
 
-with Engine(Settings(data_dir=sys.argv[1])) as engine:
-    print(engine.create_key("operator").secret)
+settings = Settings(data_dir=sys.argv[1])
+with closing(open_store(settings.database, settings.blobs)) as store:
+    print(create_key(store, "operator").secret)
 """
 
 

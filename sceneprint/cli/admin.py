@@ -13,14 +13,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sceneprint.cli import duration, whole_number
-from sceneprint.cli.options import add_data_option, existing_store, settings_of
+from sceneprint.cli.options import (
+    add_data_option,
+    existing_store,
+    open_command_store,
+    settings_of,
+)
 from sceneprint.cli.output import count_of, one_line, print_error
 from sceneprint.errors import InvalidRequest
 from sceneprint.process import COMMAND, acting_as
 from sceneprint_client.api.admin import EVERY, SCOPES
 
 if TYPE_CHECKING:
-    from sceneprint.engine import Engine
+    from sceneprint.engine.admin.operations import Audit
+    from sceneprint.store import Store
     from sceneprint.store.audit_log import AuditFilter
     from sceneprint_client.api.admin import AuditLine, Key, MadeKey, Scope
 
@@ -77,8 +83,13 @@ def run_keys(options: argparse.Namespace) -> int:
     its hash is stored. The requests of a tenant's keys are limited together, and tenants take
     turns at the workers.
     """
-    from sceneprint.engine import Engine
-    from sceneprint.engine.admin.operations import create_tenant, delete_tenant
+    from sceneprint.engine.admin.operations import (
+        create_key,
+        create_tenant,
+        delete_tenant,
+        revoke_key,
+        rotate_key,
+    )
 
     own = ("scope", "map", "tenant", "expires")
     foreign = [name for name in own if getattr(options, name) is not None]
@@ -86,31 +97,31 @@ def run_keys(options: argparse.Namespace) -> int:
         raise InvalidRequest(f"--{foreign[0]} applies to a new key only. Use it with --create.")
     if options.overlap is not None and options.rotate is None:
         raise InvalidRequest("--overlap applies to a rotation only. Use it with --rotate.")
-    with acting_as(COMMAND), Engine(settings_of(options)) as engine:
+    with acting_as(COMMAND), open_command_store(settings_of(options)) as store:
         if options.list:
-            _print_keys(engine)
+            _print_keys(store)
         elif options.rotate is not None:
             overlap = timedelta(hours=1) if options.overlap is None else options.overlap
-            key = engine.rotate_key(options.rotate, overlap.total_seconds())
+            key = rotate_key(store, options.rotate, overlap.total_seconds())
             _print_secret(key)
             if key.previous_until is not None:
                 print_error(f"the old secret works until {key.previous_until:%Y-%m-%dT%H:%M:%SZ}")
         elif options.revoke is not None:
-            engine.revoke_key(options.revoke)
+            revoke_key(store, options.revoke)
             print(f"key {one_line(options.revoke)} is revoked")
         elif options.list_tenants:
-            _print_tenants(engine)
+            _print_tenants(store)
         elif options.delete_tenant is not None:
-            delete_tenant(engine.store, options.delete_tenant)
+            delete_tenant(store, options.delete_tenant)
             print(f"tenant {one_line(options.delete_tenant)} is deleted")
         elif options.create_tenant is not None:
-            create_tenant(engine.store, options.create_tenant)
+            create_tenant(store, options.create_tenant)
             print(f"tenant {one_line(options.create_tenant)} is created")
         else:
             scope: Scope = options.scope or "admin"
             grants = dict.fromkeys(options.map or [EVERY], scope)
             until = None if options.expires is None else datetime.now(UTC) + options.expires
-            _print_secret(engine.create_key(options.create, grants, until, options.tenant))
+            _print_secret(create_key(store, options.create, grants, until, options.tenant))
     return 0
 
 
@@ -119,13 +130,13 @@ def _print_secret(key: MadeKey) -> None:
     print_error("save this secret now: it is not stored and cannot be shown again")
 
 
-def _print_keys(engine: Engine) -> None:
+def _print_keys(store: Store) -> None:
     """Print all keys, and below which of them expire soon."""
     from sceneprint.engine.admin.operations import list_keys
 
     now, cursor, soon = datetime.now(UTC), None, []
     while True:
-        page = list_keys(engine.store, cursor, 1000)
+        page = list_keys(store, cursor, 1000)
         for key in page.items:
             print(_key_line(key))
             if key.expires_at is not None and now < key.expires_at <= now + SOON:
@@ -140,10 +151,10 @@ def _print_keys(engine: Engine) -> None:
         )
 
 
-def _print_tenants(engine: Engine) -> None:
+def _print_tenants(store: Store) -> None:
     from sceneprint.store.tenants import list_tenants
 
-    with engine.store.database.read() as connection:
+    with store.database.read() as connection:
         tenants = list_tenants(connection)
     for one in tenants:
         at = datetime.fromtimestamp(one.created_at, UTC)
@@ -207,29 +218,31 @@ def run_audit(options: argparse.Namespace) -> int:
     address, and the change or the refused request. With --format, export all entries, oldest
     first.
     """
-    from sceneprint.engine import Engine
+    from sceneprint.engine.admin.operations import Audit
     from sceneprint.store.audit_log import AuditFilter
 
     if options.output is not None and options.format is None:
         raise InvalidRequest("--output needs --format. Choose jsonl or syslog.")
     since = None if options.since is None else time.time() - options.since.total_seconds()
     wanted = AuditFilter(options.actor, options.map, options.action, since)
-    with Engine(existing_store(options)) as engine:
+    settings = existing_store(options)
+    with open_command_store(settings) as store:
+        audit = Audit(store, settings.audit_kept_days)
         if options.format is None:
-            for one in _newest(engine, wanted, options.limit):
+            for one in _newest(audit, wanted, options.limit):
                 print(_audit_line(one))
             return 0
         target = options.output
         with nullcontext(sys.stdout) if target is None else target.open("a") as file:
-            for one in engine.audit.lines(wanted):
+            for one in audit.lines(wanted):
                 print(_FORMATS[options.format](one), file=file)
     return 0
 
 
-def _newest(engine: Engine, wanted: AuditFilter, left: int) -> Iterator[AuditLine]:
+def _newest(audit: Audit, wanted: AuditFilter, left: int) -> Iterator[AuditLine]:
     cursor = None
     while left > 0:
-        page = engine.audit.page(wanted, cursor, min(left, 1000))
+        page = audit.page(wanted, cursor, min(left, 1000))
         yield from page.items
         cursor, left = page.next_cursor, left - len(page.items)
         if cursor is None:

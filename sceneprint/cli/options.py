@@ -7,7 +7,7 @@ import json
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from sceneprint_client.http import DEFAULT_URL
 
 if TYPE_CHECKING:
     from sceneprint.settings import Settings
+    from sceneprint.store import Store
     from sceneprint_client import Client
 
 # Which frames of a map a command searches.
@@ -256,7 +257,11 @@ def existing_store(options: argparse.Namespace) -> Settings:
     return settings
 
 
-# Services.
+def open_command_store(settings: Settings) -> AbstractContextManager[Store]:
+    """Open the store of some settings, and create it if it is missing."""
+    from sceneprint.store import open_store
+
+    return closing(open_store(settings.database, settings.blobs))
 
 
 def add_service_options(command: argparse.ArgumentParser) -> None:

@@ -99,15 +99,14 @@ def run_work(options: argparse.Namespace) -> int:
     """Run worker processes for a service that uses the same store."""
     from sceneprint.atomic_files import warn_if_public
     from sceneprint.cli.preparation import prepare_presets
-    from sceneprint.engine.engine import open_engine
+    from sceneprint.engine.context import require_writable
     from sceneprint.process import log_as_json
     from worker.supervisor import run as work
 
     settings = settings_of(options)
     log_as_json()  # from the first line on
     warn_if_public(settings.data_dir)
-    with open_engine(settings) as engine:  # what is wrong is said once, and not by every worker
-        engine.store.database.require_writable()
+    require_writable(settings)  # what is wrong is said once, and not by every worker
     prepare_presets(settings, logging.getLogger(__name__).info)
     work(settings)
     return 0

@@ -19,6 +19,7 @@ from sceneprint.cli.options import (
     ended_by_signals,
     existing_store,
     open_client,
+    open_command_store,
     settings_of,
 )
 from sceneprint.cli.output import one_line, print_error, progress_bar, waiting_reason
@@ -27,7 +28,7 @@ from sceneprint.process import COMMAND, acting_as
 
 if TYPE_CHECKING:
     from sceneprint.bundle.backup import Bundle
-    from sceneprint.engine import Engine
+    from sceneprint.engine.context import Context
     from sceneprint.maintenance.fsck.findings import Finding
     from sceneprint.settings import Settings
     from sceneprint.store import Database
@@ -53,7 +54,6 @@ def run_migrate(options: argparse.Namespace) -> int:
     of its own in a deployment. Where the schema is up to date it changes nothing. Exit code 2 if a
     later version wrote the database, or it cannot be reached.
     """
-    from sceneprint.engine import Engine
     from sceneprint.store.database import database_exists, reach_database
 
     settings = settings_of(options)
@@ -66,7 +66,8 @@ def run_migrate(options: argparse.Namespace) -> int:
         if options.check:
             print(shown if usable else f"{shown}; run `sceneprint migrate`")
             return 0 if usable else 1
-        Engine(settings).close()  # opening it creates or upgrades the schema
+        with open_command_store(settings):  # which creates or upgrades the schema
+            pass
         after, _ = _revisions(database)
     finally:
         database.close()
@@ -115,7 +116,7 @@ def run_fsck(options: argparse.Namespace) -> int:
     --repair would do. Changes nothing without --repair. The service may be running. Exit code 1 if
     problems remain, 2 if the folder cannot be checked.
     """
-    from sceneprint.engine import Engine
+    from sceneprint.engine.admin.operations import Audit
     from sceneprint.maintenance.fsck.check import fsck
     from sceneprint.maintenance.fsck.findings import GRACE_S
 
@@ -144,8 +145,9 @@ def run_fsck(options: argparse.Namespace) -> int:
             tqdm.write(_line(finding))
     repaired = sum(each.done is not None for each in findings)
     if repaired:
-        with acting_as(COMMAND), Engine(settings_of(options)) as engine:
-            engine.audit.record("store.repaired", options.map, repaired=repaired)
+        kept_days = settings_of(options).audit_kept_days
+        with acting_as(COMMAND), open_command_store(settings_of(options)) as store:
+            Audit(store, kept_days).record("store.repaired", options.map, repaired=repaired)
     if options.json is not None:
         record = {"checked": dict(counts), "findings": [_record(each) for each in findings]}
         write_whole(options.json, (json.dumps(record, indent=1) + "\n").encode())
@@ -185,17 +187,18 @@ def _record(finding: Finding) -> dict[str, object]:
 
 def _purge(options: argparse.Namespace) -> int:
     """Erase deleted frames; return 1 if the log of the database could not be emptied."""
-    from sceneprint.engine import Engine
+    from sceneprint.engine.context import open_context
+    from sceneprint.engine.upkeep.housekeeping import purging_of
 
     if not options.map is options.grace is options.json is None:
         raise InvalidRequest("--purge checks nothing. Give no other option than --data with it.")
-    with Engine(existing_store(options)) as engine:
-        found = engine.purging.now()
+    with open_context(existing_store(options)) as context:
+        found = purging_of(context).now()
         print(
             f"purged {found.blobs} blobs, {found.answers} stored answers, "
             f"{found.products} products; rebuilt {found.indexes} indexes"
         )
-        if not engine.store.database.shrink_log():
+        if not context.store.database.shrink_log():
             print("the database log is in use: run this again when nothing reads the database")
             return 1
     return 0
@@ -454,18 +457,19 @@ def run_reencode(options: argparse.Namespace) -> int:
     switches at once. Works on the data folder, also while a service runs on it. Run the same
     command again to retry failed frames.
     """
-    from sceneprint.engine import Engine
+    from sceneprint.engine.context import open_context
     from sceneprint.engine.maps import map_lifecycle
 
-    with acting_as(COMMAND), Engine(existing_store(options)) as engine:
+    with acting_as(COMMAND), open_context(existing_store(options)) as context:
+        store = context.store
         if options.model is not None:
-            now = engine.reencode(options.map, options.model)
+            now = map_lifecycle.begin_reencoding(store, context.bell, options.map, options.model)
         elif options.cancel:
-            now = map_lifecycle.cancel_reencoding(engine.store, options.map)
+            now = map_lifecycle.cancel_reencoding(store, options.map)
         else:
-            now = engine.get_map(options.map)
+            now = map_lifecycle.get_map(store, options.map)
         if options.wait and now.reencoding is not None:
-            return _wait(engine, now)
+            return _wait(context, now)
         _print_reencoding(now)
     return 0
 
@@ -488,15 +492,18 @@ def _print_reencoding(one: Map) -> None:
         )
 
 
-def _wait(engine: Engine, one: Map) -> int:
+def _wait(context: Context, one: Map) -> int:
     """Wait as long as frames are signed now and then; return 2 if they are not."""
+    from sceneprint.engine.admin.statistics import Statistics
+    from sceneprint.engine.maps.map_lifecycle import get_map
+
     coming = one.reencoding
     assert coming is not None
     last, since = -1, time.monotonic()
     with progress_bar(f"sign with {coming.model}") as progress:
         while True:
             looked = time.monotonic()
-            one = engine.get_map(one.name)
+            one = get_map(context.store, one.name)
             took = time.monotonic() - looked
             now = one.reencoding
             if now is None or now.model_id != coming.model_id:
@@ -511,7 +518,7 @@ def _wait(engine: Engine, one: Map) -> int:
             time.sleep(max(LOOK_S, 10 * took))
     _print_reencoding(one)
     if now is not None and now.model_id == coming.model_id and not now.dead:
-        stats = engine.operations.statistics.tell(minutes=1)
+        stats = Statistics(context).tell(minutes=1)
         reason = waiting_reason(stats, now.left)
         print_error(f"no progress for {STALL_S:.0f} s. {reason}")
     return 0 if one.model_id == coming.model_id else 2

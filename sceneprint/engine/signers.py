@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from contextlib import suppress
 from dataclasses import replace
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.errors import Busy, FrameError
+from sceneprint.errors import Busy, FrameError, ModelError
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.retrieval.ranking import distances, pairwise_distances
@@ -20,8 +21,11 @@ from sceneprint.index import Tail, search
 from sceneprint.models import Model, parse_model, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare, validate
 from sceneprint.store import Database
-from sceneprint.store.maps import model_content
+from sceneprint.store.maps import list_maps, model_content
+from sceneprint.store.reencoding_rows import models_of
 from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics, ReferenceSurface
+
+log = logging.getLogger(__name__)
 
 #: Seconds that a request waits for kernels that are being compiled.
 KERNELS_S = 20.0
@@ -88,6 +92,16 @@ class Signers:
             if model.id not in self._open:
                 self._open[model.id] = open_signer(model, self._cache_dir)
             return self._open[model.id]
+
+    def warm(self) -> None:
+        """Load code and tables of every model in use before a request needs them."""
+        with self.database.read() as connection:
+            used = {one for row in list_maps(connection) for one in models_of(row)}
+        for model_id in used:
+            try:
+                warm(self(model_id))
+            except ModelError as error:  # it costs the maps of this model, and no others
+                log.error("model unusable", extra={"model": model_id, "error": str(error)})
 
 
 # Loading all code and tables before the first request asks for them.

@@ -12,8 +12,8 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field
 
 from sceneprint import __version__
-from sceneprint.engine import Engine
 from sceneprint.engine.admin import operations
+from sceneprint.engine.context import Context
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.store.audit_log import AuditFilter
 from sceneprint.store.events import newest_number
@@ -28,9 +28,10 @@ from sceneprint_client.api.admin import (
     NewModel,
     Stats,
 )
-from service.auth import Asking, Guest, Here, administers, may_admin, reads_every, v1_router
+from service.auth import Asking, Guest, administers, may_admin, reads_every, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
+from service.running_service import Here
 
 router = APIRouter(tags=["operations"])
 
@@ -74,25 +75,25 @@ async def readyz(here: Here, asking: Guest) -> Readiness:
     being compiled, and for good once a later version has migrated the store. Requires no key. The
     answer is at most a second old.
     """
-    found = await here.looks.get("readiness", partial(_look, here.engine))
+    found = await here.looks.get("readiness", partial(_look, here.context))
     # who shows no key has nothing counted: that takes the longer the more there is
     if asking is None or not asking.reads_every:
         return found
-    frames, jobs = await here.looks.get("counts", here.engine.counts)
+    frames, jobs = await here.looks.get("counts", here.statistics.state_counts)
     return found.model_copy(update={"frames": frames, "jobs": jobs})
 
 
-def _look(engine: Engine) -> Readiness:
+def _look(context: Context) -> Readiness:
     """Check that the service can work; raises what it cannot do without."""
-    engine.signers.require_kernels(LOOK_S)
-    engine.store.blobs.check()
-    engine.store.database.require_schema()
-    with engine.store.database.read() as connection:
+    context.signers.require_kernels(LOOK_S)
+    context.store.blobs.check()
+    context.store.database.require_schema()
+    with context.store.database.read() as connection:
         newest_number(connection)
     return Readiness(
         status="ready",
         version=__version__,
-        read_only=engine.store.read_only,
+        read_only=context.store.read_only,
         frames=None,
         jobs=None,
     )
@@ -106,9 +107,9 @@ def _look(engine: Engine) -> Readiness:
 )
 def metrics(here: Here) -> Response:
     """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
-    figures = here.engine.operations.statistics.figures()
+    figures = here.statistics.figures()
     held, spool = here.requests.by_tenant(), here.spool.by_tenant()
-    text = here.metrics.text(figures, here.feed.streams, here.engine.query_log.lost, held, spool)
+    text = here.metrics.text(figures, here.feed.streams, here.context.query_log.lost, held, spool)
     return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 
@@ -130,7 +131,9 @@ Limit = Annotated[int, Query(ge=1, le=1000)]
 async def create_key(request: Request, here: Here, response: Response) -> MadeKey:
     """Make a key. Its secret is in this answer and nowhere else; a lost one is revoked."""
     new = await read_record(request, NewKey, "The key")
-    make = partial(here.engine.create_key, new.name, new.grants, new.expires_at, new.tenant)
+    make = partial(
+        operations.create_key, here.context.store, new.name, new.grants, new.expires_at, new.tenant
+    )
     made = await here.run(make)
     response.headers["Location"] = f"/v1/keys/{quote(made.name, safe='')}"
     return made
@@ -139,7 +142,7 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
 @keys_router.get("/keys", responses=declared(422), dependencies=[Depends(administers)])
 def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key]:
     """Keys by name, without their secrets."""
-    return operations.list_keys(here.engine.store, cursor, limit)
+    return operations.list_keys(here.context.store, cursor, limit)
 
 
 @keys_router.get("/keys/me", responses=declared())
@@ -174,7 +177,7 @@ def rotate_key(
 
     Rotated again within the overlap, the secret in use keeps its end, and the new one is replaced.
     """
-    return here.engine.rotate_key(key_name, overlap_s)
+    return operations.rotate_key(here.context.store, key_name, overlap_s)
 
 
 @keys_router.delete(
@@ -185,7 +188,7 @@ def rotate_key(
 )
 def revoke_key(key_name: Annotated[str, Path(description="Of the key.")], here: Here) -> None:
     """Let a key open nothing any more, from the next request on, on every machine of the store."""
-    here.engine.revoke_key(key_name)
+    operations.revoke_key(here.context.store, key_name)
 
 
 @keys_router.get("/audit", responses=declared(422), dependencies=[Depends(administers)])
@@ -208,7 +211,7 @@ def list_changes(
 
     Lines are kept for `SCENEPRINT_AUDIT_KEPT_DAYS`, and at most a million of each tenant.
     """
-    return here.engine.audit.page(AuditFilter(actor, map_name, action), cursor, limit)
+    return here.audit.page(AuditFilter(actor, map_name, action), cursor, limit)
 
 
 # How the service does, what maps can be signed with, and changing that.
@@ -231,13 +234,13 @@ def stats(
         asking.require_every("read")
     else:
         asking.require(map_name, "read")
-    return here.engine.operations.statistics.tell(minutes, map_name)
+    return here.statistics.tell(minutes, map_name)
 
 
 @operations_router.get("/models", responses=declared())
 def models(here: Here, asking: Asking) -> Page[ModelInfo]:
     """Models that a map can be signed with: those that ship, and those that maps have or had."""
-    found = here.engine.operations.catalogue.tell(lambda name: asking.may("read", name))
+    found = here.catalogue.tell(lambda name: asking.may("read", name))
     if not asking.reads_every:  # one that only other maps have tells of them
         found = [one for one in found if one.preset or one.maps]
     return Page[ModelInfo](items=found)
@@ -258,8 +261,12 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
     """
     wanted = await read_record(request, NewModel, "The model")
     may_read = None if asking.reads_every else partial(asking.may, "read")
-    find = here.engine.operations.catalogue.find
-    return await here.run(lambda: here.engine.reencode(map_name, find(wanted.model, may_read)))
+    find = here.catalogue.find
+    return await here.run(
+        lambda: map_lifecycle.begin_reencoding(
+            here.context.store, here.context.bell, map_name, find(wanted.model, may_read)
+        )
+    )
 
 
 @operations_router.delete(
@@ -269,4 +276,4 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
 )
 def cancel_reencoding(map_name: str, here: Here) -> Map:
     """Let a map keep the model that it has; what was made for the other is removed."""
-    return map_lifecycle.cancel_reencoding(here.engine.store, map_name)
+    return map_lifecycle.cancel_reencoding(here.context.store, map_name)

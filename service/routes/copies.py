@@ -7,9 +7,10 @@ from typing import Annotated, Any
 from fastapi import Path, Request, Response
 
 from sceneprint_client.api.copies import CopyRequest
-from service.auth import Here, may_read, v1_router
+from service.auth import may_read, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
+from service.running_service import Here
 
 router = v1_router("/maps/{map_name}/copy", "maps", may_read)
 
@@ -27,7 +28,7 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
     the bytes of the parts that the caller lacks, at most some 32 MB. Ask again for the others.
     """
     known = await read_record(request, CopyRequest, "The request")
-    return _response(await here.run(here.engine.copies.bundle, map_name, frozenset(known.have)))
+    return _response(await here.run(here.copies.bundle, map_name, frozenset(known.have)))
 
 
 @router.get(
@@ -37,13 +38,13 @@ def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
     """The geometry of an indexed frame, as validation compares it."""
-    return _response(here.engine.copies.artifact(map_name, digest))
+    return _response(here.copies.artifact(map_name, digest))
 
 
 @router.get("/model", response_class=Response, responses={**_BYTES, **declared(404)})
 def get_map_model(map_name: str, here: Here) -> Response:
     """The file of the map's model."""
-    return _response(here.engine.copies.model(map_name))
+    return _response(here.copies.model(map_name))
 
 
 def _response(data: bytes) -> Response:

@@ -28,7 +28,7 @@ from sceneprint_client.api.results import (
     View,
 )
 from sceneprint_client.formats import BYTES, HEAD, media_types_of
-from service.auth import Asking, Context, Here, may_read, v1_router
+from service.auth import Asking, may_read, v1_router
 from service.responses import (
     file_responses,
     files,
@@ -42,6 +42,7 @@ from service.responses import (
 )
 from service.routes.queries import require_readable
 from service.routes.results import MapName
+from service.running_service import Here, Service
 
 router = v1_router("/maps/{map_name}/frames/{frame_id}", "frames", may_read)
 
@@ -73,7 +74,7 @@ async def get_cloud(
     compares it; of a point cloud, a range image's about its viewpoint. The samples themselves are
     in the upload.
     """
-    found = await look(here, lambda: here.engine.outputs.cloud(map_name, frame_id, frame))
+    found = await look(here, lambda: here.outputs.cloud(map_name, frame_id, frame))
     return await sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
 
 
@@ -104,7 +105,7 @@ async def get_preview(
     width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
 ) -> Response:
     """A picture of a frame, for people."""
-    found = await look(here, lambda: here.engine.outputs.preview(map_name, frame_id, view, width))
+    found = await look(here, lambda: here.outputs.preview(map_name, frame_id, view, width))
     return await sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
 
 
@@ -115,7 +116,7 @@ async def get_preview(
 )
 async def get_patches(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The surface patches of a frame, by level, and those that validation compares."""
-    found = await look(here, lambda: here.engine.outputs.patches(map_name, frame_id))
+    found = await look(here, lambda: here.outputs.patches(map_name, frame_id))
     told = Output(found.tag, lambda: found.make().model_dump_json().encode())
     return await sent(request, here, told, JSON)
 
@@ -134,7 +135,7 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
     """The signature of a frame. Signatures of one model are compared by the sum of absolute
     differences of their bytes.
     """
-    outputs, kind = here.engine.outputs, preferred_media_type(request, (JSON, BYTES, NPY))
+    outputs, kind = here.outputs, preferred_media_type(request, (JSON, BYTES, NPY))
     if kind == JSON:
         made = await look(here, lambda: outputs.signature(map_name, frame_id))
         told = Output(made.tag, lambda: made.make().model_dump_json().encode())
@@ -150,16 +151,16 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""
-    found = await look(here, lambda: here.engine.outputs.upload(map_name, frame_id))
+    found = await look(here, lambda: here.outputs.upload(map_name, frame_id))
     if is_known(request, found.tag):
         return Response(None, 304, tagged(found))
     async with here.gate.place():
         return await here.gate.run(lambda: _upload(request, here, found, frame_id))
 
 
-def _upload(request: Request, here: Context, found: Output[bytes], frame_id: str) -> Response:
+def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str) -> Response:
     """An upload out of its file: of 70 MiB in memory each, a few slow readers would be too much."""
-    blobs, blob = here.engine.store.blobs, found.blob or ""
+    blobs, blob = here.context.store.blobs, found.blob or ""
     if blobs.condition(blob) == "sound":
         with suppress(FileNotFoundError):
             with blobs.open(blob) as file:
@@ -201,7 +202,7 @@ async def get_frame_points(
     limit: Limit = LIMIT,
 ) -> Response:
     """The points of `cloud.ply` in a third of its bytes, for a page to draw."""
-    clouds = here.engine.points
+    clouds = here.points
     found = await look(here, lambda: clouds.frame(map_name, frame_id, frame, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
@@ -221,7 +222,7 @@ async def get_query_points(
 ) -> Response:
     """The surface that a query saw, for a page to draw, in the query's sensor's frame."""
     await here.run(require_readable, query_id, here, asking)
-    found = await look(here, lambda: here.engine.points.query(query_id, limit))
+    found = await look(here, lambda: here.points.query(query_id, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
 
@@ -257,7 +258,7 @@ async def get_match_points(
     says how far it is from the surface that the other saw.
     """
     await here.run(require_readable, query_id, here, asking)
-    clouds = here.engine.points
+    clouds = here.points
     found = await look(
         here, lambda: clouds.match(query_id, frame_id, map_name, side, transform, limit)
     )

@@ -13,6 +13,7 @@ from pydantic_core import from_json
 
 from sceneprint.engine.ingest.archive_import import Receiver
 from sceneprint.engine.ingest.uploads import Upload
+from sceneprint.engine.maps import map_frames
 from sceneprint.errors import MalformedBody, UnsupportedType
 from sceneprint.store.queue import JobFile
 from sceneprint_client.api import Added, Frame, FrameState, Job, Page
@@ -30,7 +31,7 @@ from sceneprint_client.api.frames import (
 from sceneprint_client.api.listing import FramePage
 from sceneprint_client.formats import media_types_of
 from service import bodies
-from service.auth import Asking, Caller, Context, Here, may_read, may_write, v1_router
+from service.auth import Asking, Caller, may_read, may_write, v1_router
 from service.bodies import (
     FORM,
     FRAME_BODY,
@@ -44,6 +45,7 @@ from service.bodies import (
     uploaded,
 )
 from service.problems import declared
+from service.running_service import Here, Service
 
 router = v1_router("/maps/{map_name}/frames", "frames")
 
@@ -51,13 +53,13 @@ router = v1_router("/maps/{map_name}/frames", "frames")
 @router.get("", responses=declared(404, 422), dependencies=[Depends(may_read)])
 def list_frames(map_name: str, here: Here, wanted: Annotated[FramePage, Query()]) -> Page[Frame]:
     """Frames in the order they came; deleted ones only with `state=deleted`."""
-    return here.engine.list_frames(map_name, wanted.cursor, wanted.limit, wanted=wanted)
+    return map_frames.list_frames(here.context.store, map_name, wanted, wanted.cursor, wanted.limit)
 
 
 @router.get("/{frame_id}", responses=declared(404), dependencies=[Depends(may_read)])
 def get_frame(map_name: str, frame_id: str, here: Here, response: Response) -> Frame:
     """A frame, and what has become of it. Its ETag stands for what PATCH can change of it."""
-    frame = here.engine.get_frame(map_name, frame_id)
+    frame = map_frames.get_frame(here.context.store, map_name, frame_id)
     response.headers["ETag"] = f'"{frame.etag}"'
     return frame
 
@@ -70,7 +72,7 @@ def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
 
     Ten minutes by default, POST /v1/maps/{map_name}/frames/{frame_id}/restore undoes it.
     """
-    here.engine.delete_frame(map_name, frame_id)
+    here.tombstones.delete_frame(map_name, frame_id)
 
 
 # Frames on their way into a map: one, one under an id of the caller's, or many.
@@ -205,27 +207,27 @@ async def add_batch(
 
     All that are taken are taken in one commit: where the whole is refused, none was.
     """
-    async with here.uploads.place(), frames_of(request, "priority", "if_novel") as batch:
+    async with here.upload_gate.place(), frames_of(request, "priority", "if_novel") as batch:
 
         def take() -> tuple[Batch, bool]:
             uploads = batch.read()
             said = [(one.data, one.meta) for one in uploads]
             parts = ("batch", map_name, said, batch.priority, batch.if_novel, batch.faults())
             once = guarded(asking, key, *parts)
-            outcomes, replayed = here.engine.uploads.add_all(map_name, uploads, once)
+            outcomes, replayed = here.uploads.add_all(map_name, uploads, once)
             return upload_responses(batch, outcomes), replayed
 
-        answer, replayed = await here.uploads.run(take)
+        answer, replayed = await here.upload_gate.run(take)
     mark_replayed(response, replayed=replayed)
     return answer
 
 
 async def _taken(
-    map_name: str, frame_id: str | None, request: Request, here: Context, asking: Caller,
+    map_name: str, frame_id: str | None, request: Request, here: Service, asking: Caller,
     response: Response, prefer: str | None, key: str | None,
 ) -> Added:  # fmt: skip
     options = ("priority", "if_novel")
-    async with here.uploads.place(), uploaded(request, *options) as form:
+    async with here.upload_gate.place(), uploaded(request, *options) as form:
         priority = priority_of(form.fields)
         if_novel = novelty_of(form.fields.get("if_novel"))
 
@@ -233,10 +235,10 @@ async def _taken(
             upload = Upload(form.file.read(), form.meta, priority, if_novel, frame_id)
             parts = ("frame", map_name, upload.data, form.meta, priority, if_novel)
             once = guarded(asking, key, *parts)
-            outcome, replayed = here.engine.uploads.add(map_name, upload, once)
+            outcome, replayed = here.uploads.add(map_name, upload, once)
             return outcome.taken, outcome.new, replayed
 
-        added, is_new, replayed = await here.uploads.run(take)
+        added, is_new, replayed = await here.upload_gate.run(take)
     mark_replayed(response, replayed=replayed)
     response.headers["Location"] = f"/v1/jobs/{added.job_id}"
     wait_s = _wait(prefer)
@@ -255,7 +257,7 @@ def _wait(prefer: str | None) -> float:
 
 
 async def _settled(
-    request: Request, here: Context, map_name: str, added: Added, wait_s: float
+    request: Request, here: Service, map_name: str, added: Added, wait_s: float
 ) -> Added:
     """The frame once nothing more will happen to it, or as it is after the wait.
 
@@ -268,7 +270,7 @@ async def _settled(
             break
         await anyio.sleep(min(pause, left))  # holds no thread meanwhile
         pause = min(pause * GROWTH, LONGEST_PAUSE_S)
-        frame = await here.run(here.engine.get_frame, map_name, added.frame_id)
+        frame = await here.run(map_frames.get_frame, here.context.store, map_name, added.frame_id)
         added = added.model_copy(update={"state": frame.state, "reason": frame.reason})
     return added
 
@@ -348,12 +350,12 @@ async def add_import(
             f"{', '.join(TYPES)}."
         )
     options = _options(request)
-    receiving = contextmanager_in_threadpool(here.engine.imports.receive(map_name, options))
-    async with here.uploads.place(), receiving as receiver:
+    receiving = contextmanager_in_threadpool(here.imports.receive(map_name, options))
+    async with here.upload_gate.place(), receiving as receiver:
         archive = await _received(receiver, request, here)
         once = guarded(asking, key, "import", map_name, archive.blob, options)
-        job, replayed = await here.uploads.run(
-            lambda: here.engine.imports.begin(map_name, archive, options, once), patient=True
+        job, replayed = await here.upload_gate.run(
+            lambda: here.imports.begin(map_name, archive, options, once), patient=True
         )
     mark_replayed(response, replayed=replayed)
     response.headers["Location"] = f"/v1/jobs/{job.job_id}"
@@ -373,10 +375,10 @@ def list_import_items(
     """What came of each frame of the archive so far, and of members that are none; or of each view
     of a map.
     """
-    return here.engine.imports.items(map_name, job_id, cursor, limit)
+    return here.imports.items(map_name, job_id, cursor, limit)
 
 
-async def _received(receiver: Receiver, request: Request, here: Context) -> JobFile:
+async def _received(receiver: Receiver, request: Request, here: Service) -> JobFile:
     """Store the archive durably as it comes."""
     waiting = bytearray()
     async for chunk in request.stream():
@@ -389,11 +391,11 @@ async def _received(receiver: Receiver, request: Request, here: Context) -> JobF
         receiver.write(bytes(waiting))
         return receiver.end()
 
-    return await here.uploads.run(end, patient=True)
+    return await here.upload_gate.run(end, patient=True)
 
 
-async def _written(here: Context, receiver: Receiver, data: bytes) -> None:
-    await here.uploads.run(lambda: receiver.write(data), patient=True)
+async def _written(here: Service, receiver: Receiver, data: bytes) -> None:
+    await here.upload_gate.run(lambda: receiver.write(data), patient=True)
 
 
 def _options(request: Request) -> ImportOptions:

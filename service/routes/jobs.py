@@ -14,22 +14,15 @@ from fastapi import Header, Query, Request, Response
 
 from sceneprint.engine.admin.operations import MOST_KINDS, event_record
 from sceneprint.engine.jobs import lifecycle
+from sceneprint.engine.maps.map_lifecycle import get_map, get_maps
 from sceneprint.store.events import EventFilter
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage, RetriedJobs
-from service.auth import (
-    Asking,
-    Caller,
-    Context,
-    Here,
-    hold_read,
-    page_response,
-    release_place,
-    v1_router,
-)
+from service.auth import Asking, Caller, hold_read, page_response, release_place, v1_router
 from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import declared
+from service.running_service import Here, Service
 
 router = v1_router("/jobs", "jobs")
 
@@ -54,11 +47,11 @@ def list_jobs(
     names = asking.named
     if map_name is not None:
         asking.require(map_name, "read")
-        here.engine.get_map(map_name)
+        get_map(here.context.store, map_name)
         names = (map_name,)
     elif names is None and not asking.may("admin"):
-        names = tuple(one.name for one in here.engine.list_maps().items)
-    return lifecycle.list_jobs(here.engine.store, state, cursor, limit, kind, names)
+        names = tuple(one.name for one in get_maps(here.context.store))
+    return lifecycle.list_jobs(here.context.store, state, cursor, limit, kind, names)
 
 
 @router.post("/retry", responses=declared(404, 422))
@@ -75,26 +68,26 @@ def retry_dead_jobs(
     """
     if map_name is not None:
         asking.require(map_name, "write")
-        here.engine.get_map(map_name)
+        get_map(here.context.store, map_name)
         names: tuple[str, ...] | None = (map_name,)
     else:
         asking.require_every("write")
-        every = None if asking.may("admin") else here.engine.list_maps().items
+        every = None if asking.may("admin") else get_maps(here.context.store)
         names = None if every is None else tuple(one.name for one in every)
-    return here.engine.retry_dead_jobs(cursor, limit, names)
+    return lifecycle.retry_dead(here.context.store, here.context.bell, cursor, limit, names)
 
 
 @router.get("/{job_id}", responses=declared(404))
 def get_job(job_id: str, here: Here, asking: Asking) -> Job:
     """What has become of a job."""
-    return asking.require_job(here.engine.get_job(job_id))
+    return asking.require_job(lifecycle.get_job(here.context.store, job_id))
 
 
 @router.post("/{job_id}/cancel", responses=declared(404, 409))
 def cancel_job(job_id: str, here: Here, asking: Asking) -> Job:
     """Give up a job that is not over; its frame is `failed` then. Asked twice, it stays so."""
-    asking.require_job(here.engine.get_job(job_id), "write")
-    return lifecycle.cancel(here.engine.store, job_id)
+    asking.require_job(lifecycle.get_job(here.context.store, job_id), "write")
+    return lifecycle.cancel(here.context.store, job_id)
 
 
 @router.post(
@@ -109,8 +102,8 @@ def retry_job(job_id: str, here: Here, asking: Asking, response: Response) -> Jo
     """Try again what was given up (dead, cancelled or failed): a frame in a new job, a long job
     as itself, from where it stood.
     """
-    asking.require_job(here.engine.get_job(job_id), "write")
-    job, is_new = here.engine.retry_job(job_id)
+    asking.require_job(lifecycle.get_job(here.context.store, job_id), "write")
+    job, is_new = lifecycle.retry(here.context.store, here.context.bell, job_id)
     response.headers["Location"] = f"/v1/jobs/{job.job_id}"
     response.status_code = 202 if is_new else 200
     return job
@@ -172,7 +165,7 @@ async def events(
 
     With a key, events of the maps that it may read; those of no map are for admins of all.
     """
-    seals, place = here.engine.store.seals, "after" if last_event_id is None else "Last-Event-ID"
+    seals, place = here.context.store.seals, "after" if last_event_id is None else "Last-Event-ID"
     last = after if last_event_id is None else last_event_id
 
     def asked() -> tuple[EventFilter, int | None]:
@@ -191,7 +184,7 @@ async def events(
 
     def page() -> Response:
         return page_response(
-            here.engine.operations.events(
+            here.events.page(
                 wanted, after=last, cursor=cursor, limit=limit, newest_first=newest_first
             )
         )
@@ -199,10 +192,10 @@ async def events(
     return await to_thread.run_sync(page)
 
 
-def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str]) -> EventFilter:
+def _wanted(here: Service, asking: Caller, map_name: str | None, kinds: list[str]) -> EventFilter:
     if map_name is not None:
         asking.require(map_name, "read")
-    wanted = here.engine.operations.wanted(map_name, kinds)
+    wanted = here.events.wanted(map_name, kinds)
     if not asking.reads_every:
         wanted = replace(wanted, since=asking.created_at)
     if map_name is not None or asking.may("admin"):
@@ -212,14 +205,14 @@ def _wanted(here: Context, asking: Caller, map_name: str | None, kinds: list[str
     return replace(wanted, of_maps=True)
 
 
-def _still(request: Request, here: Context, asking: Caller) -> Callable[[], bool]:
+def _still(request: Request, here: Service, asking: Caller) -> Callable[[], bool]:
     """Asks whether the key that was shown still opens what it did."""
     secret = request.headers.get("authorization", "").partition(" ")[2].strip()
 
     def ask() -> bool:
         if not asking.name:
             return True  # none was asked for
-        key = here.engine.find_key(secret)
+        key = here.find_key(secret)
         lasts = key is not None and (key.expires_at is None or key.expires_at > time.time())
         return key is not None and lasts and dict(key.grants) == dict(asking.grants)
 

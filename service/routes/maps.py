@@ -7,13 +7,15 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request, Response
 
+from sceneprint.engine.maps import map_lifecycle
 from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS
-from service.auth import Asking, Here, may_admin, may_read, may_write, v1_router
+from service.auth import Asking, may_admin, may_read, may_write, v1_router
 from service.bodies import json_body, read_json_object, read_record
 from service.problems import declared
 from service.responses import expected
+from service.running_service import Here
 
 router = v1_router("/maps", "maps")
 
@@ -30,7 +32,7 @@ async def create_map(request: Request, here: Here, asking: Asking, response: Res
     asking.require_new(new.name)
     if OPERATORS & new.model_fields_set:
         asking.require_every("admin")
-    made, is_new = await here.run(here.engine.create_map, new)
+    made, is_new = await here.run(map_lifecycle.create_map, here.context.store, new)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/maps/{made.name}"
     return made
@@ -39,14 +41,14 @@ async def create_map(request: Request, here: Here, asking: Asking, response: Res
 @router.get("", responses=declared())
 def list_maps(here: Here, asking: Asking) -> Page[Map]:
     """All maps by name; those that the key may read."""
-    found = here.engine.list_maps().items
+    found = map_lifecycle.get_maps(here.context.store)
     return Page[Map](items=[one for one in found if asking.may("read", one.name)])
 
 
 @router.get("/{map_name}", responses=declared(404), dependencies=[Depends(may_read)])
 def get_map(map_name: str, here: Here, response: Response) -> Map:
     """A map, with how many frames are in each state. Its ETag stands for what PATCH can change."""
-    found = here.engine.get_map(map_name)
+    found = map_lifecycle.get_map(here.context.store, map_name)
     response.headers["ETag"] = f'"{found.etag}"'
     return found
 
@@ -56,7 +58,7 @@ def get_map(map_name: str, here: Here, response: Response) -> Map:
 )
 def delete_map(map_name: str, here: Here) -> None:
     """Remove a map with all that is in it, for good."""
-    here.engine.delete_map(map_name)
+    map_lifecycle.delete_map(here.context, map_name)
 
 
 # Metadata of frames and maps, edited.
@@ -103,7 +105,7 @@ async def patch_frame(
 ) -> Frame:
     """Change the metadata of a frame (JSON merge patch, RFC 7396); filters see it at once."""
     patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
-    frame = await here.run(edit_frame, here.engine.store, map_name, frame_id, patch, tags)
+    frame = await here.run(edit_frame, here.context.store, map_name, frame_id, patch, tags)
     response.headers["ETag"] = f'"{frame.etag}"'
     return frame
 
@@ -126,7 +128,7 @@ async def patch_map(
     patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
     if OPERATORS & patch.keys():
         asking.require_every("admin")
-    edit = partial(edit_map, here.engine.store, map_name, patch, tags, dry_run=dry_run)
+    edit = partial(edit_map, here.context.store, map_name, patch, tags, dry_run=dry_run)
     edited = await here.run(edit)
     response.headers["ETag"] = f'"{edited.etag}"'
     return edited

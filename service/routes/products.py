@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from sceneprint.engine import Engine
 from sceneprint.engine.products.pose_graph import MEDIA_TYPES
 from sceneprint.engine.products.product import Products
 from sceneprint.engine.products.session_differences import POINTS
@@ -28,24 +27,25 @@ from sceneprint_client.api.sessions import (
     Graph,
     GraphFormat,
 )
-from service.auth import Here, may_read, may_write, v1_router
+from service.auth import may_read, may_write, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
 from service.responses import file_responses, preferred_media_type, send_product_file
+from service.running_service import Here, Service
 
 Cursor = Annotated[str | None, Query(description="`next_cursor` of the page before.")]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 
 
 def product_router(
-    products_of: Callable[[Engine], Products[Any, Any]], record: type[Product], about: str, *,
+    products_of: Callable[[Service], Products[Any, Any]], record: type[Product], about: str, *,
     optional: bool = False,
 ) -> APIRouter:  # fmt: skip
     """Return the routes that all products have: begin, list, get and delete.
 
     Parameters
     ----------
-    products_of : returns the products of an engine
+    products_of : returns the products of a service
     record : of the API
     about : what the job does, for the OpenAPI document
     optional : whether a request may come without a body
@@ -55,18 +55,18 @@ def product_router(
 
     async def begin(map_name: str, request: Request, here: Here, response: Response) -> Any:
         wanted = await read_record(request, request_type, f"The {noun}", optional=optional)
-        begun = await here.run(products_of(here.engine).begin, map_name, wanted)
+        begun = await here.run(products_of(here).begin, map_name, wanted)
         response.headers["Location"] = f"/v1/maps/{map_name}/{path}/{begun.job_id}"
         return begun
 
     def list_all(map_name: str, here: Here, cursor: Cursor = None, limit: Limit = 100) -> Any:
-        return products_of(here.engine).list_all(map_name, cursor, limit)
+        return products_of(here).list_all(map_name, cursor, limit)
 
     def get(map_name: str, job_id: str, here: Here) -> Any:
-        return products_of(here.engine).get(map_name, job_id)
+        return products_of(here).get(map_name, job_id)
 
     def delete(map_name: str, job_id: str, here: Here) -> None:
-        products_of(here.engine).remove(map_name, job_id)
+        products_of(here).remove(map_name, job_id)
 
     add, writes = router.add_api_route, [Depends(may_write)]
     add(
@@ -98,7 +98,7 @@ def product_router(
 # Coverage.
 
 coverage_router = product_router(
-    lambda engine: engine.coverage, MapCoverage,
+    lambda service: service.coverage, MapCoverage,
     "Measure where in the map a robot would be found. A job queries each frame, or every n-th, "
     "against the rest of the map, and counts by cell of a plan how many are found, found in a "
     "wrong place, ambiguous and not found. It runs when nothing else waits for a worker, and takes "
@@ -122,7 +122,7 @@ def list_coverage_frames(
 
     Frames that were deleted since are left out.
     """
-    return here.engine.coverage.frames(map_name, job_id, cursor, limit, outcome)
+    return here.coverage.frames(map_name, job_id, cursor, limit, outcome)
 
 
 @coverage_router.get("/{job_id}/changes", responses=declared(404, 409, 422))
@@ -136,13 +136,13 @@ def get_coverage_changes(
     ],
 ) -> CoverageChanges:
     """Which cells became better or worse since an earlier result; 409 until both succeeded."""
-    return here.engine.coverage.changes(map_name, job_id, since)
+    return here.coverage.changes(map_name, job_id, since)
 
 
 # Differences of sessions.
 
 differences_router = product_router(
-    lambda engine: engine.differences, Difference,
+    lambda service: service.differences, Difference,
     "Compare two sessions whose frames have poses in one parent frame. A job fuses at most 500 "
     "frames of each session to cells, and asks the frames of the other session about each cell. It "
     "runs when nothing else waits for a worker.",
@@ -162,14 +162,14 @@ differences_router = product_router(
 )
 def get_difference_points(map_name: str, job_id: str, request: Request, here: Here) -> Response:
     """The cells of both sessions; 409 until the job has succeeded."""
-    find = partial(here.engine.differences.file, map_name, job_id, POINTS)
+    find = partial(here.differences.file, map_name, job_id, POINTS)
     return send_product_file(request, here, find, f"{job_id[:12]}-points")
 
 
 # Associations: sessions joined, loops closed.
 
 associations_router = product_router(
-    lambda engine: engine.associations, Association,
+    lambda service: service.associations, Association,
     "Find where sessions see the same places: two of them, which joins their maps, or one, which "
     "closes its loops. Every frame of the first session is looked up among those of the second; "
     "what validation accepts is an edge. Edges near each other must agree with how the robots "
@@ -196,7 +196,7 @@ def undo_join(map_name: str, job_id: str, here: Here) -> Association:
     that other joins lead to. Without a join that stands nothing changes. The parent frames are not
     joined again unless somebody asks for an association.
     """
-    return here.engine.associations.undo_join(map_name, job_id)
+    return here.associations.undo_join(map_name, job_id)
 
 
 @associations_router.get("/{job_id}/edges", responses=declared(404, 422))
@@ -216,7 +216,7 @@ def list_edges(
     ] = None,
 ) -> Page[Edge]:
     """Edges in the order in which they were found, also while more are."""
-    return here.engine.associations.edges(
+    return here.associations.edges(
         map_name, job_id, cursor, limit, min_overlap, consistent=consistent
     )
 
@@ -263,7 +263,7 @@ async def get_graph(
     wanted: Any = kind or kinds[preferred_media_type(request, list(kinds))]
     async with here.gate.place():
         text = await here.gate.run(
-            lambda: here.engine.associations.graph(
+            lambda: here.associations.graph(
                 map_name, job_id, wanted, min_overlap, odometry=odometry, consistent=consistent
             )
         )

@@ -36,7 +36,7 @@ from sceneprint_client.api import (
 from sceneprint_client.api.base import Given, Label, record_of
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from service import bodies
-from service.auth import Asking, Caller, Context, Here, may_read, v1_router
+from service.auth import Asking, Caller, may_read, v1_router
 from service.bodies import (
     FORM,
     FRAME_BODY,
@@ -50,6 +50,7 @@ from service.bodies import (
     uploaded,
 )
 from service.problems import declared
+from service.running_service import Here, Service
 
 Asked = TypeVar("Asked", bound=Query)
 
@@ -300,7 +301,7 @@ def _wrong(name: str, how: str) -> InvalidRequest:
 
 
 async def run_query(
-    here: Context, sent: SentQuery, since: float, do: Callable[[], Answer]
+    here: Service, sent: SentQuery, since: float, do: Callable[[], Answer]
 ) -> Answer:
     """Answer a query when it is its turn, count it, and log it if it fails.
 
@@ -320,7 +321,7 @@ async def run_query(
     except NotFound:  # what was asked for is not there: no query was begun
         raise
     except Exception as error:
-        here.engine.query_log.note(query_row(sent, error, time.perf_counter() - since))
+        here.context.query_log.note(query_row(sent, error, time.perf_counter() - since))
         raise
     if sent.query.record:
         here.metrics.answer(answer)
@@ -384,7 +385,7 @@ async def localize_sequence(
     Send 2 to 10 frames in the order they were taken, each with a `pose` in one parent frame of any
     name: the odometry. Each is looked up; all of them vote for the pose of the last.
     """
-    since, at, engine = time.perf_counter(), time.time(), here.engine
+    since, at = time.perf_counter(), time.time()
     options = tuple(Query.model_fields)
     async with (
         here.gate.place(),
@@ -398,7 +399,7 @@ async def localize_sequence(
         log = SentQuery([map_name], query, last.robot, last.session, asking.key_id, at=at)
         answer = await run_query(
             here, log, since,
-            lambda: engine.queries.sequence(
+            lambda: here.queries.sequence(
                 map_name, [(one.data, one.meta) for one in sent.read()], query, since, log
             ),
         )  # fmt: skip
@@ -412,7 +413,7 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
     The maps must be of one model. A pose is averaged within one parent frame of one map, which
     `location.map` names.
     """
-    since, at, queries = time.perf_counter(), time.time(), here.engine.queries
+    since, at, queries = time.perf_counter(), time.time(), here.queries
     async with here.gate.place(), question(request, SeveralQuery, "frame") as body:
         query, upload, frame = body.query, body.upload, body.query.frame
         if query.query_id is not None and (upload is not None or frame is not None):
@@ -430,22 +431,22 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
             )  # fmt: skip
         if query.query_id is not None:
             return await _repeated(query.query_id, here, asking, sent, since)
-        if frame is None:
+        if named is None:
             raise unnamed("frame")
-        asking.require(frame.map, "read")
+        asking.require(named.map, "read")
         return await run_query(
-            here, sent, since, lambda: queries.stored(maps, frame, query, since, sent)
+            here, sent, since, lambda: queries.stored(maps, named, query, since, sent)
         )
 
 
-def require_readable(query_id: str, here: Context, asking: Caller) -> QueryRow:
+def require_readable(query_id: str, here: Service, asking: Caller) -> QueryRow:
     """Return the row of a query, if the caller may read all maps that it names.
 
     Raises
     ------
     UnknownQuery : its answer is not stored, or the caller may not see it: the text is the same.
     """
-    row = here.engine.query_log.find_row(query_id)
+    row = here.context.query_log.find_row(query_id)
     maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
     if len(asking.readable(maps)) < len(maps):
         raise unknown_query(query_id)
@@ -453,23 +454,23 @@ def require_readable(query_id: str, here: Context, asking: Caller) -> QueryRow:
 
 
 async def _repeated(
-    query_id: str, here: Context, asking: Caller, sent: SentQuery, since: float
+    query_id: str, here: Service, asking: Caller, sent: SentQuery, since: float
 ) -> Answer:
     """Repeat an earlier query with other options."""
-    log = here.engine.query_log
+    log = here.context.query_log
     await here.run(require_readable, query_id, here, asking)
     stored = await here.run(log.find, query_id)
     sent = replace(sent, frame=stored.answer.frame)
     return await run_query(
         here, sent, since,
-        lambda: here.engine.queries.again(list(sent.maps), stored, sent.query, since, sent),
+        lambda: here.queries.again(list(sent.maps), stored, sent.query, since, sent),
     )  # fmt: skip
 
 
 async def _asked(
-    map_name: str, request: Request, here: Context, asking: Caller, *, localizes: bool
+    map_name: str, request: Request, here: Service, asking: Caller, *, localizes: bool
 ) -> Answer:
-    since, at, engine = time.perf_counter(), time.time(), here.engine
+    since, at = time.perf_counter(), time.time()
     async with here.gate.place(), question(request, Query, "frame_id") as body:
         query, upload = body.query, body.upload
         sent = SentQuery([map_name], query, body.robot, body.session, asking.key_id, at=at)
@@ -478,16 +479,17 @@ async def _asked(
         if upload is not None:
             return await run_query(
                 here, sent, since,
-                lambda: engine.queries.upload(
+                lambda: here.queries.upload(
                     [map_name], upload.file.read(), upload.meta, query, since, sent
                 ),
             )  # fmt: skip
         frame_id = body.named["frame_id"]
         if not isinstance(frame_id, str):
             raise unnamed("frame_id")
-        sent = replace(sent, frame=FrameName(map=map_name, frame_id=frame_id))
+        frame = FrameName(map=map_name, frame_id=frame_id)
+        sent = replace(sent, frame=frame)
         return await run_query(
-            here, sent, since, lambda: engine.query_frame(map_name, frame_id, query, since, sent)
+            here, sent, since, lambda: here.queries.stored([map_name], frame, query, since, sent)
         )
 
 
@@ -538,7 +540,7 @@ async def compare(request: Request, here: Here, asking: Asking) -> Similarity:
             if isinstance(side, NamedFrame):
                 asking.require(side.map, "read")
         return await here.gate.run(
-            lambda: here.engine.queries.compare(
+            lambda: here.queries.compare(
                 a.read() if isinstance(a, Sent) else a,
                 b.read() if isinstance(b, Sent) else b,
                 asked.how,

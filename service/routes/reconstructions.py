@@ -9,10 +9,11 @@ from fastapi import Request, Response
 from sceneprint.engine.products.reconstruction import MEDIA_TYPE, MESH
 from sceneprint.engine.results.query_entry import StoredAnswer, unknown_query
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
-from service.auth import Asking, Caller, Context, Here, v1_router
+from service.auth import Asking, Caller, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
 from service.responses import files, send_product_file
+from service.running_service import Here, Service
 
 router = v1_router(tag="reconstructions")
 
@@ -33,7 +34,7 @@ async def reconstruct(
     """
     stored = await here.run(lambda: _stored_answer(here, asking, query_id))
     wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
-    made = await here.run(lambda: here.engine.reconstructions.begin_for(stored, wanted))
+    made = await here.run(lambda: here.reconstructions.begin_for(stored, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
     return made
 
@@ -58,7 +59,7 @@ async def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) ->
     """The surface, in the query's camera frame; 409 until the job has succeeded."""
     await here.run(_find_reconstruction, here, asking, job_id)
     async with here.gate.place():  # it is read whole: when it is its turn
-        find = partial(here.engine.reconstructions.file, None, job_id, MESH)
+        find = partial(here.reconstructions.file, None, job_id, MESH)
         name = f"{job_id[:12]}-{MESH}"
         return await here.gate.run(partial(send_product_file, request, here, find, name))
 
@@ -68,12 +69,12 @@ def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
     """Remove a reconstruction with its files; one that is under way is given up."""
     for name in _find_reconstruction(here, asking, job_id).maps:
         asking.require(name, "write")
-    here.engine.reconstructions.remove(None, job_id)
+    here.reconstructions.remove(None, job_id)
 
 
-def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredAnswer:
+def _stored_answer(here: Service, asking: Caller, query_id: str) -> StoredAnswer:
     """The answer, for who may read the maps that it was asked of, and write to those it names."""
-    stored = here.engine.query_log.find(query_id)
+    stored = here.context.query_log.find(query_id)
     answer = stored.answer
     matched = {match.map for match in answer.matches}
     asked = {*answer.maps, *([] if answer.frame is None else [answer.frame.map])}
@@ -84,8 +85,8 @@ def _stored_answer(here: Context, asking: Caller, query_id: str) -> StoredAnswer
     return stored
 
 
-def _find_reconstruction(here: Context, asking: Caller, job_id: str) -> Reconstruction:
-    found = here.engine.reconstructions.get(None, job_id)
+def _find_reconstruction(here: Service, asking: Caller, job_id: str) -> Reconstruction:
+    found = here.reconstructions.get(None, job_id)
     if not all(asking.may("read", name) for name in found.maps):
-        raise here.engine.reconstructions.unknown(job_id)
+        raise here.reconstructions.unknown(job_id)
     return found

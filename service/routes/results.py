@@ -9,6 +9,7 @@ from fastapi import Query, Request, Response
 from pydantic import AwareDatetime
 
 from sceneprint.engine.maps.map_frames import PLY, PNG
+from sceneprint.engine.maps.map_lifecycle import get_map
 from sceneprint.store.query_rows import WantedQueries
 from sceneprint_client.api import Answer, Page
 from sceneprint_client.api.base import Label
@@ -26,10 +27,11 @@ from sceneprint_client.api.results import (
     StoredQuery,
     View,
 )
-from service.auth import Asking, Caller, Context, Here, v1_router
+from service.auth import Asking, Caller, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
 from service.routes.queries import require_readable
+from service.running_service import Here, Service
 
 router = v1_router("/queries/{query_id}", "queries")
 
@@ -55,7 +57,7 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
     Answers are stored for 30 days by default, and while there is room; not with `keep` false.
     """
     require_readable(query_id, here, asking)
-    return here.engine.inspection.answer(query_id)
+    return here.inspection.answer(query_id)
 
 
 @router.get(
@@ -65,7 +67,7 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
 )
 async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
     """The surface that the query saw, as validation compares it: binary PLY, metres."""
-    inspection = here.engine.inspection
+    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(lambda: inspection.cloud(query_id))
@@ -82,7 +84,7 @@ async def get_similarities(
     ] = 50,
 ) -> Similarities:
     """How alike the query and its nearest frames are, each to each: what the selection sees."""
-    inspection = here.engine.inspection
+    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
     async with here.gate.place():
         return await here.gate.run(lambda: inspection.similarities(query_id, limit))
@@ -97,7 +99,7 @@ async def get_match(
     It is validated once more, with the seed and the options of the query; one that the query
     passed over is validated now.
     """
-    inspection = here.engine.inspection
+    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
     async with here.gate.place():
         return await here.gate.run(lambda: inspection.match(query_id, frame_id, map_name))
@@ -133,7 +135,7 @@ async def get_overlay(
     ] = "aligned",
 ) -> Response:
     """The query laid on a match, to see how well they fit: binary PLY, metres."""
-    inspection = here.engine.inspection
+    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(
@@ -155,7 +157,7 @@ _PNG: dict[int | str, dict[str, Any]] = {
 def get_question(query_id: str, here: Here, asking: Asking) -> StoredQuery:
     """How the query was sent: to which maps, with which frame and options."""
     require_readable(query_id, here, asking)
-    return here.engine.inspection.question(query_id)
+    return here.inspection.question(query_id)
 
 
 @router.get("/preview.png", response_class=Response, responses=_PNG)
@@ -170,7 +172,7 @@ async def get_query_preview(
     width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
 ) -> Response:
     """A picture of what the query saw, for people."""
-    inspection = here.engine.inspection
+    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
     async with here.gate.place():
         data = await here.gate.run(lambda: inspection.preview(query_id, view, width))
@@ -189,17 +191,17 @@ async def keep_answer(query_id: str, request: Request, here: Here, asking: Askin
     """
     await here.run(_require_write, query_id, here, asking)
     options = await read_record(request, KeepOptions, "The request to keep it", optional=True)
-    return await here.run(here.engine.query_log.keep, query_id, options.title)
+    return await here.run(here.context.query_log.keep, query_id, options.title)
 
 
 @router.delete("/keep", status_code=204, responses=declared(404, 422))
 def release_answer(query_id: str, here: Here, asking: Asking) -> None:
     """Let the answer expire. It requires the scope `write` for every map that was searched."""
     _require_write(query_id, here, asking)
-    here.engine.query_log.release(query_id)
+    here.context.query_log.release(query_id)
 
 
-def _require_write(query_id: str, here: Context, asking: Caller) -> None:
+def _require_write(query_id: str, here: Service, asking: Caller) -> None:
     for name in require_readable(query_id, here, asking).searched:
         asking.require(name, "write")
 
@@ -236,14 +238,14 @@ def list_queries(
     names = asking.named
     if map_name is not None:
         asking.require(map_name, "read")
-        here.engine.get_map(map_name)
+        get_map(here.context.store, map_name)
         names = (map_name,)
     wanted = WantedQueries(
         statuses=tuple(status), robot=robot, kept=kept,
         since=None if since is None else since.timestamp(),
         until=None if until is None else until.timestamp(),
     )  # fmt: skip
-    return here.engine.query_log.page(wanted, names, cursor, limit, partial(asking.may, "read"))
+    return here.context.query_log.page(wanted, names, cursor, limit, partial(asking.may, "read"))
 
 
 @history_router.delete("", status_code=204, responses=declared(404, 422))
@@ -254,5 +256,5 @@ def delete_queries(
 ) -> None:
     """Remove all past queries of a map with their answers. Requires `admin` of the map."""
     asking.require(map_name, "admin")
-    here.engine.audit.record("queries.removed", map_name)
-    here.engine.query_log.remove_of_map(map_name)
+    here.audit.record("queries.removed", map_name)
+    here.context.query_log.remove_of_map(map_name)

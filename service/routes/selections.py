@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import Depends, Query, Request
 
+from sceneprint.engine.maps.map_frames import get_frame
 from sceneprint.engine.maps.selections import delete_selection, edit_selection
 from sceneprint_client.api import Frame, Page
 from sceneprint_client.api.listing import (
@@ -17,9 +18,10 @@ from sceneprint_client.api.listing import (
     FrameSelection,
     FramesRestored,
 )
-from service.auth import Here, may_read, may_write, v1_router
+from service.auth import may_read, may_write, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
+from service.running_service import Here
 
 router = v1_router("/maps/{map_name}", "frames")
 
@@ -38,10 +40,9 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
     it.
     """
     wanted = await read_record(request, FrameSelection, "The selection")
-    engine = here.engine
-    async with here.uploads.place():
-        return await here.uploads.run(
-            partial(delete_selection, engine.store, map_name, wanted, engine.tombstones)
+    async with here.upload_gate.place():
+        return await here.upload_gate.run(
+            partial(delete_selection, here.context.store, map_name, wanted, here.tombstones)
         )
 
 
@@ -56,8 +57,10 @@ async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdit
     has what undoes it.
     """
     edit = await read_record(request, FramesEdit, "The edit of the frames")
-    async with here.uploads.place():
-        return await here.uploads.run(partial(edit_selection, here.engine.store, map_name, edit))
+    async with here.upload_gate.place():
+        return await here.upload_gate.run(
+            partial(edit_selection, here.context.store, map_name, edit)
+        )
 
 
 @router.post(
@@ -68,8 +71,8 @@ def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
 
     404 where it is gone for good, or another frame has its id; 409 where its content came again.
     """
-    here.engine.tombstones.restore_one(map_name, frame_id)
-    return here.engine.get_frame(map_name, frame_id)
+    here.tombstones.restore_one(map_name, frame_id)
+    return get_frame(here.context.store, map_name, frame_id)
 
 
 @router.get("/deletions", responses=declared(404, 422), dependencies=[Depends(may_read)])
@@ -80,7 +83,7 @@ def list_deletions(
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[FrameDeletion]:
     """Deletions of frames that can still be undone, the newest first."""
-    return here.engine.tombstones.list_all(map_name, cursor, limit)
+    return here.tombstones.list_all(map_name, cursor, limit)
 
 
 @router.post(
@@ -92,7 +95,5 @@ async def restore_deletion(map_name: str, deletion_id: str, here: Here) -> Frame
     A call ends after ten seconds: repeat it while `remaining` is not 0. 403 where the map may not
     hold so many frames.
     """
-    async with here.uploads.place():
-        return await here.uploads.run(
-            partial(here.engine.tombstones.restore, map_name, deletion_id)
-        )
+    async with here.upload_gate.place():
+        return await here.upload_gate.run(partial(here.tombstones.restore, map_name, deletion_id))

@@ -12,10 +12,11 @@ from sceneprint.engine.maps.selections import delete_session, edit_session
 from sceneprint_client.api import Page
 from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
-from service.auth import Here, may_read, may_write, v1_router
+from service.auth import may_read, may_write, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
 from service.responses import preferred_media_type
+from service.running_service import Here
 
 router = v1_router("/maps/{map_name}", "sessions", may_read)
 
@@ -42,7 +43,7 @@ def get_sessions(
 
     Frames that name neither are one run, and the first.
     """
-    return list_sessions(here.engine.store, map_name, cursor, limit)
+    return list_sessions(here.context.store, map_name, cursor, limit)
 
 
 # Names of sessions may hold anything, such as slashes, and so are no parts of a path.
@@ -59,14 +60,14 @@ async def delete_session_frames(
     A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
     POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it.
     """
-    async with here.uploads.place():
-        return await here.uploads.run(
+    async with here.upload_gate.place():
+        return await here.upload_gate.run(
             partial(
                 delete_session,
-                here.engine.store,
+                here.context.store,
                 map_name,
                 session,
-                here.engine.tombstones,
+                here.tombstones,
                 robot,
             )
         )
@@ -93,9 +94,9 @@ async def patch_session(
     A call ends after ten seconds: repeat it with `after` while `remaining` is not 0.
     """
     edit = await read_record(request, SessionEdit, "The edit of the session")
-    async with here.uploads.place():
-        return await here.uploads.run(
-            partial(edit_session, here.engine.store, map_name, session, edit, robot, after)
+    async with here.upload_gate.place():
+        return await here.upload_gate.run(
+            partial(edit_session, here.context.store, map_name, session, edit, robot, after)
         )
 
 
@@ -114,7 +115,7 @@ async def get_trajectory(
     kind = preferred_media_type(request, (_PLAIN, _JSON))
 
     def make() -> bytes:
-        found = trajectory(here.engine.store, map_name, run)
+        found = trajectory(here.context.store, map_name, run)
         return (found.model_dump_json() if kind == _JSON else trajectory_file(found)).encode()
 
     async with here.gate.place():

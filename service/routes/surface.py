@@ -18,9 +18,10 @@ from sceneprint_client.api.surface import (
     SurfaceSighting,
     SurfaceTile,
 )
-from service.auth import Here, may_read, may_write, v1_router
+from service.auth import may_read, may_write, v1_router
 from service.problems import declared
 from service.responses import file_responses, is_known, look, sent
+from service.running_service import Here
 
 router = v1_router("/maps/{map_name}/surface", "surface", may_read)
 
@@ -35,7 +36,7 @@ Parent = Annotated[
 @router.get("", responses=declared(404))
 def get_surface(map_name: str, here: Here) -> MapSurface:
     """What the posed frames of a map saw, fused: levels of tiles, sessions, state."""
-    return here.engine.surfaces.get(map_name)
+    return here.surfaces.get(map_name)
 
 
 @router.post(
@@ -54,7 +55,7 @@ def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
     `Location` until `state` is `ready`; the tiles that are there can be read meanwhile. It takes
     the scope `write`.
     """
-    surface, begun = here.engine.surfaces.begin(map_name)
+    surface, begun = here.surfaces.begin(map_name)
     response.headers["Location"] = f"/v1/maps/{map_name}/surface"
     if not begun:
         response.status_code = 200
@@ -64,7 +65,7 @@ def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
 @router.delete("", status_code=204, responses=declared(404), dependencies=[Depends(may_write)])
 def delete_surface(map_name: str, here: Here) -> None:
     """Delete the surface of a map. Workers build it again only when somebody asks for it."""
-    here.engine.surfaces.remove(map_name)
+    here.surfaces.remove(map_name)
 
 
 @router.get("/tiles", responses=declared(404, 422))
@@ -77,7 +78,7 @@ def list_surface_tiles(
     limit: Annotated[int, Query(ge=1, le=1000)] = 1000,
 ) -> Page[SurfaceTile]:
     """Tiles of a level by column, row and floor."""
-    return here.engine.surfaces.tiles(map_name, parent, level, cursor, limit)
+    return here.surfaces.tiles(map_name, parent, level, cursor, limit)
 
 
 @router.get(
@@ -89,7 +90,7 @@ def list_surface_tiles(
 )
 def get_surface_tile(map_name: str, digest: str, request: Request, here: Here) -> Response:
     """The cells of a tile. They never change: another digest stands for others."""
-    found = here.engine.surfaces.tile(map_name, digest)
+    found = here.surfaces.tile(map_name, digest)
     headers = {"ETag": f'"{found.tag}"', "Cache-Control": _FOREVER}
     if is_known(request, found.tag):
         return Response(None, 304, headers)
@@ -126,9 +127,9 @@ def list_surface_frames(
         )
     if at is not None:
         spot = _numbers("at", at, 3)
-        return here.engine.surfaces.sightings(map_name, spot, radius, parent, cursor, limit)
+        return here.surfaces.sightings(map_name, spot, radius, parent, cursor, limit)
     ends = _numbers("box", box or "", 6)
-    return here.engine.surfaces.frames_in(map_name, ends[:3], ends[3:], parent, cursor, limit)
+    return here.surfaces.frames_in(map_name, ends[:3], ends[3:], parent, cursor, limit)
 
 
 @router.get(
@@ -159,9 +160,7 @@ async def get_surface_plan(
     ] = None,
 ) -> Response:
     """A surface as a picture. `plan` of GET /v1/maps/{map_name}/surface tells where it lies."""
-    output = await look(
-        here, lambda: here.engine.surfaces.picture(map_name, parent, width, low, high)
-    )
+    output = await look(here, lambda: here.surfaces.picture(map_name, parent, width, low, high))
     return await sent(request, here, output, _PNG, "surface.png")
 
 

@@ -15,7 +15,6 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle.backup import take_backup
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import (
@@ -26,6 +25,7 @@ from sceneprint_client.api import (
     NewMap,
     Query,
 )
+from tests.whole_engine import Engine
 
 SIGNED = 4
 

@@ -31,13 +31,13 @@ from sceneprint.bundle.backup import listed_blobs, take_backup
 from sceneprint.bundle.place import BundlePlace
 from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
 from sceneprint.bundle.rows import cut_rows
-from sceneprint.engine import Engine
 from sceneprint.errors import BundleError, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import refers_to
 from sceneprint.store.tables import keys
+from tests.whole_engine import Engine
 
 file_only = pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 

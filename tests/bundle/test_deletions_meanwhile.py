@@ -9,7 +9,7 @@ import pytest
 
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import verify_bundle
-from sceneprint.engine import Engine
+from tests.whole_engine import Engine
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")

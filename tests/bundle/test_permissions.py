@@ -13,8 +13,8 @@ from sceneprint.atomic_files import make_folder, public_mode
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_folder
 from sceneprint.cli.doctor import machine
-from sceneprint.engine import Engine
 from sceneprint_client.api import NewMap, Query
+from tests.whole_engine import Engine
 
 
 @pytest.fixture

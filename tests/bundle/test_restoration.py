@@ -21,7 +21,6 @@ from pydantic import SecretStr
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_folder, restore_to_server, verify_bundle
-from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.errors import BundleError, UnusableStore
 from sceneprint.maintenance.fsck.check import fsck
@@ -31,6 +30,7 @@ from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.tables import metadata
 from sceneprint_client.api import Query
 from tests.bundle.test_backup import names_in
+from tests.whole_engine import Engine
 
 SIGNED = 4
 file_only = pytest.mark.sqlite_only("looks at the database as a file of the data folder")

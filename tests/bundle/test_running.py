@@ -13,9 +13,9 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_folder
-from sceneprint.engine import Engine
 from sceneprint_client import Client
 from sceneprint_lab.cli.demo import serving
+from tests.whole_engine import Engine
 
 
 @dataclass(eq=False)

@@ -10,9 +10,9 @@ from pydantic import SecretStr
 from benchmarks.postgres import Server
 from sceneprint.cli.checks import Check, store_check
 from sceneprint.cli.doctor import database, object_stores, server
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
+from tests.whole_engine import Engine
 
 
 def found_in(url: str, **other: object) -> dict[str, Check]:
@@ -47,7 +47,7 @@ def test_more_connections_than_the_server_allows(postgres: Server) -> None:
 def test_a_service_does_not_take_the_server_for_a_file(postgres_url: str, tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, database_url=SecretStr(postgres_url))
     with Engine(settings) as engine:
-        stats = engine.operations.statistics.tell(1)
+        stats = engine.statistics.tell(1)
     assert stats.bytes.database is not None
     size = f"{stats.bytes.database / 1e6:.1f}"
     text = f"database of {size} MB, blobs of 0.0 MB, indexes of 0.0 MB"

@@ -10,9 +10,9 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint_client import Client
+from tests.whole_engine import Engine
 
 Run = Callable[..., tuple[str, str]]
 

@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
+from sceneprint.store.keys import KeyUses
+from tests.whole_engine import Engine
 
 Run = Callable[..., Any]
 
@@ -43,8 +44,10 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_pa
 
     def named(secret: str) -> str | None:
         with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
-            found = engine.find_key(secret)
-            engine.key_uses.write(engine.store.database)
+            found, uses = engine.find_key(secret), KeyUses()
+            if found is not None:
+                uses.note(found)
+            uses.write(engine.store.database)
             return None if found is None else found.name
 
     old = keys("--create", "robot", "--scope", "read", "--expires", "3d").stdout.strip()

@@ -10,12 +10,12 @@ from typing import Any
 from sqlalchemy import update
 
 from sceneprint.cli import storage as command
-from sceneprint.engine import Engine
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.settings import Settings
 from sceneprint.store.tables import jobs
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import JobState
+from tests.whole_engine import Engine
 
 Run = Callable[..., Any]
 

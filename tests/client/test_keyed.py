@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.errors import (
     Conflict,
     Forbidden,
@@ -30,6 +29,7 @@ from sceneprint_client import Client
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.admin import Scope
 from sceneprint_client.api.coverage import MapCoverage
+from tests.whole_engine import Engine
 
 ID = "0" * 32
 KEYS: dict[str, dict[str, Scope]] = {

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.products.product import Products
 from sceneprint.engine.search import local_index
@@ -27,6 +26,7 @@ from sceneprint.store.tables import events, jobs
 from sceneprint.types import DepthFrame, Floats, Geometry
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
 from sceneprint_lab.synth import SynthRoom
+from tests.whole_engine import Engine
 
 
 @dataclass(frozen=True)
@@ -236,10 +236,10 @@ def each_slice_lost_once(due_now: Callable[[Engine], None]) -> Callable[..., int
             due_now(engine)
             again = engine.claim("lives")
             assert isinstance(again, LongJob)
-            assert engine.tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
+            assert engine.jobs._tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
             second = products.run_slice(again, lambda: True)
             assert asdict(first) == asdict(second)
-            engine.tasks._store_result(again, second)
+            engine.jobs._tasks._store_result(again, second)
             slices += 1
             progress = products.get("hall", job_id).progress
             assert progress is not None

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint.localization import localize, views_of_rows
 from sceneprint.pipeline import Signature, Signer, associate, diversify, retrieve
 from sceneprint.places import QueryFrame
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, NewMap, Query
+from tests.whole_engine import Engine
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.products import associations
@@ -30,6 +29,7 @@ from sceneprint.types import Floats
 from sceneprint_client.api import Filter, JobState, NewMap
 from sceneprint_client.api.sessions import Association, NewAssociation
 from sceneprint_lab.synth import SynthRoom
+from tests.whole_engine import Engine
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -334,7 +334,7 @@ def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]
     handler = engine.associations.run_slice
     task = engine.claim("w")
     assert isinstance(task, LongJob)
-    engine.tasks._store_result(task, handler(task, lambda: True))
+    engine.jobs._tasks._store_result(task, handler(task, lambda: True))
     name = begun.job_id
     before = engine.associations.edges("hall", name).items
     assert before
@@ -430,7 +430,7 @@ def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine: Engine) ->
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     handler = engine.associations.run_slice
-    engine.tasks._store_result(task, handler(task, lambda: True))
+    engine.jobs._tasks._store_result(task, handler(task, lambda: True))
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     engine.delete_map("hall")

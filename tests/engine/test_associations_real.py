@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from sceneprint.engine import Engine
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.types import Floats
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.sessions import NewAssociation
 from sceneprint_client.frame_files import sendable
+from tests.whole_engine import Engine
 
 #: Frames of redkitchen: the second stretch comes back to what the first saw.
 FIRST, SECOND = range(100, 180, 10), range(640, 720, 10)

@@ -12,7 +12,6 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.decoders import LocalDecoders
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.frame_decoder import content_id, read_upload
 from sceneprint.engine.products.reconstruction import JobView, fused
 from sceneprint.engine.search.verification import thresholds
@@ -26,6 +25,7 @@ from sceneprint.types import DepthFrame, Floats
 from sceneprint_client.api import FrameMeta, JobState, Query
 from sceneprint_client.api.query import ValidationOptions
 from sceneprint_client.api.surface import NewReconstruction
+from tests.whole_engine import Engine
 
 WorkOff = Callable[[Engine], list[JobState | None]]
 #: Where clouds were seen from, metres in their own coordinates.

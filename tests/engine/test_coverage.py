@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs.lifecycle import Work, cancel
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_lifecycle import edit_frame
@@ -29,6 +28,7 @@ from sceneprint.types import Floats
 from sceneprint_client.api import JobState, NewMap
 from sceneprint_client.api.coverage import CoverageFrame, MapCoverage, NewMapCoverage
 from sceneprint_lab.synth import SynthRoom
+from tests.whole_engine import Engine
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -267,7 +267,7 @@ def test_an_upload_goes_before_the_next_slice(
     handler = engine.coverage.run_slice
     task = engine.claim("w")
     assert isinstance(task, LongJob)
-    engine.tasks._store_result(task, handler(task, at_once))
+    engine.jobs._tasks._store_result(task, handler(task, at_once))
     engine.add_frame("pair", uploads[9].data, uploads[9].meta, -10)  # of the least priority
     frame = engine.claim("w")
     assert isinstance(frame, Work)
@@ -329,7 +329,7 @@ def test_frames_that_went_meanwhile_are_skipped(
     task = engine.claim("w")
     assert isinstance(task, LongJob)
     handler = engine.coverage.run_slice
-    engine.tasks._store_result(task, handler(task, at_once))
+    engine.jobs._tasks._store_result(task, handler(task, at_once))
     last = [one for one in engine.list_frames("hall").items if one.session == "c"][-1]
     engine.delete_frame("hall", last.frame_id)
     due_now(engine)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint.errors import (
     FrameConflict,
@@ -25,6 +24,7 @@ from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.store.tables import events
 from sceneprint_client.api import Filter, Frame, NewMap, Query
 from sceneprint_client.api.listing import FrameListing
+from tests.whole_engine import Engine
 
 Ids = Callable[[Engine], list[str]]
 EDITABLE = ("robot", "session", "captured_at", "tags", "pose", "base_frame", "T_base_sensor")

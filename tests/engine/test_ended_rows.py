@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from sqlalchemy import event, insert, select, update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep.purge import Retention
@@ -20,6 +19,7 @@ from sceneprint.store.deletion import DAY_S, maps_with_ended
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, jobs, maps, surface_frames
 from sceneprint_client.api import FrameState, Query
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 Ids = Callable[[Engine], list[str]]

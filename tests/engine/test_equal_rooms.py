@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.localization import rival_rows
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import Answer, Query
+from tests.whole_engine import Engine
 
 #: What looks for frames of another place.
 RIVAL_ROWS = "sceneprint.localization.rival_rows"

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
-from sceneprint.engine.engine import stored_maps
 from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.retrieval.ranking import ranking_size
+from sceneprint.store import maps as stored_maps
 from sceneprint.store.maps import add_frame
 from sceneprint.store.signatures import StoredSignature, index_frame
 from sceneprint_client.api import Answer, Filter, NewMap, Query
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 Ids = Callable[[Engine], list[str]]

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_frames import list_frames, trajectory, trajectory_file
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import InvalidRequest, PreconditionFailed
@@ -20,6 +19,7 @@ from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 from sceneprint_client.api.listing import FrameListing, Run
 from sceneprint_client.api.sessions import NewAssociation
 from sceneprint_lab.synth import SynthRoom
+from tests.whole_engine import Engine
 
 #: Orders in which the eight frames of a run are uploaded.
 IN_ORDER, SHUFFLED = range(8), (5, 0, 7, 2, 6, 1, 4, 3)

@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest import archive_import
 from sceneprint.engine.ingest import uploads as uploading
 from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
@@ -28,6 +27,7 @@ from sceneprint.store.queue import MAXIMUM_FAILURES, files_of
 from sceneprint_client.api import Job, JobState, NewMap
 from sceneprint_client.api.frames import ImportOptions, UploadSummary, pooled_range
 from tests.engine.conftest import Between
+from tests.whole_engine import Engine
 
 
 def packed(uploads: Any) -> bytes:

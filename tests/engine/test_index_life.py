@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import AppendBuffer
 from sceneprint.errors import UnusableStore
@@ -18,6 +17,7 @@ from sceneprint.index import newest, scrub
 from sceneprint.models import read_model
 from sceneprint.store.signatures import SignatureChange
 from sceneprint_client.api import Query
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
@@ -139,7 +139,7 @@ def test_a_damaged_index_is_read_once_and_not_with_every_query(
     said = [r for r in caplog.records if r.message.startswith("Damaged index skipped")]
     assert len(said) == 1
     flip(path, path.stat().st_size - 5 * LENGTH)  # as it was: out of reach for a moment
-    _, reader = engine._readers._open["hall"]
+    _, reader = engine.readers._open["hall"]
     reader._unsound = reader._unsound[0], 0.0  # when it is time to try again
     assert ask(engine, uploads)[1] == 1
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.serializers import transform
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
 from sceneprint.formats.export import points_of
@@ -20,6 +19,7 @@ from sceneprint.store.maps import find_frame, find_map, geometry_blobs
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query, ValidationOptions
 from sceneprint_lab.synth import SynthRoom
+from tests.whole_engine import Engine
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
 from sceneprint.errors import CannotRetry, InvalidRequest, JobOver, UnknownJob
@@ -18,6 +17,7 @@ from sceneprint.store import queue
 from sceneprint.store.queue import read_clock
 from sceneprint.store.tables import JobRow, jobs
 from sceneprint_client.api import FrameState, JobState
+from tests.whole_engine import Engine
 
 DueNow = Callable[[Engine], None]
 Told = Callable[[Engine], list[str]]
@@ -30,7 +30,7 @@ def row(engine: Engine, job_id: str) -> JobRow:
 
 
 def due(engine: Engine) -> float:
-    found = engine.due_in_s()
+    found = engine.jobs.due_in_s()
     assert found is not None
     return found
 
@@ -298,7 +298,7 @@ def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
 
 
 def test_when_there_is_something_to_do_next(empty: Engine, uploads: Any) -> None:
-    assert empty.due_in_s() is None
+    assert empty.jobs.due_in_s() is None
     for one in uploads[:3]:
         empty.add_frame("hall", one.data, one.meta)
     running = claimed(empty).job

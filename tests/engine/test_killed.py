@@ -13,15 +13,15 @@ import pytest
 from sqlalchemy import select
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.store.tables import jobs, signatures
 from sceneprint_client.api import FrameState, JobState, Query
+from tests.whole_engine import Engine
 
 #: Works as a worker does, and stands still at a step of which it tells.
 WORKER = """
 import sys, time
 from pathlib import Path
-from sceneprint.engine import Engine
+from tests.whole_engine import Engine
 from sceneprint.engine.jobs import signature_job
 from sceneprint.settings import Settings
 

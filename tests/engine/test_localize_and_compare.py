@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint.engine.search.response import uncertainty_record
 from sceneprint.errors import InvalidRequest, UnknownFrame
@@ -17,6 +16,7 @@ from sceneprint.models import read_model
 from sceneprint.pipeline import Signature, distance, validate
 from sceneprint.types import Geometry
 from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query, Similarity
+from tests.whole_engine import Engine
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

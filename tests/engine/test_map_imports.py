@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest import map_import
 from sceneprint.engine.ingest.map_import import StoredSurface, weak_areas
 from sceneprint.engine.jobs.lifecycle import cancel
@@ -28,6 +27,7 @@ from sceneprint_client.api import FrameState, Job, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
 from sceneprint_lab.synth.rooms import make_room
 from tests.engine.conftest import Between
+from tests.whole_engine import Engine
 
 #: A camera of few pixels, so that views are rendered and signed quickly.
 CAMERA = {"fx": 146.0, "fy": 146.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}
@@ -58,7 +58,7 @@ def claimed(engine: Engine) -> LongJob:
 
 def slice_of(engine: Engine, task: LongJob, is_over: Callable[[], bool]) -> SliceResult:
     """What a slice of the import comes to, if it is never stored: its worker dies."""
-    return engine.tasks._handlers["import-map"](task, is_over)
+    return engine.jobs.handlers["import-map"](task, is_over)
 
 
 def used_bytes(engine: Engine) -> int:

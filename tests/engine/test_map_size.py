@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from sqlalchemy import func, select
 
-from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics as measuring
 from sceneprint.engine.maps.map_frames import trajectory, trajectory_file
 from sceneprint.engine.maps.map_lifecycle import edit_frame
@@ -18,6 +17,7 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap
 from sceneprint_client.api.listing import Run
+from tests.whole_engine import Engine
 
 Ids = Callable[[Engine], list[str]]
 
@@ -34,12 +34,12 @@ def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatc
         ).all()
     folder = full.settings.data_dir
     on_disk = sum(p.stat().st_size for p in (folder / "blobs").glob("*/*"))
-    told = full.operations.statistics.tell(1, "hall").bytes
+    told = full.statistics.tell(1, "hall").bytes
     assert told.blobs == on_disk
     assert told.database == sum(one[1] for one in held)
     assert told.index == sum(p.stat().st_size for p in _files(folder / "index"))
     assert (told.free, told.disk) == (None, None)
-    shop = full.operations.statistics.tell(1, "shop").bytes
+    shop = full.statistics.tell(1, "shop").bytes
     assert (shop.database, shop.blobs, shop.index) == (0, 0, 0)
 
     monkeypatch.setattr(measuring, "WEIGHED", 4)  # the 1st, 4th, 7th and 10th stand for all

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import UnknownMap
 from sceneprint.pipeline import associate
 from sceneprint_client.api import NewMap, Query
+from tests.whole_engine import Engine
 
 Ids = Callable[[Engine], list[str]]
 R = Query(stages=("retrieve",), k=50)
@@ -48,7 +48,7 @@ def test_a_frame_deleted_after_it_was_asked_for_is_answered(
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     (name,) = ids(empty)
-    row = empty._row("hall")
+    row = empty.row("hall")
     asked = prepare_stored(empty.store, empty.signers, "hall", name, Query())
     empty.delete_frame("hall", name)
     answer = empty.queries.answer([row], asked, Query(), Deadline(None))
@@ -60,7 +60,7 @@ def test_a_map_made_anew_while_it_was_asked_is_not_answered_for(
 ) -> None:
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
-    row = empty._row("hall")
+    row = empty.row("hall")
     asked = prepare_stored(empty.store, empty.signers, "hall", ids(empty)[0], Query())
     empty.delete_map("hall")
     empty.create_map(NewMap(name="hall", model="paper"))  # whose signatures are longer

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from benchmarks.indexed_frames import fill
-from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index
 from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.types import Bytes
 from sceneprint_client.api import Answer, NamedFrame, Query
+from tests.whole_engine import Engine
 
 Node = Callable[..., Engine]
 #: Frames of both maps, and bytes of a signature.

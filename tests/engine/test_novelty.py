@@ -12,18 +12,18 @@ import pytest
 from sqlalchemy import select
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
-from sceneprint.engine.engine import stored_maps
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.signature_job import find_nearest
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.errors import InvalidRequest
 from sceneprint.pipeline import Signature, Signer
+from sceneprint.store import maps as stored_maps
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import events, signatures
 from sceneprint.types import Geometry
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.base import NOVEL, novelty_of
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -239,7 +239,7 @@ def test_signatures_of_another_model_are_not_compared(
         row = stored_maps.find_map(connection, "hall")
     vector = prepared[1][0].vector.tobytes()
     made = StoredSignature(row.model_id, vector, "00" * 32, [1], [1])
-    database, readers = empty.store.database, empty._readers
+    database, readers = empty.store.database, empty.readers
     seen = find_nearest(database, readers, row, made)
     assert seen is not None
     assert seen.nearest is not None

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from benchmarks.s3 import ObjectServer
-from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics as measuring
-from sceneprint.engine.engine import open_engine
+from sceneprint.engine.context import require_writable
 from sceneprint.errors import UnusableStore
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.frames import ImportOptions
+from tests.whole_engine import Engine
 
 
 @pytest.fixture
@@ -130,4 +130,4 @@ def test_what_ends_with_a_process_is_for_one_process_alone(
     engine.add_frame("hall", uploads[0].data, uploads[0].meta)
     assert work_off(engine) == ["succeeded"]
     with pytest.raises(UnusableStore, match=r"memory:///.*Client.embedded"):
-        open_engine(engine.settings)
+        require_writable(engine.settings)

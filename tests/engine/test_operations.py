@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select, update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.admin import statistics
 from sceneprint.engine.admin import statistics as measuring
 from sceneprint.engine.admin.statistics import anchors
@@ -28,6 +27,7 @@ from sceneprint.store.store_counts import add_sample, samples_since
 from sceneprint.store.tables import events, idempotency, jobs, samples
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.admin import IndexRecall
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 
@@ -71,7 +71,7 @@ def test_history_is_that_of_all_processes(make_engine, noon):
             connection.execute(
                 update(samples).where(samples.c.number == number).values(at=noon - ago)
             )
-    stats = engine.operations.statistics.tell(3)
+    stats = engine.statistics.tell(3)
     assert [one.at.timestamp() - noon for one in stats.minutes] == [-150, -90, -30]
     assert [one.received for one in stats.minutes] == [0, 0, 1]
     assert [one.indexed for one in stats.minutes] == [0, 2, 1]
@@ -85,11 +85,11 @@ def test_history_is_that_of_all_processes(make_engine, noon):
     assert last.latency is not None
     assert bin_of(last.latency.p50) == bin_of(last.latency.p95) == bin_of(0.1)
     assert bin_of(last.latency.p99) == bin_of(0.1)  # the 198th of 200; the 199th took 3 s
-    own = engine.operations.statistics.tell(3, "hall")
+    own = engine.statistics.tell(3, "hall")
     assert [one.indexed for one in own.minutes] == [0, 1, 1]
     assert (own.total.queries, own.total.latency, own.workers, own.bytes.free) == (None,) * 4
     with pytest.raises(UnknownMap):
-        engine.operations.statistics.tell(3, "shop")
+        engine.statistics.tell(3, "shop")
 
 
 def test_what_waits_and_who_works(make_engine, uploads):
@@ -102,37 +102,37 @@ def test_what_waits_and_who_works(make_engine, uploads):
         for number in (1, 2, 3):
             made = time.time() - 100 * number
             connection.execute(update(jobs).where(jobs.c.number == number).values(created_at=made))
-    stats = engine.operations.statistics.tell(1)
+    stats = engine.statistics.tell(1)
     assert (stats.maps, stats.frames, stats.jobs) == (2, {"received": 3}, {"queued": 3})
     assert stats.waiting == 3
     assert stats.oldest_waiting_s == pytest.approx(100, abs=20)  # that of the least number
-    of_shop = engine.operations.statistics.tell(1, "shop")
+    of_shop = engine.statistics.tell(1, "shop")
     assert (of_shop.frames, of_shop.jobs, of_shop.waiting) == ({"received": 2}, {"queued": 2}, 2)
     assert of_shop.oldest_waiting_s == pytest.approx(200, abs=20)
     assert stats.workers == []
     work = engine.claim("far:17")
     with engine.bell.listen():
-        stats = engine.operations.statistics.tell(1)
+        stats = engine.statistics.tell(1)
     assert work is not None
     here = f"{os.uname().nodename}:{os.getpid()}"
     assert stats.workers is not None
     assert {one.name: one.job_id for one in stats.workers} == {
         "far:17": work.job.id, here: None
     }  # fmt: skip
-    assert engine.operations.statistics.tell(1).workers == [stats.workers[0]]
+    assert engine.statistics.tell(1).workers == [stats.workers[0]]
     engine.put_back(work)
-    assert engine.operations.statistics.tell(1).workers == []
+    assert engine.statistics.tell(1).workers == []
 
 
 @pytest.mark.sqlite_only("reads the size of its file")
 def test_indexes_and_sizes_are_told(data, make_engine):
     engine = make_engine(data)
     indexed = engine.get_map("hall").frames["indexed"]
-    (index,) = engine.operations.statistics.tell(1).indexes
+    (index,) = engine.statistics.tell(1).indexes
     assert (index.map, index.generation, index.tail) == ("hall", None, indexed)
     assert index.recall is None
     engine.rebuild_index("hall")
-    (index,) = engine.operations.statistics.tell(1).indexes
+    (index,) = engine.statistics.tell(1).indexes
     assert (index.generation, index.tail) == (1, 0)
     assert index.recall == IndexRecall(  # compared whole
         share=1, near=10, sample=0, probes=0, frames=indexed
@@ -164,7 +164,7 @@ def test_of_a_large_store_what_was_counted_is_told_while_a_thread_counts_again(
     engine.create_map(NewMap(name="hall"))
     for upload in uploads[:3]:
         engine.add_frame("hall", upload.data, upload.meta)
-    seen = engine.operations.statistics
+    seen = engine.statistics
     first = seen.tell()
     assert (first.frames, first.counted_at) == ({"received": 3}, first.counted_at)
     engine.add_frame("hall", uploads[3].data, uploads[3].meta)
@@ -182,7 +182,7 @@ def test_of_a_large_store_what_was_counted_is_told_while_a_thread_counts_again(
     again = seen.tell()
     assert (again.frames, again.waiting, threads) == ({"received": 4}, 5, [])
     assert again.counted_at == known.counted_at < again.at
-    assert engine.counts()[0] == {"received": 4}
+    assert engine.statistics.state_counts()[0] == {"received": 4}
     monkeypatch.setattr(statistics, "COUNTING", 1e12)  # and old at once
     assert seen.tell().frames == {"received": 4}
     assert seen.tell().frames == {"received": 4}
@@ -256,17 +256,17 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
     engine.rebuild_index("hall")
     (anchor,) = anchors(engine.settings.indexes)
     seals = engine.store.seals
-    before = seals.open("event", engine.operations.events(EventFilter(), limit=1).newest)
+    before = seals.open("event", engine.events.page(EventFilter(), limit=1).newest)
     assert before is not None
     with engine.store.database.write() as connection:
         for _ in range(2500):
             record_event(connection, "frame.received", "hall")
-    assert engine.operations.tidy() == 0  # it is not time yet
+    assert engine.events.tidy() == 0  # it is not time yet
     # of what was there before the newest 1000, the anchor stays, and the last of the map
     floor = before + 1500
-    assert engine.operations.remove_surplus() == floor - 2
-    assert engine.operations.remove_surplus() == 0
-    page = engine.operations.events(EventFilter(), limit=1000)
+    assert engine.events.remove_surplus() == floor - 2
+    assert engine.events.remove_surplus() == 0
+    page = engine.events.page(EventFilter(), limit=1000)
     numbers = [seals.open("event", one.id) for one in page.items[:3]]
     assert numbers == [anchor, floor, floor + 1]
     other = make_engine(data)
@@ -276,7 +276,7 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
 
 
 def test_a_map_that_another_process_deleted_is_let_go(data, make_engine, monkeypatch):
-    monkeypatch.setattr(retrieval, "_TIDY_S", 1e9)  # by `forget_gone` alone
+    monkeypatch.setattr(retrieval, "_TIDY_S", 1e9)  # by `MemoryPurging` alone
     engine, other = make_engine(data), make_engine(data)
     engine.rebuild_index("hall")
     frame = engine.list_frames("hall").items[0].frame_id
@@ -288,11 +288,11 @@ def test_a_map_that_another_process_deleted_is_let_go(data, make_engine, monkeyp
         return [line for line in Path("/proc/self/maps").read_text().splitlines() if index in line]
 
     assert mapped()
-    engine.forget_gone()
+    engine.memory_purging.run()
     assert mapped()  # it is there
     other.delete_map("hall")
     assert mapped()
-    engine.forget_gone()
+    engine.memory_purging.run()
     assert mapped() == []
 
 
@@ -301,7 +301,7 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
     for name in ("hall", "shop"):
         engine.create_map(NewMap(name=name, model="depth"))
     engine.reencode("shop", small_model)
-    found = {one.name: one for one in engine.operations.catalogue.tell(lambda name: name != "hall")}
+    found = {one.name: one for one in engine.catalogue.tell(lambda name: name != "hall")}
     assert list(found) == [*PRESETS, "small"]
     depth, small = read_model("depth"), found["small"]
     assert found["depth"].maps == ["shop"]
@@ -314,15 +314,15 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
     assert found["depth"].model_id == depth.id
     for name in ("small", "/etc/passwd", "", small_model.id[:12]):
         with pytest.raises(InvalidRequest, match="There is no model"):
-            engine.operations.catalogue.find(name)
+            engine.catalogue.find(name)
     for name in (small_model.id, small_model.label):
-        assert engine.operations.catalogue.find(name).id == small_model.id
-        assert engine.operations.catalogue.find(name, "shop".__eq__).id == small_model.id
+        assert engine.catalogue.find(name).id == small_model.id
+        assert engine.catalogue.find(name, "shop".__eq__).id == small_model.id
         with pytest.raises(InvalidRequest, match="There is no model"):  # another's alone
-            engine.operations.catalogue.find(name, "hall".__eq__)
-    assert engine.operations.catalogue.find(depth.label, lambda _: False).id == depth.id
+            engine.catalogue.find(name, "hall".__eq__)
+    assert engine.catalogue.find(depth.label, lambda _: False).id == depth.id
     with pytest.raises(Conflict, match="is already switching to"):
-        engine.reencode("shop", engine.operations.catalogue.find("paper"))
+        engine.reencode("shop", engine.catalogue.find("paper"))
 
 
 @pytest.mark.parametrize("spread", [0.3, 1.0, 2.0])

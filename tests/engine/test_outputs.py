@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_frames import (
     BYTES,
     NPY,
@@ -35,6 +34,7 @@ from sceneprint_client.api.listing import Run
 from sceneprint_client.api.results import View
 from sceneprint_client.poses import rotation_of
 from sceneprint_lab.synth.dataset import room_and_rng
+from tests.whole_engine import Engine
 
 Ids = Callable[[Engine], list[str]]
 Prepared = list[tuple[Signature, Geometry]]

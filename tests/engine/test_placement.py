@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.engine.search.answer import Outcome, answer_status
 from sceneprint.engine.search.query import localization_of
@@ -32,6 +31,7 @@ from sceneprint.places import QueryFrame, model_parameters
 from sceneprint.store.maps import placed_frames
 from sceneprint.types import Geometry, Patches
 from sceneprint_client.api import Counts, Localization, Prior, Query
+from tests.whole_engine import Engine
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

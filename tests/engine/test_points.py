@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
 from sceneprint.formats.export import points_of
 from sceneprint.geometry.rigid import transform_points
@@ -17,6 +16,7 @@ from sceneprint.pipeline import Signature
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query
 from sceneprint_client.surface_encoding import HEADER, POINT
+from tests.whole_engine import Engine
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

@@ -16,7 +16,6 @@ import pytest
 from sqlalchemy import inspect, text
 
 from sceneprint.atomic_files import folder_turn
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep import index_upkeep, purge
@@ -30,6 +29,7 @@ from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.signatures import stored_vector
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.surface import NewReconstruction
+from tests.whole_engine import Engine
 
 #: Bytes of a piece that is looked for, and pieces of each thing.
 PIECE, MANY = 24, 40
@@ -203,7 +203,7 @@ def test_readers_let_go_of_what_was_deleted(empty, uploads, work_off):
     held = engine.view("hall")[2]
     assert (held.size, len(held.tail), bytes(held.tail.signatures[0])) == (2, 3, gone)
     with engine.store.database.read() as connection:
-        engine._readers.purge(connection)
+        engine.readers.purge(connection)
     now = engine.view("hall")[2]
     assert (now.size, len(now.tail), now.revision) == (2, 2, held.revision)
     assert gone not in now.tail.signatures.tobytes()
@@ -246,13 +246,13 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
     workers = [
         Purging(
-            one.store, one._upkeep, one.query_log, one.tombstones,
+            one.store, one.upkeep, one.query_log, one.tombstones,
             (one.reconstructions, one.differences), 0.0, one.settings.quarantine_dir,
         )
         for one in (second, second)
     ]  # fmt: skip
     first.delete_frame("hall", names[0])
-    folder = index_folder(first.settings.indexes, first._row("hall"))
+    folder = index_folder(first.settings.indexes, first.row("hall"))
     before = newest_number(folder)
     with folder_turn(folder):
         with pytest.raises(BusyIndex, match="may still contain bytes of deleted frames"):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index, retrieval
 from sceneprint.engine.search.retrieval import FIRST_S, Deadline
 from sceneprint.engine.search.verification import thresholds
@@ -32,6 +31,7 @@ from sceneprint.store.tables import frames
 from sceneprint.types import Geometry
 from sceneprint_client.api import Answer, Query
 from sceneprint_client.api.query import ValidationOptions
+from tests.whole_engine import Engine
 
 Prepared = list[tuple[Signature, Geometry]]
 Ids = Callable[[Engine], list[str]]

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.search import local_index
 from sceneprint_client.api import Answer, JobState, NewMap, Query
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 Ids = Callable[[Engine], list[str]]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
 from sceneprint.geometry.retrieval.ranking import Metric
@@ -22,6 +21,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.tables import frames, jobs, signatures
 from sceneprint_client.api import Answer, FrameState, JobState, NewMap, Query
 from sceneprint_lab.synth import SynthRoom
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]

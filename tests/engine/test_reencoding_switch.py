@@ -17,7 +17,6 @@ import pytest
 from sqlalchemy import select
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.engine.search import local_index, query
@@ -31,6 +30,7 @@ from sceneprint.store.signatures import StoredSignature, replace_signature
 from sceneprint.store.tables import signatures
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState, JobState, Query
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -176,7 +176,7 @@ def test_a_query_signed_before_the_switch_is_signed_again(
 def test_signatures_of_two_models_are_not_compared_whatever_their_length(
     full: Engine, uploads: Any, whitened_model: Model, signer: Signer
 ) -> None:
-    row = full._row("hall")
+    row = full.row("hall")
     decoders = full.store.decoders
     asked = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R, decoders)
     given = ([row], asked, R, Deadline(None))
@@ -235,7 +235,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     engine, names = make_engine(full.settings.data_dir, tail_frames=5), ids(full)
     assert engine.publish_due() == 1
-    before = index_folder(engine.settings.indexes, engine._row("hall"))
+    before = index_folder(engine.settings.indexes, engine.row("hall"))
     engine.reencode("hall", small_file)
     assert set(work_off(engine)) == {JobState.SUCCEEDED}
     for asked in (engine, full):
@@ -246,7 +246,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     assert (answer.index_generation, answer.counts.map) == (1, 12)
     assert found(answer) == right(names, by_model, answer.model, 4)
     assert not before.exists()
-    after = index_folder(engine.settings.indexes, engine._row("hall"))
+    after = index_folder(engine.settings.indexes, engine.row("hall"))
     assert [one for one in engine.settings.indexes.iterdir() if one.is_dir()] == [after]
     # the next generation is due again after as many frames, and not before
     assert engine.publish_due() == 0
@@ -279,10 +279,10 @@ def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
         assert engine.run(blind) == JobState.FAILED
     work_off(engine)
     with monkeypatch.context() as patch:  # the worker dies between the two
-        patch.setattr(engine._reencoding, "_switch", lambda *_: False)
+        patch.setattr(engine.housekeeping.reencodings, "_switch", lambda *_: False)
         engine.publish_due()
     assert engine.get_map("hall").reencoding is not None
-    coming = replace(engine._row("hall"), model_id=blind.model_id)
+    coming = replace(engine.row("hall"), model_id=blind.model_id)
     assert index_folder(engine.settings.indexes, coming).is_dir()  # and is not cleared away
     at = names.index(blind.frame.id)
     signature, _ = prepare(uploads[at].frame, whitened_signer)
@@ -334,7 +334,7 @@ WORKER = """
 import sys, time
 from importlib import import_module
 from pathlib import Path
-from sceneprint.engine import Engine
+from tests.whole_engine import Engine
 from sceneprint.settings import Settings
 
 module, name = import_module(sys.argv[2]), sys.argv[3]

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.upkeep import repair
 from sceneprint.engine.upkeep.repair import MOST, PAUSE_S, PRIORITY, resign_frames
 from sceneprint.errors import DamagedBlob
@@ -17,6 +16,7 @@ from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, frames, jobs, signatures
 from sceneprint_client.api import FrameState, JobState, Query
+from tests.whole_engine import Engine
 
 Ids = Callable[[Engine], list[str]]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -122,8 +122,8 @@ def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(
     answer = full.query_frame("hall", hurt, Query())
     assert statuses(answer) == statuses(before)
     assert [m.transform for m in answer.matches] == [m.transform for m in before.matches]
-    wanted = full.operations.wanted("hall", ["frame.damaged"])
-    (event,) = full.operations.events(wanted).items
+    wanted = full.events.wanted("hall", ["frame.damaged"])
+    (event,) = full.events.page(wanted).items
     assert (event.frame_id, event.job_id) == (hurt, waiting(full)[0].id)
     assert [job.frame_number for job in waiting(full)] == [number_of(full, hurt)]
     assert work_off(full) == [JobState.SUCCEEDED]
@@ -204,7 +204,7 @@ def test_what_cannot_be_healed_is_not_tried_for_ever(
     for _ in range(3):
         assert len(work_off(full)) == 1
         due_now(full)
-    assert full.counts()[1]["dead"] == 1
+    assert full.statistics.state_counts()[1]["dead"] == 1
     assert statuses(ask())[hurt][0] == "skipped"
     assert waiting(full) == []
     assert full.get_frame("hall", hurt).state == "indexed"  # it is found all the while

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.rigid import pose_difference
 from sceneprint.pipeline import Signer
@@ -19,6 +18,7 @@ from sceneprint_lab.evaluation.judgement import Candidate, Judge, QueryTask, ans
 from sceneprint_lab.evaluation.protocol import JudgedAnswer
 from sceneprint_lab.evaluation.sites import signed
 from sceneprint_lab.synth import SynthRoom, synthesise_lookalike
+from tests.whole_engine import Engine
 
 Asked = tuple[Answer, JudgedAnswer]
 

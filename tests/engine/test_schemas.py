@@ -12,11 +12,11 @@ import pytest
 from pydantic import BaseModel, ValidationError
 from scipy.spatial.transform import Rotation
 
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.frame_decoder import pose_matrix
 from sceneprint.engine.serializers import transform
 from sceneprint.errors import InvalidPose, InvalidRequest, MapExists
 from sceneprint_client.api import FrameMeta, FrameState, GivenPose, JobState, NewMap, Query
+from tests.whole_engine import Engine
 
 CAMERA: dict[str, Any] = {"width": 4, "height": 3, "fx": 2, "fy": 2, "cx": 2, "cy": 1}
 EYE = np.eye(4).tolist()
@@ -162,7 +162,7 @@ def test_maps_are_made_once(make_engine: Callable[..., Engine]) -> None:
         given = {"name": "hall", "title": "Hall", "model": "depth"} | other
         with pytest.raises(MapExists, match="'hall' already exists with a different title, model"):
             engine.create_map(NewMap.model_validate(given))
-    assert engine.list_maps().items == [made]
+    assert engine.list_maps() == [made]
 
 
 def test_a_frame_is_told_as_it_was_sent(

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine
 from sceneprint.maintenance.scrub import Scrub
 from sceneprint.process import StopSignal
 from sceneprint.settings import Settings
 from sceneprint.store.scrub_rows import PASS_S, SLICE_S, ScrubRow, read_scrub
 from sceneprint.store.tables import frames, scrubs, signatures
 from sceneprint_client.api import JobState
+from tests.whole_engine import Engine
 from worker.loop import Trace, Worker
 
 
@@ -75,7 +75,7 @@ def test_all_bytes_are_read_once_a_day(full: Engine) -> None:
     assert before <= stored.began_at <= stored.finished_at <= time.time()
     assert stored.next_at == stored.began_at + PASS_S
     assert _scrub(full).run(now=True) is None  # nobody else begins another
-    told = full.operations.statistics.tell().scrub
+    told = full.statistics.tell().scrub
     assert told is not None
     assert (told.blobs, told.bytes, told.damaged) == (row.blobs, row.bytes, 0)
 
@@ -119,8 +119,8 @@ def test_damage_is_told_and_what_can_be_made_again_is(
     row = _scrub(full).run(now=True)
     assert row is not None
     assert row.damaged == 5
-    wanted = full.operations.wanted("hall", ["frame.damaged"])
-    found = full.operations.events(wanted).items
+    wanted = full.events.wanted("hall", ["frame.damaged"])
+    found = full.events.page(wanted).items
     assert {(one.frame_id, one.data.get("upload", False)) for one in found} == {
         (ids[1], False), (ids[2], False), (ids[3], True), (ids[4], False),
     }  # fmt: skip

@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps import selections as module
 from sceneprint.engine.maps.selections import delete_selection, edit_selection
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.listing import FrameListing, FramesEdit, FrameSelection
+from tests.whole_engine import Engine
 
 #: Session, robot and tags of each of twelve uploads.
 TAKEN = [("a", "r1", ["x"])] * 5 + [("b", "r2", ["x", "y"])] * 4 + [(None, None, [])] * 3

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.products.session_differences import POINTS
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint_client.api import JobState
 from sceneprint_client.api.sessions import GONE, NEW, Difference, NewDifference
 from sceneprint_client.surface_encoding import SurfacePoints, decode_points
+from tests.whole_engine import Engine
 
 WorkOff = Callable[[Engine], list[JobState | None]]
 #: Of the box's front, before the cameras; and the pixels that it fills there.

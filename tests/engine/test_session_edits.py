@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps import selections
 from sceneprint.engine.maps.map_frames import list_sessions
 from sceneprint.engine.maps.selections import delete_session, edit_session
 from sceneprint.errors import UnknownFrame, UnknownMap, UnknownSession
 from sceneprint_client.api import Frame, FrameMeta
 from sceneprint_client.api.listing import FrameListing, SessionEdit
+from tests.whole_engine import Engine
 
 #: Session and robot of each of twelve uploads.
 TAKEN = [("a", "r1")] * 5 + [("a", "r2")] * 3 + [("a/..", "r1")] * 2 + [(None, "r1")] * 2

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
 from sceneprint_client.api import Answer, NamedFrame, NewMap, Query, SeveralQuery
+from tests.whole_engine import Engine
 
 Ids = Callable[[Engine], list[str]]
 MAPS = ["hall", "lab"]

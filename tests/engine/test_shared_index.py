@@ -19,7 +19,6 @@ from sqlalchemy import select
 
 from benchmarks.s3 import ObjectServer
 from sceneprint.atomic_files import folder_turn
-from sceneprint.engine import Engine
 from sceneprint.engine.search import index_place, local_index
 from sceneprint.engine.search.index_place import IN_USE_S, IndexPlace
 from sceneprint.engine.search.local_index import index_folder
@@ -33,6 +32,7 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.postgres.session_locks import index_turn
 from sceneprint.store.tables import MapRow, frames, signatures
 from sceneprint_client.api import Answer, NewMap, Query
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 WorkOff = Callable[[Engine], list[Any]]
@@ -92,7 +92,7 @@ def built(host: Callable[..., Engine], fill: Callable[..., list[str]]) -> Engine
 
 
 def shared(engine: Engine) -> IndexPlace:
-    return engine._indexes
+    return engine.indexes
 
 
 def row_of(engine: Engine, name: str = "hall") -> MapRow:
@@ -354,15 +354,15 @@ def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
     left = []
     for drop in ({5}, {6}):
         append(one, 0, frozenset(drop))
-        service._purged = time.monotonic() - 1
+        service.memory_purging._purged = time.monotonic() - 1
         shared(service).sync(row_of(one))
-        service.forget_gone()
+        service.memory_purging.run()
         left.append(numbers(service))
     assert left == [[2], []]
     append(one, 0, clean=True)
     shared(service).sync(row_of(one))
-    service._purged = time.monotonic() - 1
-    service.forget_gone()
+    service.memory_purging._purged = time.monotonic() - 1
+    service.memory_purging.run()
     assert numbers(service) == [4]
 
 
@@ -476,8 +476,8 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
     assert held() == {"two", "three"}
     assert other.purging.now().indexes == 0  # it fetches the other's
     assert held() == {"three"}
-    service._purged = time.monotonic() - 1
-    service.forget_gone()
+    service.memory_purging._purged = time.monotonic() - 1
+    service.memory_purging.run()
     assert held() == set()
     assert keys(objects)[:2] == [".swept", "0000000002.json"]
     assert [ask(engine, uploads).counts.map for engine in (built, other, service)] == [3, 3, 3]
@@ -493,8 +493,8 @@ def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(
     built.delete_frame("hall", ids(built)[0])
     left = []
     for _ in range(2):
-        service._purged = time.monotonic() - 1
-        service.forget_gone()
+        service.memory_purging._purged = time.monotonic() - 1
+        service.memory_purging.run()
         left.append(numbers(service))
     assert left == [[1], []]
     assert ask(service, uploads).counts.map == 3
@@ -530,8 +530,8 @@ def test_nothing_is_shared_of_maps_that_are_gone(
     left = {one.key.split("/")[1] for one in objects.list("index/")}
     assert left == {".swept", folder_of(built, "other").name}
     assert name not in left
-    service._purged = time.monotonic() - 1
-    service.forget_gone()
+    service.memory_purging._purged = time.monotonic() - 1
+    service.memory_purging.run()
     assert not folder.exists()
 
 

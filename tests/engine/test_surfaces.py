@@ -14,7 +14,6 @@ import pytest
 from PIL import Image
 from sqlalchemy import func, select
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps import map_surface, surface_job
 from sceneprint.engine.maps.map_surface import SurfaceUpkeep
 from sceneprint.engine.maps.surface_job import surface_points
@@ -36,6 +35,7 @@ from sceneprint.store.tables import (
 from sceneprint.types import Floats
 from sceneprint_client.api import JobState
 from sceneprint_client.surface_encoding import SurfaceCells, decode_tile
+from tests.whole_engine import Engine
 
 WorkOff = Callable[[Engine], list[JobState | None]]
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC).timestamp()

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs import tasks
 from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import Handler, IsOver, LongJob, SliceResult
@@ -19,6 +18,7 @@ from sceneprint.store.events import number_events
 from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
 from sceneprint_client.api import Job, JobState, NewMap
+from tests.whole_engine import Engine
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def items(engine: Engine, job: Job) -> list[int]:
 
 
 def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
-    engine.tasks.register("count", count_to(engine, 3))
-    job, _ = engine.tasks.begin("count", "hall", {"to": 3})
+    engine.handle("count", count_to(engine, 3))
+    job, _ = engine.begin_task("count", "hall", {"to": 3})
     assert (job.kind, job.map, job.frame_id, job.progress) == ("count", "hall", None, None)
     claimed = engine.claim("w")
     assert isinstance(claimed, LongJob)
@@ -77,8 +77,8 @@ def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
 
 
 def test_a_slice_of_a_worker_that_fell_silent_counts_once(engine, work_off):
-    engine.tasks.register("count", count_to(engine, 2))
-    job, _ = engine.tasks.begin("count", "hall", {})
+    engine.handle("count", count_to(engine, 2))
+    job, _ = engine.begin_task("count", "hall", {})
     late = engine.claim("silent")
     with engine.store.database.write() as connection:
         connection.execute(update(jobs).values(leased_until=1.0))
@@ -95,8 +95,8 @@ def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work
             raise InvalidRequest("the second step is impossible")
         return count_to(engine, 3)(task, is_over)
 
-    engine.tasks.register("count", handle)
-    job, _ = engine.tasks.begin("count", "hall", {})
+    engine.handle("count", handle)
+    job, _ = engine.begin_task("count", "hall", {})
     assert work_off(engine) == [JobState.QUEUED, JobState.FAILED]
     failed = engine.get_job(job.job_id)
     assert (failed.error, failed.traceback) == ("the second step is impossible", None)
@@ -114,8 +114,8 @@ def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
     def handle(_task: LongJob, _: IsOver) -> SliceResult:
         raise RuntimeError("no luck")
 
-    engine.tasks.register("count", handle)
-    job, _ = engine.tasks.begin("count", None, {})
+    engine.handle("count", handle)
+    job, _ = engine.begin_task("count", None, {})
     states = []
     for _ in range(3):
         with engine.store.database.write() as connection:
@@ -129,17 +129,17 @@ def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
 
 
 def test_a_kind_that_nobody_does_says_so(engine, work_off):
-    job, _ = engine.tasks.begin("dance", "hall", {})
+    job, _ = engine.begin_task("dance", "hall", {})
     assert work_off(engine) == [JobState.FAILED]
     assert "kind 'dance'" in str(engine.get_job(job.job_id).error)
     with pytest.raises(UnknownMap):
-        engine.tasks.begin("dance", "nowhere", {})
+        engine.begin_task("dance", "nowhere", {})
 
 
 def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
-    engine.tasks.register("count", count_to(engine, 2))
-    job, _ = engine.tasks.begin("count", "hall", {})
-    other, _ = engine.tasks.begin("count", None, {})
+    engine.handle("count", count_to(engine, 2))
+    job, _ = engine.begin_task("count", "hall", {})
+    other, _ = engine.begin_task("count", None, {})
     claimed = engine.claim("w")
     assert engine.run(claimed) == JobState.QUEUED
     with engine.store.database.read() as connection:
@@ -159,8 +159,8 @@ def test_frames_that_wait_are_signed_between_two_slices(
     engine: Engine, uploads: Any, work_off: Callable[[Engine], list[JobState]],
     due_now: Callable[[Engine], None],
 ) -> None:  # fmt: skip
-    engine.tasks.register("count", count_to(engine, 3))
-    engine.tasks.begin("count", "hall", {})
+    engine.handle("count", count_to(engine, 3))
+    engine.begin_task("count", "hall", {})
     first = engine.claim("w")
     assert isinstance(first, LongJob)
     assert engine.run(first) == JobState.QUEUED
@@ -174,8 +174,8 @@ def test_frames_that_wait_are_signed_between_two_slices(
 
 
 def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) -> None:
-    engine.tasks.register("count", count_to(engine, 30))
-    job, _ = engine.tasks.begin("count", "hall", {})
+    engine.handle("count", count_to(engine, 30))
+    job, _ = engine.begin_task("count", "hall", {})
     for _ in range(12):  # a machine that is restarted within every other slice
         assert isinstance(engine.claim("killed"), LongJob)
         with engine.store.database.write() as connection:
@@ -194,8 +194,8 @@ def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
             remove_job(connection, find_job(connection, task.job.id))
         return count_to(engine, 2)(task, is_over)
 
-    engine.tasks.register("count", handle)
-    engine.tasks.begin("count", "hall", {})
+    engine.handle("count", handle)
+    engine.begin_task("count", "hall", {})
     broke: list[bool] = []
     claimed = engine.claim("w")
     assert claimed is not None
@@ -216,8 +216,8 @@ def test_a_file_that_a_deletion_swept_is_made_again(
             collect_blobs(engine.store, swept)
         return outcome
 
-    engine.tasks.register("count", handle)
-    job, _ = engine.tasks.begin("count", "hall", {})
+    engine.handle("count", handle)
+    job, _ = engine.begin_task("count", "hall", {})
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     assert engine.get_job(job.job_id).attempts == 1
     assert engine.store.blobs.get(swept[0]) == b"part 0"
@@ -226,8 +226,8 @@ def test_a_file_that_a_deletion_swept_is_made_again(
 def test_a_file_that_another_takes_the_place_of_is_removed(
     engine: Engine, work_off: Callable[[Engine], list[JobState]]
 ) -> None:
-    engine.tasks.register("count", count_to(engine, 3))
-    engine.tasks.begin("count", "hall", {})
+    engine.handle("count", count_to(engine, 3))
+    engine.begin_task("count", "hall", {})
     work_off(engine)
     [blob] = engine.store.blobs.digests()
     assert engine.store.blobs.get(blob) == b"part 2"
@@ -240,15 +240,15 @@ def test_a_slice_ends_when_another_tenant_waits(
 
     def handle(_: LongJob, is_over: IsOver) -> SliceResult:
         with work_of("other"):
-            engine.tasks.begin("count", "hall", {})
+            engine.begin_task("count", "hall", {})
         while not is_over():
             pass
         return SliceResult(over=False, progress={"done": 1, "total": 2})
 
-    engine.tasks.register("endless", handle)
-    engine.tasks.register("count", count_to(engine, 1))
+    engine.handle("endless", handle)
+    engine.handle("count", count_to(engine, 1))
     with work_of("own"):
-        engine.tasks.begin("endless", "hall", {})
+        engine.begin_task("endless", "hall", {})
     held = engine.claim("w")
     assert held is not None
     assert engine.run(held) == JobState.QUEUED

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.maps import selections, tombstones
 from sceneprint.engine.maps.map_lifecycle import begin_reencoding, edit_map
@@ -30,6 +29,7 @@ from sceneprint.store.maps import MapUsage, counted_usage, find_frame, find_map
 from sceneprint.store.tables import frames as frames_table
 from sceneprint_client.api import Frame, FrameMeta, FrameState, JobState, NewMap, Query
 from sceneprint_client.api.listing import FrameListing, FrameSelection
+from tests.whole_engine import Engine
 
 #: What a restored frame has anew.
 FRESH = {"revision", "job_id", "indexed_at", "state"}
@@ -132,7 +132,7 @@ def test_a_frame_of_a_map_that_has_another_model_now_is_signed_again(
 ) -> None:
     first = next(iter(frames(full)))
     full.delete_frame("hall", first)
-    begin_reencoding(full.store, "hall", small_model)
+    begin_reencoding(full.store, full.bell, "hall", small_model)
     full.publish_due()
     work_off(full)
     full.publish_due()

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint.engine.results.query_entry import decode_answer, encode_answer
 from sceneprint.engine.search.query import localization_of
@@ -20,6 +19,7 @@ from sceneprint.store.maps import find_frame, find_map
 from sceneprint.types import Floats
 from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query
 from sceneprint_client.api.base import FrameMeta, checked
+from tests.whole_engine import Engine
 
 Ids = Callable[[Engine], list[str]]
 Z = [0.0, 0.0, 1.0]  #: up in the world of synthetic rooms

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine import Engine
-from sceneprint.engine import engine as administration
+from sceneprint.engine import signers
 from sceneprint.engine.search import retrieval
 from sceneprint.errors import InvalidRequest, UnreadableModel
 from sceneprint.index import generation, index_manifest, manifests
@@ -19,6 +18,7 @@ from sceneprint.index.index_manifest import read_manifest
 from sceneprint.index.part_files import verify
 from sceneprint.store.tables import models
 from sceneprint_client.api import JobState, NewMap, Query
+from tests.whole_engine import Engine
 
 Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
@@ -108,7 +108,7 @@ def test_what_was_not_asked_for_long_is_not_held(
         for name in ("hall", "other", "hall"):
             answer = engine.queries.upload([name], uploads[0].data, uploads[0].meta, ALL)
             assert answer.matches[0].distance == 0
-        return list(engine._readers._open)
+        return list(engine.readers._open)
 
     assert held() == ["other", "hall"]
     monkeypatch.setattr(retrieval, "HELD_BYTES", 2 * 64 * 448 - 1)  # 64 rows are set aside at once
@@ -125,9 +125,9 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
     with engine.store.database.write() as connection:
         connection.execute(update(models).where(models.c.id == old).values(content=b"of old"))
     fresh = make_engine()
-    fresh.warm()
+    fresh.signers.warm()
     (error,) = [r for r in caplog.records if r.levelname == "ERROR"]
-    assert (error.name, error.__dict__["model"]) == (administration.__name__, old)
+    assert (error.name, error.__dict__["model"]) == (signers.__name__, old)
     fill(fresh, uploads, work_off, range(1))
     assert fresh.queries.upload(["hall"], uploads[0].data, uploads[0].meta, ALL).counts.map == 1
     with pytest.raises(UnreadableModel):

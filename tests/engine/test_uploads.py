@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 from sqlalchemy import Connection, event, update
 
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.upkeep import garbage_collection
@@ -24,6 +23,7 @@ from sceneprint.errors import (
 )
 from sceneprint.store.tables import jobs
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
+from tests.whole_engine import Engine
 
 Told = Callable[[Engine], list[str]]
 WorkOff = Callable[[Engine], list[JobState | None]]
@@ -61,7 +61,7 @@ def test_the_same_upload_is_the_frame_that_is_there(
     assert (again.frame_id, again.job_id, new) == (first.frame_id, first.job_id, False)
     assert again.state == FrameState.INDEXED
     assert told(empty) == ["map.created", "frame.received", "frame.indexed"]
-    assert empty.counts() == ({"indexed": 1}, {"succeeded": 1})
+    assert empty.statistics.state_counts() == ({"indexed": 1}, {"succeeded": 1})
 
 
 def sweep_before(engine: Engine, table: str, digests: Callable[[], list[str]]) -> None:
@@ -163,7 +163,7 @@ def test_other_metadata_of_the_same_content_is_a_conflict_that_names_it(
     said = f"Frame {added.frame_id} has the same content, but a different {fields}. A map stores"
     assert str(caught.value).startswith(said)
     assert len(blobs(empty)) == 1
-    assert empty.counts() == ({"received": 1}, {"queued": 1})
+    assert empty.statistics.state_counts() == ({"received": 1}, {"queued": 1})
 
 
 def test_another_parent_frame_or_pose_is_a_conflict(empty: Engine, uploads: Any) -> None:
@@ -210,7 +210,7 @@ def test_what_cannot_be_a_frame_is_refused_and_not_kept(empty: Engine, uploads: 
     with pytest.raises(UselessFrame, match="All 307200 samples are missing"):
         empty.add_frame("hall", out.getvalue(), meta)
     assert blobs(empty) == []
-    assert empty.counts() == ({}, {})
+    assert empty.statistics.state_counts() == ({}, {})
 
 
 def test_a_deleted_frame_is_found_no_more_and_may_come_again(

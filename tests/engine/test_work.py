@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.store.maps import find_map
 from sceneprint.store.signatures import changes_since
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
+from tests.whole_engine import Engine
 
 Told = Callable[[Engine], list[str]]
 WorkOff = Callable[[Engine], list[JobState | None]]

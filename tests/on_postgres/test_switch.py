@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
+from tests.whole_engine import Engine
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("SCENEPRINT_TEST_DATABASE") != "postgresql", reason="make test-postgres"
@@ -21,10 +21,10 @@ pytestmark = pytest.mark.skipif(
 CHILD = """
 import sys
 from pathlib import Path
-from sceneprint.engine import Engine
+from tests.whole_engine import Engine
 from sceneprint.settings import Settings
 with Engine(Settings(data_dir=Path(sys.argv[1]))) as engine:
-    print(engine.store.database.dialect, *[one.name for one in engine.list_maps().items])
+    print(engine.store.database.dialect, *[one.name for one in engine.list_maps()])
 """
 
 
@@ -33,7 +33,7 @@ def opened(folder: Path) -> Engine:
 
 
 def names(engine: Engine) -> list[str]:
-    return [one.name for one in engine.list_maps().items]
+    return [one.name for one in engine.list_maps()]
 
 
 def test_a_folder_has_a_database_and_its_copy_a_copy(tmp_path: Path) -> None:

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from benchmarks.postgres import Server
-from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway, UnknownFrame
 from sceneprint.settings import Settings
 from sceneprint.store import Database
 from sceneprint.store.events import EventFilter, EventRow
 from sceneprint_client.api import JobState, NewMap, Query
 from service.event_stream import Feed
+from tests.whole_engine import Engine
 
 ASKED = Query(k=5, candidates=5, keep=False)
 

@@ -18,11 +18,11 @@ import pytest
 
 from benchmarks.postgres import OPTIONS, Server, binaries, of_nobody
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.errors import UnknownFrame
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 from sceneprint_client.api import JobState, NewMap, Query
+from tests.whole_engine import Engine
 
 SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "deployment" / "recover.sh"
 #: Of the server's command line, which the copy in its folder does not have.

@@ -20,7 +20,6 @@ from sqlalchemy import select, text, update
 from benchmarks.postgres import Server
 from benchmarks.s3 import ObjectServer
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_doomed_blobs
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
@@ -34,6 +33,7 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.postgres.connection import LOCKS
 from sceneprint.store.tables import doomed, signatures
 from sceneprint_client.api import JobState, NewMap
+from tests.whole_engine import Engine
 
 Until = Callable[[Callable[[], Any]], Any]
 OTHER = hashlib.sha256(b"of another frame").hexdigest()

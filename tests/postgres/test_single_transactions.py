@@ -13,7 +13,6 @@ import pytest
 from sqlalchemy import event, func, insert, literal_column, select, text, update
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.engine.jobs import signature_job
@@ -38,6 +37,7 @@ from sceneprint.store.tables import (
     signatures,
 )
 from sceneprint_client.api import JobState, NewMap
+from tests.whole_engine import Engine
 
 Until = Callable[[Callable[[], Any]], Any]
 MODEL = "ab" * 32

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 from sqlalchemy import event, text
 
-from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import next_events
 from sceneprint.engine.jobs.tasks import SliceResult
 from sceneprint.engine.upkeep.purge import Retention
@@ -25,6 +24,7 @@ from sceneprint.store.events import EventFilter
 from sceneprint.store.maps import find_map, map_usage
 from sceneprint.store.postgres.connection import LOCKS, TURN
 from sceneprint_client.api import JobState, NewMap
+from tests.whole_engine import Engine
 
 _ALL = re.compile(rf"pg_advisory_xact_lock\({LOCKS}, {TURN}\)")
 _WAITING = text("SELECT count(*) FROM pg_locks WHERE locktype = 'transactionid' AND NOT granted")
@@ -104,8 +104,8 @@ def test_retention_takes_the_turn_of_its_map(engine: Engine, small: Any) -> None
 
 
 def test_a_slice_takes_the_turn_of_its_map(engine: Engine) -> None:
-    engine.tasks.register("count", lambda _task, _is_over: SliceResult(True, {}, event="counted"))
-    engine.tasks.begin("count", "hall", {})
+    engine.handle("count", lambda _task, _is_over: SliceResult(True, {}, event="counted"))
+    engine.begin_task("count", "hall", {})
     work = engine.claim("w")
     assert work is not None
     with turns(engine) as taken:

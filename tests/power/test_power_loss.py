@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, event
 
 from sceneprint import atomic_files
-from sceneprint.engine import Engine
 from sceneprint.index import Generation, generation, newest, publish
 from sceneprint.index.index_manifest import GenerationManifest
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameMeta, JobState, NewMap
+from tests.whole_engine import Engine
 
 LENGTH = 64
 Recorded = Callable[..., Any]

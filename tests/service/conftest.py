@@ -28,12 +28,12 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from benchmarks.waiting import PATIENCE_S, until
-from sceneprint.engine import Engine
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.settings import Settings
 from sceneprint.types import DepthFrame, Floats32, Intrinsics
 from sceneprint_client.api.admin import Scope
 from service.app import create_app
+from tests.whole_engine import Engine
 
 BIN = Path(sys.executable).parent
 #: The origin whose pages may ask the server for all tests.
@@ -369,7 +369,8 @@ def _opened(
             httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://here")
         ) as client,
     ):
-        engine = app.state.context.engine
+        context = app.state.service.context
+        engine = Engine(context.settings, context)
         secrets = {name: engine.create_key(name, grants).secret for name, grants in keys.items()}
         yield House(client, portal, engine, secrets)
 

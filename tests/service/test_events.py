@@ -13,8 +13,8 @@ import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
+from tests.whole_engine import Engine
 
 STREAM = {"Accept": "text/event-stream"}
 

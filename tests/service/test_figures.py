@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 
 from sceneprint import process
-from sceneprint.engine import Engine
 from sceneprint.process import JsonFormatter, name_request, of_request, request_id
 from sceneprint.settings import Settings
 from sceneprint.store import database
 from sceneprint.store.store_counts import samples_since
 from sceneprint_client.api import Answer
 from service.metrics import Sampler
+from tests.whole_engine import Engine
 
 
 def test_what_was_done_is_told(served, make_map, shots, until):

@@ -19,10 +19,10 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import doctor
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint.store.postgres.connection import allow
 from sceneprint_client.api import FrameMeta, NewMap
+from tests.whole_engine import Engine
 
 BIN = Path(sys.executable).parent
 #: Largest file that a process may write from now on, where no disk can be mounted: less than the

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.jobs import lifecycle
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap
+from tests.whole_engine import Engine
 
 HALL = "/v1/maps/hall"
 NEAREST = {"stages": ["retrieve"], "k": 9, "exact": True}

@@ -17,9 +17,9 @@ import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
+from tests.whole_engine import Engine
 
 #: The key's own map, one that it may not see, and one that is not there: names of one length.
 OWN, THEIRS, NONE = "alpha", "bravo", "zulus"

@@ -15,13 +15,14 @@ from starlette.requests import Request
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.engine import Engine
-from sceneprint.engine.admin.operations import list_keys
+from sceneprint.engine.admin.operations import create_key, list_keys
 from sceneprint.settings import Settings
-from service.app import create_app
+from service.app import create_app, housekeeping
 from service.auth import caller
 from service.limits import RequestBody
-from service.metrics import Sampler, housekeeping
+from service.metrics import Metrics
+from service.running_service import Service
+from tests.whole_engine import Engine
 
 BELOW = (
     ("GET", "/v1/maps"),
@@ -144,8 +145,9 @@ def test_who_uses_a_key_waits_for_no_note_of_it(tmp_path):
             return {one.name: one.last_used_at is not None for one in list_keys(engine.store).items}
 
         async def serve() -> None:
-            async with housekeeping(engine, Sampler()):
-                assert engine.find_key(secret).name == "busy"
+            service = Service(engine.context, Metrics())
+            async with housekeeping(service):
+                assert service.find_key(secret).name == "busy"
                 assert used() == {"busy": False, "idle": False}
 
         asyncio.run(serve())
@@ -158,8 +160,8 @@ def test_a_key_is_looked_up_while_every_shared_thread_is_taken(tmp_path):
 
     async def ask() -> str:
         async with app.router.lifespan_context(app):
-            here = app.state.context
-            secret = here.engine.create_key("robot").secret
+            here = app.state.service
+            secret = create_key(here.context.store, "robot").secret
             shared = to_thread.current_default_thread_limiter()
             slow = [object() for _ in range(int(shared.total_tokens))]
             for one in slow:

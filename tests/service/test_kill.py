@@ -18,9 +18,9 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint_client.api import NewMap
+from tests.whole_engine import Engine
 
 #: Frames that a robot may send for each kill.
 FRAMES_A_KILL = 4

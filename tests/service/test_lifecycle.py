@@ -13,8 +13,8 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
+from tests.whole_engine import Engine
 
 
 @pytest.fixture(scope="module")

@@ -19,10 +19,12 @@ import pytest
 import starlette.formparsers
 from fastapi import FastAPI
 
+from sceneprint.engine.maps import map_lifecycle
 from sceneprint.settings import Settings
 from sceneprint_client.api import Added
-from service.app import UPLOADS, create_app
+from service.app import create_app
 from service.routes import frames
+from service.running_service import UPLOADS
 
 JSON, FORM = "application/json", "multipart/form-data; boundary=x"
 #: The beginning of a form whose file is larger than is kept in memory, and its end.
@@ -112,14 +114,14 @@ def test_of_json_no_more_is_read_than_anyone_has_to_say(inside, path):
 
 def test_a_map_is_made_off_the_event_loop(inside, monkeypatch):
     async def test(app: FastAPI) -> None:
-        engine, threads = app.state.context.engine, []
-        make = engine.create_map
+        threads = []
+        make = map_lifecycle.create_map
 
-        def noted(new: Any) -> Any:
+        def noted(store: Any, new: Any) -> Any:
             threads.append(threading.current_thread())
-            return make(new)
+            return make(store, new)
 
-        monkeypatch.setattr(engine, "create_map", noted)
+        monkeypatch.setattr(map_lifecycle, "create_map", noted)
         asked = Asked(app, "/v1/maps", JSON, [b'{"name": "hall"}'])
         assert (await asked.answer())["name"] == "hall"
         assert asked.status == 201

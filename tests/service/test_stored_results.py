@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.engine.results.query_entry import SentQuery, StoredAnswer, query_row
 from sceneprint.settings import Settings
 from sceneprint.store.maps import add_frame, find_map
 from sceneprint_client.api import Answer, Counts, NewMap, Query
 from sceneprint_client.api.query import FrameName
+from tests.whole_engine import Engine
 
 
 @pytest.fixture(scope="module")

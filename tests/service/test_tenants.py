@@ -17,7 +17,6 @@ from starlette.applications import Starlette
 
 import service
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine import Engine
 from sceneprint.engine.admin.operations import create_tenant
 from sceneprint.errors import RateLimited
 from sceneprint.process import NOBODY, work_of
@@ -38,6 +37,7 @@ from service.limits import (
 )  # fmt: skip
 from service.metrics import MOST_TENANTS, Metrics, TenantMetrics
 from service.middleware import RequestMiddleware
+from tests.whole_engine import Engine
 
 
 class Clock:

@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy import Engine, event
 from starlette.types import Message
 
-from service.auth import READY_S
+from service.running_service import READY_S
 
 AT_ONCE = 48
 

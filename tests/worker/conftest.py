@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from benchmarks.waiting import PATIENCE_S, until
-from sceneprint.engine import Engine
 from sceneprint.settings import Settings
 from sceneprint_client.api import Added, FrameMeta, NewMap
+from tests.whole_engine import Engine
 
 LEASE_S = 1.5  # a busy machine renews one late at times
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from benchmarks.waiting import PATIENCE_S, until
-from sceneprint.engine import Engine
 from sceneprint_client.api import FrameMeta, NewMap
+from tests.whole_engine import Engine
 
 #: The workers as they are, but for what they do with frames of some focal lengths. Nothing but
 #: the bell, and the time of the next try, wakes those that wait.

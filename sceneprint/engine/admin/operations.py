@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.admin.statistics import Statistics, anchors
-from sceneprint.engine.maps.map_lifecycle import Catalogue
+from sceneprint.engine.admin.statistics import anchors
 from sceneprint.engine.serializers import when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.process import COMMAND, Actor
@@ -38,7 +37,6 @@ from sceneprint.store.events import (
 from sceneprint.store.maps import find_map
 from sceneprint.store.opaque_ids import OpaqueIds, invalid_cursor
 from sceneprint.store.queue import read_clock
-from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Page
 from sceneprint_client.api.admin import (
     EVERY,
@@ -122,13 +120,11 @@ AT_MOST = 20_000
 MOST_KINDS = 20
 
 
-class OperatorTasks:
-    """Events, statistics and models of one store."""
+class Events:
+    """Events of one store, and their removal."""
 
-    def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
+    def __init__(self, store: Store, settings: Settings) -> None:
         self._store, self._settings = store, settings
-        self.statistics = Statistics(store, settings, bell)
-        self.catalogue = Catalogue(store.database)
         self._tidied = time.monotonic()
 
     def wanted(self, map_name: str | None = None, kinds: Sequence[str] = ()) -> EventFilter:
@@ -156,7 +152,7 @@ class OperatorTasks:
             row = find_map(connection, map_name)
         return EventFilter(frozenset((row.name,)), tuple(kinds))
 
-    def events(
+    def page(
         self, wanted: EventFilter, *, after: str | None = None, cursor: str | None = None,
         limit: int = 100, newest_first: bool = False,
     ) -> EventPage:  # fmt: skip
@@ -389,6 +385,12 @@ def _check_name(name: str, of: str) -> None:
 
 #: Default and maximum seconds for which the former secret stays valid after a rotation.
 OVERLAP_S, MOST_OVERLAP_S = 3600.0, 30 * 86_400.0
+
+
+def revoke_key(store: Store, name: str) -> None:
+    """Revoke a key; raise UnknownKey if there is none of that name."""
+    with store.database.write() as connection:
+        stored.revoke_key(connection, name)
 
 
 def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey:

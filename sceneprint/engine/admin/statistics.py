@@ -21,6 +21,7 @@ from typing import Any
 from sqlalchemy import Connection, func, select
 
 from sceneprint.atomic_files import nearest_folder
+from sceneprint.engine.context import Context
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
 from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
@@ -35,7 +36,6 @@ from sceneprint.store.queue import PENDING, count_jobs, read_clock, waiting_by_t
 from sceneprint.store.scrub_rows import ScrubRow, read_scrub
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
-from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import JobState
 from sceneprint_client.api.admin import (
     OUTCOMES,
@@ -276,11 +276,17 @@ class StoreCounts:
         return not 0 <= time.time() - self.at < self.seconds / COUNTING
 
 
+def record_start(store: Store, worker: str) -> None:
+    """Record the start of a worker; ignore errors of the store."""
+    with suppress(SceneprintError), store.database.write(turn=False) as connection:
+        store_counts.add_sample(connection, WORKER, worker, {})
+
+
 class Statistics:
     """Statistics of one store."""
 
-    def __init__(self, store: Store, settings: Settings, bell: Wakeup) -> None:
-        self._store, self._settings, self._bell = store, settings, bell
+    def __init__(self, context: Context) -> None:
+        self._store, self._settings, self._bell = context.store, context.settings, context.bell
         self._counts: StoreCounts | None = None
         self._counting = threading.Lock()  # held while a large store is counted
         self._sizes: tuple[float, Sizes] | None = None
@@ -362,6 +368,12 @@ class Statistics:
                 raise
         return counts
 
+    def state_counts(self) -> tuple[dict[str, int], dict[str, int]]:
+        """Return how many frames and how many jobs are in each state; see `counts`."""
+        with self._store.database.read() as connection:
+            found = self.counts(connection)
+        return dict(found.frames), dict(found.jobs)
+
     def _count_again(self) -> None:
         try:
             with self._store.database.read() as connection:
@@ -379,11 +391,6 @@ class Statistics:
             seconds=time.monotonic() - start,
         )  # fmt: skip
         return self._counts
-
-    def began(self, worker: str) -> None:
-        """Record the start of a worker; ignore errors of the store."""
-        with suppress(SceneprintError), self._store.database.write(turn=False) as connection:
-            store_counts.add_sample(connection, WORKER, worker, {})
 
     def _look(self) -> Figures:
         stats = self.tell(minutes=1)

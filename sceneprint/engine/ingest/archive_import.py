@@ -20,9 +20,10 @@ from typing import Any
 from sqlalchemy import Connection, func, select
 
 from sceneprint import errors
+from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
 from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, queue_task
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.formats.archive import BLOCK, Archive, Inflater, is_archive, open_archive
 from sceneprint.formats.dataset import FrameReference
@@ -35,7 +36,7 @@ from sceneprint.formats.dataset.frame_reference import (
 from sceneprint.formats.surface_file import surface_format
 from sceneprint.geometry.views import ViewParameters, view_parameters
 from sceneprint.models import ModelParameters, parse_model
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.blobs.folder import IncomingBlob
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.deletion import make_room
@@ -311,18 +312,12 @@ def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewPa
 
 
 class Imports:
-    """Imports of archives, and the start of those of maps.
+    """Imports of archives, and the start of those of maps."""
 
-    Parameters
-    ----------
-    most_bytes : maximum size of an archive as sent
-    """
-
-    def __init__(self, store: Store, tasks: Tasks, uploads: Uploads, most_bytes: int) -> None:
-        self._store, self._tasks, self._uploads = store, tasks, uploads
-        self._most = most_bytes
+    def __init__(self, context: Context, uploads: Uploads) -> None:
+        self._store, self._bell, self._uploads = context.store, context.bell, uploads
+        self._most = context.settings.import_bytes
         self._tidied = time.monotonic()
-        tasks.register(KIND, self.handle)
 
     @contextmanager
     def receive(self, map_name: str, options: ImportOptions) -> Iterator[Receiver]:
@@ -381,13 +376,15 @@ class Imports:
 
         Raises
         ------
-        UnknownMap, IdempotencyConflict, QuotaExceeded : see `Tasks.begin`; the archive is removed.
+        UnknownMap, IdempotencyConflict, QuotaExceeded : see `queue_task`; the archive is removed.
         Conflict : an import of the same archive has just ended, and removed it.
         """
         data = options.model_dump(mode="json", by_alias=True)
         kind = MAP_KIND if options.as_ == "map" else KIND
         try:
-            job, again = self._tasks.begin(kind, map_name, data, options.priority, [archive], once)
+            job, again = queue_task(
+                self._store, self._bell, kind, map_name, data, options.priority, [archive], once
+            )
         except Swept as error:
             raise errors.Conflict(
                 "An import of the same file ended while this one was received, and its bytes were "

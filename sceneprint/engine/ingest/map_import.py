@@ -21,6 +21,7 @@ from numpy.lib import format as npy
 from sqlalchemy import Connection
 
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
+from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.archive_import import (
     import_item,
     states_of_import,
@@ -33,7 +34,6 @@ from sceneprint.engine.products.map_coverage import outcome_of
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_upload
 from sceneprint.engine.search.up_vectors import PlanAxes, plan_axes
-from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DecoderFailure,
     FrameError,
@@ -44,7 +44,7 @@ from sceneprint.errors import (
 from sceneprint.formats.depth_file import encode_npy, encode_png
 from sceneprint.formats.surface_file import SurfaceOptions
 from sceneprint.geometry.views import Renderer, ViewParameters, choose_views
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.frame_queries import PathFrame, has_parent_frame
 from sceneprint.store.maps import current_map, living_frame, map_usage
@@ -182,15 +182,14 @@ class MapImporter:
 
     Parameters
     ----------
-    store, signers, uploads, queries : parts of the engine
-    seconds : maximum processor time to decode a file
+    uploads : adds the views of a map as frames
+    queries : tests the map with views that it does not have
     """
 
-    def __init__(
-        self, store: Store, signers: Signers, uploads: Uploads, queries: Queries, seconds: float
-    ) -> None:
-        self._limits = SurfaceLimits(seconds=seconds)
-        self._store, self._signers = store, signers
+    def __init__(self, context: Context, uploads: Uploads, queries: Queries) -> None:
+        # processor time: what is left of a job's time is for writing
+        self._limits = SurfaceLimits(seconds=0.75 * context.settings.job_s)
+        self._store, self._signers = context.store, context.signers
         self._uploads, self._queries = uploads, queries
         self._phases = {
             "read": self._read, "choose": self._choose, "render": self._render,

@@ -21,12 +21,12 @@ from weakref import WeakValueDictionary
 from sqlalchemy import Connection, select
 
 from sceneprint import errors
+from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.frame_decoder import columns, content_id, read_upload
 from sceneprint.engine.ingest.write_groups import Grouping, NewFrames
 from sceneprint.engine.serializers import sample_range_of
 from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.formats.sample_range import sample_range
-from sceneprint.store import Store
 from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import relax_novelty, renew_frame
@@ -41,7 +41,6 @@ from sceneprint.store.maps import (
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.queue import enqueue, signing_jobs
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
-from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Added, FrameMeta, FrameState
 from sceneprint_client.api.frames import (
     BatchItem,
@@ -296,19 +295,14 @@ class IncomingBytes:
 
 
 class Uploads:
-    """Store uploaded frames in maps; safe to share between threads.
+    """Store uploaded frames in maps; safe to share between threads."""
 
-    Parameters
-    ----------
-    store, bell : store, and wakeup of its workers
-    """
-
-    def __init__(self, store: Store, bell: Wakeup) -> None:
-        self._store, self._bell = store, bell
+    def __init__(self, context: Context) -> None:
+        self._store, self._bell = context.store, context.bell
         # by map, while a thread writes to it
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
-        self._new_frames = NewFrames(store.database)
+        self._new_frames = NewFrames(context.store.database)
         self.incoming = IncomingBytes()
 
     def add(

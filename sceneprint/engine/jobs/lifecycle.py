@@ -24,6 +24,7 @@ from sceneprint.store.queue import fail_dead_worker
 from sceneprint.store.queue import list_jobs as list_stored
 from sceneprint.store.reencoding_rows import REENCODE
 from sceneprint.store.tables import ARCHIVE, FrameRow, JobRow, MapRow
+from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import FrameState, Job, JobState, Page
 from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
@@ -224,7 +225,7 @@ def cancel(store: Store, job_id: str) -> Job:
     return cancelled
 
 
-def retry(store: Store, job_id: str) -> tuple[Job, bool]:
+def retry(store: Store, bell: Wakeup, job_id: str) -> tuple[Job, bool]:
     """Retry a job that failed or was cancelled, by a new job of the same priority.
 
     Returns
@@ -238,6 +239,13 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
     CannotRetry : the job succeeded, its frame has a later job that is over, or the upload is
         missing.
     """
+    job, is_new = _retry(store, job_id)
+    if is_new:
+        bell.ring()
+    return job, is_new
+
+
+def _retry(store: Store, job_id: str) -> tuple[Job, bool]:
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
         if job.frame_number is None:
@@ -274,7 +282,7 @@ def retry(store: Store, job_id: str) -> tuple[Job, bool]:
 
 
 def retry_dead(
-    store: Store, cursor: str | None = None, limit: int = 100,
+    store: Store, bell: Wakeup, cursor: str | None = None, limit: int = 100,
     map_names: Collection[str] | None = None,
 ) -> RetriedJobs:  # fmt: skip
     """Retry a page of dead jobs, the newest first; ignore jobs that were retried already.
@@ -291,7 +299,7 @@ def retry_dead(
         if job.followed_by is not None:
             continue
         try:
-            again, is_new = retry(store, job.job_id)
+            again, is_new = retry(store, bell, job.job_id)
         except (CannotRetry, UnknownJob) as error:
             refused.append(RefusedRetry(job_id=job.job_id, reason=str(error)))
         else:

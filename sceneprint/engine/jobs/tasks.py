@@ -1,6 +1,6 @@
 """Long jobs, which are not about a single frame and run in slices.
 
-    begin  -->  queued  --claim-->  LongJob  --Tasks.run-->  a SliceResult for each slice
+    queue_task  -->  queued  --claim-->  LongJob  --Tasks.run-->  a SliceResult for each slice
 
 The results and progress of a slice are one commit, fenced by the job's token. If a worker dies, its
 slice is repeated.
@@ -131,63 +131,64 @@ def ends_within(is_over: IsOver, seconds: float) -> IsOver:
     return lambda: time.monotonic() >= until or is_over()
 
 
+def queue_task(
+    store: Store, bell: Wakeup, kind: str, map_name: str | None, data: dict[str, Any],
+    priority: int = 0, files: Collection[queue.JobFile] = (), once: IdempotentRequest | None = None,
+) -> tuple[Job, bool]:  # fmt: skip
+    """Queue a long job, and wake a worker.
+
+    Parameters
+    ----------
+    kind : of the job, such as associate
+    map_name : the map that the job works on, or None
+    data : the request, as JSON
+    priority : on the same scale as that of frames
+    files : that the job works on
+    once : the request that is to take effect once
+
+    Returns
+    -------
+    job : the job as it is now
+    replayed : whether an earlier request with the key of `once` queued the job
+
+    Raises
+    ------
+    UnknownMap : no such map.
+    Swept : a file is gone; put it once more.
+    IdempotencyConflict : an earlier request with the key of `once` differs from this one.
+    QuotaExceeded : the map has no room for an archive among the files.
+    """
+    with store.database.write() as connection:
+        row = None if map_name is None else find_map(connection, map_name)
+        before = None if once is None else once.stored_result(connection)
+        if before is not None:
+            with suppress(UnknownJob):  # its map may have been deleted and made anew
+                there = queue.find_job(connection, before["job_id"])
+                return job_record(there, None, map_name), True
+        _check_files(store, files)
+        size = sum(one.bytes for one in files if one.name == ARCHIVE)
+        gone = [] if row is None else make_room(connection, row, size, new=False)
+        number = None if row is None else row.number
+        job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
+        queue.add_files(connection, job.number, files)
+        record_change(connection, "job.queued", map_name, job.id, kind=kind)
+        if once is not None:
+            once.store(connection, {"job_id": job.id})
+    collect_deleted_blobs(store, gone)
+    bell.ring()
+    return job_record(job, None, map_name), False
+
+
 class Tasks:
-    """The handlers of long jobs, by kind."""
+    """Runs slices of long jobs.
 
-    def __init__(self, store: Store, bell: Wakeup) -> None:
-        self._store, self._bell = store, bell
-        self._handlers: dict[str, Handler] = {}
+    Parameters
+    ----------
+    handlers : by the kinds of jobs that this process can run
+    """
 
-    def register(self, kind: str, handler: Handler) -> None:
-        """Let this process run jobs of a kind."""
-        self._handlers[kind] = handler
-
-    def begin(
-        self, kind: str, map_name: str | None, data: dict[str, Any], priority: int = 0,
-        files: Collection[queue.JobFile] = (), once: IdempotentRequest | None = None,
-    ) -> tuple[Job, bool]:  # fmt: skip
-        """Queue a job.
-
-        Parameters
-        ----------
-        kind : kind, such as associate
-        map_name : name of its map, or None
-        data : parameters, as JSON
-        priority : priority, as of frames
-        files : input files
-        once : request that must take effect once
-
-        Returns
-        -------
-        job : job
-        replayed : whether an earlier request of `once` queued it; it is returned as it is now
-
-        Raises
-        ------
-        UnknownMap : the map does not exist.
-        Swept : a file was removed; store it again.
-        IdempotencyConflict : another request was sent with the key of `once`.
-        QuotaExceeded : the map has no room for an archive among the files.
-        """
-        with self._store.database.write() as connection:
-            row = None if map_name is None else find_map(connection, map_name)
-            before = None if once is None else once.stored_result(connection)
-            if before is not None:
-                with suppress(UnknownJob):  # a new map may have replaced its map
-                    former = queue.find_job(connection, before["job_id"])
-                    return job_record(former, None, map_name), True
-            self._check(files)
-            size = sum(one.bytes for one in files if one.name == ARCHIVE)
-            gone = [] if row is None else make_room(connection, row, size, new=False)
-            number = None if row is None else row.number
-            job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
-            queue.add_files(connection, job.number, files)
-            record_change(connection, "job.queued", map_name, job.id, kind=kind)
-            if once is not None:
-                once.store(connection, {"job_id": job.id})
-        collect_deleted_blobs(self._store, gone)
-        self._bell.ring()
-        return job_record(job, None, map_name), False
+    def __init__(self, store: Store, bell: Wakeup, handlers: Mapping[str, Handler]) -> None:
+        self._store, self._bell, self._handlers = store, bell, handlers
 
     def run(
         self, task: LongJob, lease_s: float, longest_s: float,
@@ -273,7 +274,7 @@ class Tasks:
                     )
             else:
                 queue.requeue_slice(connection, task.job, outcome.progress, outcome.after_s)
-            self._check(outcome.files)
+            _check_files(self._store, outcome.files)
             if not all(map(self._store.blobs.holds, outcome.blobs)):
                 raise Swept("A deletion removed the same bytes before they were stored.")
             # after the job, which fails if the job was deleted
@@ -284,12 +285,6 @@ class Tasks:
             gone += queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
             gone += [before[one.name].blob for one in outcome.files if one.name in before]
             return gone if outcome.write is None else [*gone, *outcome.write(connection)]
-
-    def _check(self, files: Collection[queue.JobFile]) -> None:
-        """Check that files exist, in the transaction that refers to them."""
-        for file in files:
-            if not self._store.blobs.holds(file.blob):
-                raise Swept(f"A deletion removed the same {file.name} before its job was stored.")
 
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
         try:
@@ -307,6 +302,15 @@ class Tasks:
                 return queue.fail(connection, task.job, reason, trace)
         except LostLease:
             return None
+
+
+def _check_files(store: Store, files: Collection[queue.JobFile]) -> None:
+    """Raise Swept if a file is gone, in the transaction that refers to them from now on."""
+    for one in files:
+        if not store.blobs.holds(one.blob):
+            raise Swept(
+                f"A deletion elsewhere swept the same {one.name} before its job was stored."
+            )
 
 
 def _make_room(

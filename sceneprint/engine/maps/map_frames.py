@@ -164,6 +164,13 @@ def list_frames(
     return Page[Frame](items=items, next_cursor=more)
 
 
+def get_frame(store: Store, map_name: str, frame_id: str) -> Frame:
+    """Return a frame; raise UnknownMap or UnknownFrame if it does not exist."""
+    with store.database.read() as connection:
+        row = find_map(connection, map_name)
+        return frame_records(connection, row, [find_frame(connection, row, frame_id)])[0]
+
+
 def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
     """The cursor of the page after a frame; where it was taken is in it, as it may be deleted."""
     sealed = store.seals.seal("frame", last.number)

@@ -22,18 +22,27 @@ import numpy as np
 from sqlalchemy import Connection, select
 
 from sceneprint import errors
-from sceneprint.engine import serializers
+from sceneprint.engine.context import Context
 from sceneprint.engine.ingest import frame_decoder
 from sceneprint.engine.ingest.frame_decoder import base_of, columns, viewpoint_of
 from sceneprint.engine.search.local_index import trusted
-from sceneprint.engine.serializers import map_record, model_label
-from sceneprint.engine.upkeep.garbage_collection import collect_blobs
+from sceneprint.engine.serializers import (
+    frame_records,
+    frame_tag,
+    map_record,
+    map_tag,
+    model_label,
+    transform,
+    when,
+)
+from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.index import Generation
 from sceneprint.models import PRESETS, Model, parse_model, read_model, write_model
 from sceneprint.store import Database, Store, signatures
 from sceneprint.store import reencoding_rows as stored
 from sceneprint.store.audit_log import record_change
+from sceneprint.store.deletion import remove_map
 from sceneprint.store.frames import write_frame, write_map
 from sceneprint.store.maps import (
     add_map,
@@ -47,6 +56,7 @@ from sceneprint.store.maps import (
 from sceneprint.store.parent_joins import root_columns
 from sceneprint.store.queue import cancel_jobs
 from sceneprint.store.tables import FrameRow, MapRow, jobs, models
+from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import Frame, FrameMeta, FrameState, Map, NewMap
 from sceneprint_client.api.admin import ModelInfo
 from sceneprint_client.api.base import ROS_NAMES, record_of
@@ -77,14 +87,36 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
         if there is None:
             store_model(connection, model.id, model.name, write_model(model))
             row = add_map(connection, new.name, new.title, model.id, limits)
-            return serializers.map_record(connection, row), True
+            return map_record(connection, row), True
         other = any(getattr(there, name) != value for name, value in limits.items())
         if other or (there.title, there.model_id) != (new.title, model.id):
             raise errors.MapExists(
                 f"Map {new.name!r} already exists with a different title, model, limits or up. Use "
                 "it as it is, delete it, or choose another name."
             )
-        return serializers.map_record(connection, there), False
+        return map_record(connection, there), False
+
+
+def get_maps(store: Store) -> list[Map]:
+    """Return all maps, by name."""
+    with store.database.read() as connection:
+        return [map_record(connection, row) for row in list_maps(connection)]
+
+
+def get_map(store: Store, name: str) -> Map:
+    """Return a map; raise UnknownMap if there is none of that name."""
+    with store.database.read() as connection:
+        return map_record(connection, find_map(connection, name))
+
+
+def delete_map(context: Context, name: str) -> None:
+    """Delete a map with all that is in it; raise UnknownMap if there is none of that name."""
+    store = context.store
+    context.query_log.remove_of_map(name)  # most of them, while other writers get their turns
+    with store.database.write() as connection:
+        blobs = remove_map(connection, find_map(connection, name))
+    context.readers.forget(name)
+    collect_deleted_blobs(store, blobs)
 
 
 # Metadata of frames and maps, edited by a JSON merge patch (RFC 7396).
@@ -135,13 +167,13 @@ def edit_frame(
         frame = find_frame(connection, row, frame_id)
         if frame.state == FrameState.DELETED:
             raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
-        _check_tag(f"Frame {frame.id}", serializers.frame_tag(frame), if_match)
+        _check_tag(f"Frame {frame.id}", frame_tag(frame), if_match)
         values = edited(frame, patch)
         if "pose_parent" in values:  # it is sent anew, in a parent frame that may be joined
             values = {"sent_parent": None, "sent_pose": None, **values}
             values |= root_columns(connection, replace(frame, **values))
         now = write_frame(connection, row, frame, values)
-        return serializers.frame_records(connection, row, [now])[0]
+        return frame_records(connection, row, [now])[0]
 
 
 def edit_map(
@@ -159,10 +191,10 @@ def edit_map(
         values["up"] = change.up.unit
     with store.database.read() if dry_run else store.database.write() as connection:
         row = find_map(connection, map_name)
-        _check_tag(f"Map {row.name!r}", serializers.map_tag(row), if_match)
+        _check_tag(f"Map {row.name!r}", map_tag(row), if_match)
         if dry_run:
-            return serializers.map_record(connection, replace(row, **values))
-        return serializers.map_record(connection, write_map(connection, row, values))
+            return map_record(connection, replace(row, **values))
+        return map_record(connection, write_map(connection, row, values))
 
 
 def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
@@ -193,7 +225,7 @@ def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
     now = {
         "robot": frame.robot,
         "session": frame.session,
-        "captured_at": serializers.when(frame.captured_at),
+        "captured_at": when(frame.captured_at),
         "tags": frame.tags,
         "pose": _relative_transform(frame.pose, "parent_frame", frame.pose_parent),
         "T_base_sensor": _relative_transform(frame.base, "base_frame", frame.base_frame),
@@ -219,7 +251,7 @@ def _with(now: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, 
     given = {ROS_NAMES.get(name, name): value for name, value in given.items()}
     kept = dict(now or {})
     if "matrix" in kept and ("translation" in given or "rotation" in given):
-        T = serializers.transform(np.array(kept.pop("matrix")), "", "")
+        T = transform(np.array(kept.pop("matrix")), "", "")
         kept |= {"translation": T.translation.model_dump(), "rotation": T.rotation.model_dump()}
     merged = {**kept, **given}
     return {name: value for name, value in merged.items() if value is not None}
@@ -257,7 +289,7 @@ log = logging.getLogger(__name__)
 TIDY_S = 2.0
 
 
-def begin_reencoding(store: Store, map_name: str, model: str | Path | Model) -> Map:
+def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Path | Model) -> Map:
     """Have a map signed with another model; where that is under way, try again what broke down.
 
     Parameters
@@ -290,6 +322,7 @@ def begin_reencoding(store: Store, map_name: str, model: str | Path | Model) -> 
         else:
             record_change(connection, "map.reencoding_retried", row.name, model=wanted.id)
     _enqueue(store, row, again=True)
+    bell.ring()
     with store.database.read() as connection:
         return map_record(connection, find_map(connection, map_name))
 

@@ -13,7 +13,8 @@ from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import Conflict, QuotaExceeded, UnknownDeletion, UnknownFrame
 from sceneprint.store import Store
 from sceneprint.store.deletion import oldest_tombstones, purge_frames
-from sceneprint.store.maps import find_map, list_maps
+from sceneprint.store.frames import delete_frame
+from sceneprint.store.maps import find_frame, find_map, list_maps
 from sceneprint.store.queue import read_clock
 from sceneprint.store.tables import MapRow
 from sceneprint.store.tombstones import (
@@ -42,7 +43,7 @@ _NUMBER = re.compile("[0-9]{1,18}")
 
 
 class Tombstones:
-    """Restores deleted frames, and purges them when their time is over.
+    """Deletes frames, restores them, and purges them when their time is over.
 
     Parameters
     ----------
@@ -61,6 +62,14 @@ class Tombstones:
         row : of the map, as the writing transaction reads it
         """
         return row.revision + 1 if self._seconds > 0 else None
+
+    def delete_frame(self, map_name: str, frame_id: str) -> None:
+        """Delete a frame at once; raise UnknownMap or UnknownFrame if it does not exist."""
+        with self._store.database.write() as connection:
+            row = find_map(connection, map_name)
+            frame = find_frame(connection, row, frame_id)
+            blobs = delete_frame(connection, row, frame, self.begin(row))
+        collect_deleted_blobs(self._store, blobs)
 
     def find(self, connection: Connection, row: MapRow, number: int | None) -> FrameDeletion | None:
         """Return the deletion of a number, if it can be undone."""

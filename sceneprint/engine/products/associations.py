@@ -13,16 +13,14 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept, Tasks
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Swept
 from sceneprint.engine.products.edge_consensus import finish_association
 from sceneprint.engine.products.pose_graph import graph_text, pose_graph
 from sceneprint.engine.products.product import StepwiseProducts
 from sceneprint.engine.search.local_index import IndexView
-from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import sensor_frame, transform
-from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import DamagedBlob, InvalidRequest, JoinStands, UnreadableGeometry
 from sceneprint.formats.export import information_of
@@ -38,7 +36,6 @@ from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, associate
-from sceneprint.store import Store
 from sceneprint.store.events import record_event
 from sceneprint.store.frame_queries import (
     PathFrame,
@@ -146,10 +143,6 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     priority = 0
     item_count = "edges"
 
-    def __init__(self, store: Store, tasks: Tasks, signers: Signers, readers: Readers) -> None:
-        super().__init__(store, tasks)
-        self._signers, self._readers = signers, readers
-
     def start(self, connection: Connection, row: MapRow, request: NewAssociation) -> dict[str, Any]:
         """Fix the frames of both sessions, in the order of time; see `runs_of`."""
         runs = runs_of(connection, row, request)
@@ -218,7 +211,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         with self._store.database.read() as connection:
             found = items_of(connection, task.job.number) + items
             stops = path_frames(connection, {*source, *target})
-        scale = self._signers(task.of_map.model_id).model.answer.map.same_m / MapParameters().same_m
+        model = self._context.signers(task.of_map.model_id).model
+        scale = model.answer.map.same_m / MapParameters().same_m
         verdicts, counts, joins = finish_association(found, source, target, stops, request, scale)
         rooted = self._rooted(task, joins) if request.join and len(request.sessions) == 2 else []
         result = {
@@ -270,13 +264,13 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         """
         row = of
         while True:  # its signer opened while no connection is held
-            model = self._signers(row.model_id).model
+            model = self._context.signers(row.model_id).model
             with self._store.database.read() as connection:
                 row = find_map(connection, of.name)
                 if row.number != of.number:
                     raise unknown_map(of.name)
                 if row.model_id == model.id:
-                    return row, model, self._readers.view(connection, row)
+                    return row, model, self._context.readers.view(connection, row)
 
     def undo_join(self, map_name: str, job_id: str) -> Association:
         """Undo the join of an association: all frames have the poses that the other joins give

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult, Tasks
+from sceneprint.engine.context import Context
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.maps.map_plans import (
     QueriedPosition,
     coverage_plans,
@@ -28,7 +29,6 @@ from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.engine.serializers import model_label
-from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DamagedBlob,
     DamagedSignature,
@@ -37,7 +37,6 @@ from sceneprint.errors import (
     UnreadableGeometry,
 )
 from sceneprint.geometry.rigid import pose_difference
-from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     PathFrame,
     QueryOrigin,
@@ -114,9 +113,9 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
     record = MapCoverage
     item_count = "frames"
 
-    def __init__(self, store: Store, tasks: Tasks, signers: Signers, queries: Queries) -> None:
-        super().__init__(store, tasks)
-        self._signers, self._queries = signers, queries
+    def __init__(self, context: Context, queries: Queries) -> None:
+        super().__init__(context)
+        self._queries = queries
 
     def start(self, connection: Connection, row: MapRow, request: NewMapCoverage) -> dict[str, Any]:
         """Choose the frames to query; raise InvalidRequest if there is none."""
@@ -160,8 +159,8 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
             query = plain.model_copy(update={"filter": Filter(not_within_s=left_out_s)})
 
         def ask(rows: list[MapRow]) -> Answer:
-            self._signers(rows[0].model_id)  # while no connection is held
-            ready = prepare_stored(self._store, self._signers, row.name, stop.id, plain)
+            self._context.signers(rows[0].model_id)  # while no connection is held
+            ready = prepare_stored(self._store, self._context.signers, row.name, stop.id, plain)
             if ready.frame is None or ready.frame[0] != stop.number:
                 raise UnknownFrame(f"Frame {stop.id} was deleted, and a new frame has its id.")
             ready = replace(ready, taken=taken)

@@ -14,11 +14,12 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
+from sceneprint.engine.context import Context
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, ends_within, queue_task
 from sceneprint.engine.serializers import job_progress, when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import DamagedBlob, NotIndexed, UnknownJob
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.audit_log import record_change
 from sceneprint.store.maps import current_map, find_map, map_of_number
 from sceneprint.store.opaque_ids import row_of
@@ -64,9 +65,8 @@ class Products(ABC, Generic[Request, Record]):
     priority: ClassVar[int] = BACKGROUND
     item_count: ClassVar[str] = ""
 
-    def __init__(self, store: Store, tasks: Tasks) -> None:
-        self._store, self._tasks = store, tasks
-        tasks.register(self.kind, self.run_slice)
+    def __init__(self, context: Context) -> None:
+        self._context, self._store = context, context.store
 
     # what each product adds
 
@@ -113,7 +113,8 @@ class Products(ABC, Generic[Request, Record]):
         with self._store.database.read() as connection:
             progress = self.start(connection, find_map(connection, map_name), request)
         data = request.model_dump(mode="json", exclude_unset=True)
-        job, _ = self._tasks.begin(self.kind, map_name, data, self.priority)
+        bell = self._context.bell
+        job, _ = queue_task(self._store, bell, self.kind, map_name, data, self.priority)
         begun = self.get(map_name, job.job_id)
         if begun.progress is None:
             total = Progress(done=0, total=progress["total"])

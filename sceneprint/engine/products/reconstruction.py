@@ -15,7 +15,7 @@ import numpy as np
 from sqlalchemy import Connection, select
 
 from sceneprint.engine.ingest.frame_decoder import read_stored
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, queue_task
 from sceneprint.engine.maps.map_frames import living
 from sceneprint.engine.products.product import Products
 from sceneprint.engine.results.query_entry import StoredAnswer
@@ -285,7 +285,8 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
                 blob, size = self._store.blobs.put(data_of_query), len(data_of_query)
                 files = [queue.JobFile(QUERY, blob, size, "application/octet-stream")]
             try:
-                job, _ = self._tasks.begin(self.kind, of, data, files=files)
+                bell = self._context.bell
+                job, _ = queue_task(self._store, bell, self.kind, of, data, files=files)
             except Swept:
                 continue
             except BaseException:

@@ -16,11 +16,10 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Tasks, ends_within
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, ends_within
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
 from sceneprint.engine.products.product import SLICE_S, Products
 from sceneprint.engine.search.up_vectors import parent_axes
-from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     DamagedBlob,
     InvalidRequest,
@@ -46,7 +45,7 @@ from sceneprint.geometry.cells import (
 )
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.rigid import transform_points
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.frame_queries import (
     any_purged,
     parents_of_session,
@@ -113,10 +112,6 @@ class Differences(Products[NewDifference, Difference]):
     kind = "difference"
     record = Difference
 
-    def __init__(self, store: Store, tasks: Tasks, signers: Signers) -> None:
-        super().__init__(store, tasks)
-        self._signers = signers
-
     def start(self, connection: Connection, row: MapRow, request: NewDifference) -> dict[str, Any]:
         """Choose the frames to compare, and their parent frame; see `shared_parent`."""
         parent = shared_parent(connection, row, request)
@@ -144,7 +139,8 @@ class Differences(Products[NewDifference, Difference]):
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
             file = queue.files_of(connection, task.job.number).get(STATE)
-        parameters = self._signers(row.model_id).model.parameters  # while no connection is held
+        # while no connection is held
+        parameters = self._context.signers(row.model_id).model.parameters
         progress.setdefault("cell_m", cell_width(parameters.cloud.voxel_size))
         state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))
         if progress["done"] < progress["total"] // 2:

@@ -19,14 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneprint import errors
+from sceneprint.engine.context import Context
 from sceneprint.engine.maps.map_frames import FORM, Output, find_indexed, geometry_of, placed
 from sceneprint.engine.results.query_entry import StoredAnswer
-from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
-from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, write_ply
@@ -47,7 +46,6 @@ from sceneprint.geometry.validation.inspection import (
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.pipeline import validate, validate_guided, validate_without_up
-from sceneprint.store import Store
 from sceneprint.store.frames import refers_to
 from sceneprint.store.maps import (
     find_frame,
@@ -107,8 +105,8 @@ class StoredPair:
 class Pairs:
     """Matches of stored answers."""
 
-    def __init__(self, store: Store, signers: Signers, query_log: QueryLog) -> None:
-        self._store, self._signers, self._log = store, signers, query_log
+    def __init__(self, context: Context) -> None:
+        self._store, self._signers, self._log = context.store, context.signers, context.query_log
         self._remembered = _ValidationCache()
 
     def find(self, query_id: str, frame_id: str, map_name: str | None = None) -> StoredPair:
@@ -247,9 +245,9 @@ def _match_of(stored: StoredAnswer, frame_id: str, map_name: str | None) -> Told
 class Inspection:
     """Stored answers, and what they rest on."""
 
-    def __init__(self, store: Store, signers: Signers, query_log: QueryLog) -> None:
-        self._store, self._signers, self._log = store, signers, query_log
-        self.pairs = Pairs(store, signers, query_log)
+    def __init__(self, context: Context) -> None:
+        self._store, self._signers, self._log = context.store, context.signers, context.query_log
+        self.pairs = Pairs(context)
 
     def answer(self, query_id: str) -> Answer:
         """The answer again; UnknownQuery where it is not stored, or no longer."""
@@ -449,8 +447,9 @@ def _triples(rows: Floats) -> list[Triple]:
 class PointClouds:
     """Points of frames, queries and matches as bytes; see `sceneprint.formats.export`."""
 
-    def __init__(self, store: Store, signers: Signers, pairs: Pairs, query_log: QueryLog) -> None:
-        self._store, self._signers, self._pairs, self._log = store, signers, pairs, query_log
+    def __init__(self, context: Context, pairs: Pairs) -> None:
+        self._store, self._signers, self._log = context.store, context.signers, context.query_log
+        self._pairs = pairs
 
     def frame(
         self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT

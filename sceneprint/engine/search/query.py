@@ -10,14 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+from sceneprint.engine.context import Context
 from sceneprint.engine.results.query_entry import SentQuery, StoredAnswer, query_row
-from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.engine.search.answer import SequenceFrame, answer
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.retrieval import (
     Deadline,
     PreparedQuery,
-    Readers,
     SearchedMap,
     check_taken,
     prepare_stored,
@@ -35,7 +34,6 @@ from sceneprint.errors import (
     UnknownMap,
 )
 from sceneprint.formats.artifact import read_geometry
-from sceneprint.geometry.kernel import Cores
 from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.geometry.retrieval.ranking import distances, similarity
 from sceneprint.geometry.rigid import inverse
@@ -49,6 +47,7 @@ from sceneprint_client.api import (
     Answer,
     Comparison,
     FrameMeta,
+    FrameName,
     Localization,
     NamedFrame,
     Query,
@@ -235,11 +234,9 @@ class Queries:
     cores : that queries share
     """
 
-    def __init__(
-        self, store: Store, signers: Signers, readers: Readers, query_log: QueryLog, cores: Cores
-    ) -> None:
-        self._store, self._signers, self._readers = store, signers, readers
-        self._log, self._cores = query_log, cores
+    def __init__(self, context: Context) -> None:
+        self._store, self._signers, self._readers = context.store, context.signers, context.readers
+        self._log, self._cores = context.query_log, context.cores
 
     def upload(
         self, maps: Sequence[str], data: bytes, meta: FrameMeta, query: Query,
@@ -302,7 +299,7 @@ class Queries:
         return self._steadily([map_name], ask)
 
     def stored(
-        self, maps: Sequence[str], frame: NamedFrame, query: Query, since: float | None = None,
+        self, maps: Sequence[str], frame: FrameName, query: Query, since: float | None = None,
         sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
         """Look a stored frame up, which does not find itself; see `prepare_stored` and `upload`."""
@@ -338,8 +335,7 @@ class Queries:
         """
         frame = stored.answer.frame
         if frame is not None:
-            named = NamedFrame(map=frame.map, frame_id=frame.frame_id)
-            return self.stored(maps, named, query, since, sent)
+            return self.stored(maps, frame, query, since, sent)
         deadline, geometry = Deadline(query.deadline_ms, since), None
         if "validate" in query.stages:
             if stored.geometry is None:

@@ -22,6 +22,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
+from sceneprint.engine.context import Context
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.products.product import Products
 from sceneprint.engine.results.query_log import QueryLog
@@ -137,6 +138,28 @@ class Retention:
         if numbers:
             log.info("old frames deleted", extra={"map": row.name, "frames": len(numbers)})
         return len(numbers)
+
+
+class MemoryPurging:
+    """Drops what this process holds of deleted maps and frames."""
+
+    def __init__(self, context: Context) -> None:
+        self._context, self._every_s = context, context.settings.purge_s / 2
+        self._purged = time.monotonic()
+
+    def run(self) -> None:
+        """Drop what is held of deleted maps, and of deleted frames if it is time to look."""
+        context, readers = self._context, self._context.readers
+        context.query_log.tidy()  # this node may have no worker
+        with context.store.database.read() as connection:
+            if time.monotonic() - self._purged < self._every_s:
+                readers.tidy(connection)
+                return
+            self._purged = time.monotonic()
+            context.store.geometries.forget_older(self._every_s)
+        context.indexes.purge_local()
+        with context.store.database.read() as connection:
+            readers.purge(connection)
 
 
 #: Seconds for which a deletion is left to whoever began it.

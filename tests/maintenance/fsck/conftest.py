@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
-from sceneprint.engine import Engine
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.maintenance.fsck.findings import Finding
@@ -23,6 +22,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.maps import add_map, store_model
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import FrameMeta, GivenPose, JobState, Query
+from tests.whole_engine import Engine
 
 #: Frames of `hall`, all signed; the first index holds half of them, the second all.
 HALL = 12

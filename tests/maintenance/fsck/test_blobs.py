@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.maintenance.fsck.check import check_frames
 from sceneprint.maintenance.fsck.findings import GONE, Finding, Folder
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
+from tests.whole_engine import Engine
 
 DIGEST = "ab" * 32
 FIRST = "SELECT f.id, f.blob, geometry FROM frames f JOIN signatures ON frame_number = number"
@@ -43,7 +43,7 @@ def lost(house: Any) -> Callable[[str], tuple[Path, str]]:
             blob = upload if kind == "upload" else artifact
             return house.blob(blob), f"the {kind} of frame {frame_id} of map hall"
         with Engine(house.settings) as engine:
-            job, _ = engine.tasks.begin("reconstruct", "hall", {})
+            job, _ = engine.begin_task("reconstruct", "hall", {})
             blobs = [engine.store.blobs.put(one) for one in (b"a picture", b"a mesh", b"cells")]
             with engine.store.database.write() as connection:
                 add_files(connection, find_job(connection, job.job_id).number, [

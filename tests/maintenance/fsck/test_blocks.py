@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from sqlalchemy import insert
 
-from sceneprint.engine import Engine
 from sceneprint.maintenance.fsck import findings
 from sceneprint.maintenance.fsck.findings import Folder
 from sceneprint.settings import Settings
@@ -17,6 +16,7 @@ from sceneprint.store import Store
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import MapRow, frames
 from sceneprint_client.api import NewMap
+from tests.whole_engine import Engine
 
 N, BLOCK = 2_000, 100
 

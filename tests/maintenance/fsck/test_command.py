@@ -19,9 +19,9 @@ from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.engine import Engine
 from sceneprint_client import Client
 from sceneprint_lab.cli.demo import serving
+from tests.whole_engine import Engine
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint.errors import NewerSchema, UnusableStore
 from sceneprint.maintenance.fsck.check import FATAL
 from sceneprint_client.api import NewMap
+from tests.whole_engine import Engine
 
 FLIPS = 30
 #: Rows of which every byte that matters is checked.

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from sceneprint.engine import Engine
 from sceneprint_client.api import Query
+from tests.whole_engine import Engine
 
 
 @pytest.mark.parametrize("kind", ["keys", "faiss", "json"])

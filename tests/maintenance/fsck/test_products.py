@@ -10,7 +10,6 @@ import pytest
 
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_folder
-from sceneprint.engine import Engine
 from sceneprint.formats.depth_file import encode_png
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
@@ -26,6 +25,7 @@ from sceneprint.store.query_rows import (
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, write_tile
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
+from tests.whole_engine import Engine
 
 
 def query_of(letter: str, *, listed: bool = True) -> NewQuery:
@@ -40,7 +40,7 @@ def query_of(letter: str, *, listed: bool = True) -> NewQuery:
 def fill(engine: Engine) -> tuple[str, str]:
     """Add something of each kind; ids of the job, and of a deletion that can be undone."""
     engine.create_map(NewMap(name="hall", model="depth"))
-    job, _ = engine.tasks.begin("reconstruct", "hall", {})
+    job, _ = engine.begin_task("reconstruct", "hall", {})
     mesh, cells = (engine.store.blobs.put(one) for one in (b"a mesh", b"cells"))
     lens = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
     png = encode_png(np.full((48, 64), 2000, np.uint16))

@@ -8,12 +8,12 @@ from pydantic import SecretStr
 
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_server
-from sceneprint.engine import Engine
 from sceneprint.errors import StoreAway
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.maintenance.fsck.findings import Finding
 from sceneprint.settings import Settings
 from sceneprint_client.api import JobState
+from tests.whole_engine import Engine
 
 pytestmark = pytest.mark.sqlite_only("these have servers of their own")
 

@@ -1,0 +1,102 @@
+"""What the concerns of the engine share: settings, store, bell, signers, readers and query log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+
+from threadpoolctl import threadpool_limits
+
+from sceneprint.decoders import Decoders, LocalDecoders
+from sceneprint.decoders.pool import DecoderPool
+from sceneprint.engine.results.query_log import QueryLog
+from sceneprint.engine.search.index_place import IndexPlace
+from sceneprint.engine.search.retrieval import Readers
+from sceneprint.engine.signers import Signers
+from sceneprint.geometry.kernel import Cores
+from sceneprint.process import current_tenant
+from sceneprint.settings import Settings
+from sceneprint.store import Store, open_store
+from sceneprint.store.answer_files import open_answers
+from sceneprint.store.database_errors import open_patiently
+from sceneprint.store.wakeup import Notices, Wakeup
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What the concerns of one process are built from; safe to share between threads.
+
+    Parameters
+    ----------
+    bell : wakes the workers that wait for jobs
+    indexes : the indexes of all maps, which a fleet may share
+    cores : that queries share
+    """
+
+    settings: Settings
+    store: Store
+    bell: Wakeup
+    signers: Signers
+    indexes: IndexPlace
+    readers: Readers
+    query_log: QueryLog
+    cores: Cores
+
+
+@contextmanager
+def open_context(
+    settings: Settings, patience_s: float = 0.0, may_go_on: Callable[[float], bool] | None = None
+) -> Iterator[Context]:
+    """Open a store with everything that works on it, and close it at the end.
+
+    Parameters
+    ----------
+    patience_s, may_go_on : how long to wait for a database server that is away; see
+        `open_patiently`
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : the store cannot be opened.
+    """
+    with ExitStack() as stack:
+        yield open_patiently(lambda: _enter(stack, settings), patience_s, may_go_on)
+
+
+def require_writable(settings: Settings) -> None:
+    """Raise the error that a service or a worker with these settings would end with.
+
+    Raises
+    ------
+    UnusableStore, NewerSchema : other processes cannot share the blobs, or the store cannot be
+        opened, also after waiting for its server.
+    ReadOnlyStore : it cannot be written to.
+    """
+    with closing(
+        open_patiently(lambda: open_store(settings.database, settings.served_blobs))
+    ) as store:
+        store.database.require_writable()
+
+
+def _enter(stack: ExitStack, settings: Settings) -> Context:
+    decoders: Decoders = LocalDecoders(settings.concurrency)
+    if settings.decoders > 0:  # the processes start with the first upload
+        decoders = DecoderPool(
+            settings.decoders, settings.decoder_bytes, settings.decoder_s, current_tenant
+        )
+    with ExitStack() as opened:  # closed if a later step fails
+        store = open_store(settings.database, settings.blobs, settings.geometry_bytes, decoders)
+        opened.callback(store.close)
+        server = not store.database.is_sqlite
+        bell = Notices(store.database) if server else Wakeup(settings.bell_dir)
+        opened.callback(bell.close)
+        # threads of a service work side by side, and sums must have one order: the same bytes
+        opened.enter_context(threadpool_limits(1))
+        cores = opened.enter_context(closing(Cores(settings.query_cores)))
+        answers = open_answers(store.blobs, settings.query_dir)
+        query_log = opened.enter_context(closing(QueryLog(store, answers, settings)))
+        indexes = opened.enter_context(closing(IndexPlace(store, settings)))
+        signers = Signers(store.database, settings.cache_dir)
+        readers = Readers(signers, indexes)
+        stack.push(opened.pop_all())
+    return Context(settings, store, bell, signers, indexes, readers, query_log, cores)

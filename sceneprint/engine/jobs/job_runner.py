@@ -1,0 +1,74 @@
+"""Running jobs: claim the next one, do it, or put it back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sceneprint.engine.context import Context
+from sceneprint.engine.ingest.archive_import import KIND, MAP_KIND, Imports
+from sceneprint.engine.ingest.map_import import MapImporter
+from sceneprint.engine.ingest.uploads import Uploads
+from sceneprint.engine.jobs import lifecycle, signature_job
+from sceneprint.engine.jobs.lifecycle import Work
+from sceneprint.engine.jobs.tasks import Handler, LongJob, Tasks
+from sceneprint.engine.maps.surface_job import SURFACE, SurfaceHandler
+from sceneprint.engine.products.associations import Associations
+from sceneprint.engine.products.map_coverage import Coverages
+from sceneprint.engine.products.reconstruction import Reconstructions
+from sceneprint.engine.products.session_differences import Differences
+from sceneprint.engine.search.query import Queries
+from sceneprint.process import work_of
+from sceneprint.store import queue
+from sceneprint_client.api import JobState
+
+
+class JobRunner:
+    """Runs the jobs of a store: signs frames, and does slices of long jobs.
+
+    Attributes
+    ----------
+    handlers : of long jobs, by kind
+    """
+
+    def __init__(self, context: Context) -> None:
+        uploads, queries = Uploads(context), Queries(context)
+        products = (
+            Associations(context), Coverages(context, queries), Differences(context),
+            Reconstructions(context),
+        )  # fmt: skip
+        self.handlers: dict[str, Handler] = {
+            KIND: Imports(context, uploads).handle,
+            MAP_KIND: MapImporter(context, uploads, queries),
+            SURFACE: SurfaceHandler(context.store, context.signers),
+            **{one.kind: one.run_slice for one in products},
+        }
+        self._context = context
+        self._tasks = Tasks(context.store, context.bell, self.handlers)
+
+    def claim(self, worker: str) -> Work | LongJob | None:
+        """Take the next job, or None if there is none; see `signature_job.claim`."""
+        return signature_job.claim(self._context.store, worker, self._context.settings.lease_s)
+
+    def due_in_s(self) -> float | None:
+        """Return the seconds until the next job that waits can be claimed; None if none waits."""
+        with self._context.store.database.read() as connection:
+            return queue.due_in_s(connection)
+
+    def run(self, work: Work | LongJob, broke: Callable[[], None] | None = None) -> JobState | None:
+        """Do a claimed job, or a slice of a long one; see `signature_job.run` and `Tasks.run`."""
+        context, settings = self._context, self._context.settings
+        with work_of(work.job.tenant):  # so are jobs that it queues
+            if isinstance(work, LongJob):
+                return self._tasks.run(work, settings.lease_s, settings.job_s, broke)
+            return signature_job.run(
+                context.store, context.signers, context.readers, work, settings.lease_s,
+                settings.job_s, broke,
+            )  # fmt: skip
+
+    def put_back(self, work: Work | LongJob) -> None:
+        """Return a claimed job undone."""
+        if isinstance(work, LongJob):
+            self._tasks.put_back(work)
+        else:
+            lifecycle.put_back(self._context.store, work)
+        self._context.bell.ring()

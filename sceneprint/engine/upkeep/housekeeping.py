@@ -1,0 +1,67 @@
+"""What workers do between jobs: publish indexes, switch models, and remove what has expired."""
+
+from __future__ import annotations
+
+from sceneprint.engine.admin.operations import Audit, Events
+from sceneprint.engine.context import Context
+from sceneprint.engine.ingest.archive_import import Imports
+from sceneprint.engine.ingest.uploads import Uploads
+from sceneprint.engine.maps.map_lifecycle import Reencodings
+from sceneprint.engine.maps.map_surface import SurfaceUpkeep
+from sceneprint.engine.maps.tombstones import Tombstones
+from sceneprint.engine.products.join_upkeep import JoinUpkeep
+from sceneprint.engine.products.reconstruction import Reconstructions
+from sceneprint.engine.products.session_differences import Differences
+from sceneprint.engine.upkeep.index_upkeep import Upkeep
+from sceneprint.engine.upkeep.purge import Purging, Retention
+from sceneprint.store.events import number_events
+
+
+def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
+    """Return what purges deleted frames.
+
+    Parameters
+    ----------
+    upkeep : of the indexes; default: one of its own
+    """
+    settings, store = context.settings, context.store
+    upkeep = upkeep or Upkeep(store, context.signers, settings, context.indexes)
+    return Purging(
+        store, upkeep, context.query_log, Tombstones(store, settings.undo_s, context.bell.ring),
+        (Reconstructions(context), Differences(context)), settings.purge_s, settings.quarantine_dir,
+    )  # fmt: skip
+
+
+class Housekeeping:
+    """The housekeeping of one process; any number of processes may do it."""
+
+    def __init__(self, context: Context) -> None:
+        settings, store, bell = context.settings, context.store, context.bell
+        self._context = context
+        self.upkeep = Upkeep(store, context.signers, settings, context.indexes)
+        self.reencodings = Reencodings(store, self.upkeep)
+        self.retention = Retention(store, settings.deleted_rows_days)
+        self.events = Events(store, settings)
+        self.audit = Audit(store, settings.audit_kept_days)
+        self.imports = Imports(context, Uploads(context))
+        self.surfaces = SurfaceUpkeep(store, bell, auto=settings.surfaces == "auto")
+        self.joins = JoinUpkeep(store, bell, auto=settings.joins == "auto")
+        self.purging = purging_of(context, self.upkeep)
+
+    def run(self) -> int:
+        """Do what is due, and return how many indexes were published."""
+        store = self._context.store
+        number_events(store.database)  # where nobody reads them
+        self.reencodings.run()
+        self.retention.run()
+        published = self.upkeep.run()
+        self.events.tidy()
+        self.audit.tidy()
+        self._context.query_log.tidy()
+        self.imports.tidy()
+        self.surfaces.run()
+        self.joins.run()
+        if self.purging.run() is not None:
+            with store.database.read() as connection:
+                self._context.readers.purge(connection)
+        return published
