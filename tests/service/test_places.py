@@ -225,10 +225,10 @@ def test_a_wait_looks_less_and_less_often_and_ends_with_its_caller(
     monkeypatch.setattr(frames.anyio, "sleep", sleep)
     frame = SimpleNamespace(state="received", reason=None)
 
-    async def run(do: Callable[..., object], *given: object) -> object:
-        return do(*given)
+    async def run(*_: object) -> object:
+        return frame
 
-    here: Any = SimpleNamespace(engine=SimpleNamespace(get_frame=lambda *_: frame), run=run)
+    here: Any = SimpleNamespace(context=SimpleNamespace(store=None), run=run)
     request: Any = SimpleNamespace(is_disconnected=is_disconnected)
     added = Added(frame_id="f", job_id="j", state="received", reason=None)
     settled = asyncio.run(frames._settled(request, here, "m", added, 10.0))
