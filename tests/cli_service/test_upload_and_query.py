@@ -394,7 +394,7 @@ def test_an_upload_waits_for_a_service_that_compiles(
 ) -> None:
     monkeypatch.setattr(http, "LIMIT_S", 0.0)  # asked once
     with Client.embedded(tmp_path) as client:
-        client._worker._engine.signers._compiled.clear()  # type: ignore[union-attr]
+        client._worker._runner._context.signers._compiled.clear()  # type: ignore[union-attr]
         assert is_starting(client)
     assert "the service compiles its kernels" in capsys.readouterr().err
 

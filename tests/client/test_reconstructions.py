@@ -140,7 +140,7 @@ def test_refusals(client: Client, answered: Answer) -> None:
     made = client.reconstruct(answered, voxel_m=0.002)  # finer than memory allows for a room
     [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.attempts) == ("failed", 1)
-    assert "Ask for" in str(job.error)
+    assert "Request 0.005 m or more" in str(job.error)
     with pytest.raises(NotIndexed, match=r"is failed \(.*It has its mesh\.ply once"):
         client.reconstruction_mesh(made.job_id)
     client.delete_product(Reconstruction, None, made.job_id)

@@ -193,7 +193,7 @@ def test_a_worker_scrubs_only_until_it_is_rung_for(
 ) -> None:
     monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
     with full.bell.listen() as listener, closing(Trace()) as trace:
-        worker = Worker(full, listener, trace, stop)
+        worker = Worker(full.context, listener, trace, stop)
         listener.wait(0.0)  # what rang before
         for blobs, rings in ((10, True), (24, False)):
             worker._upkeep_at = worker._scrub._next = 0.0

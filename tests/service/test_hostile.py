@@ -322,7 +322,7 @@ def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
     assert json.loads(warning)["permissions"] == "555"
     assert "every user of this machine may read the data folder" in warning
     assert line.startswith("sceneprint work: ")
-    assert "is read-only: it is read, and nothing can be stored" in line
+    assert "is read-only, so nothing can be stored" in line
     done = subprocess.run(
         sealed("doctor"), capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
