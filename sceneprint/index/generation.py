@@ -32,12 +32,12 @@ from sceneprint.index.index_manifest import (
 from sceneprint.index.part_files import Block, Keys, check_block, is_ours, verify
 from sceneprint.index.segment import (
     FLAT_BYTES,
+    FLAT_SHARE,
     Places,
     Segment,
     merge_plan,
     open_segment,
     segment_sources,
-    sketch_threshold,
     spool_blocks,
     write_segment,
 )
@@ -195,8 +195,6 @@ def _inode(path: Path) -> int:
 # The tail is compared whole, and so is each segment; of one with sketches only the frames whose
 # sketches are nearest to that of the query. What they miss is measured when it is published.
 
-# Tails: frames newer than a generation, held in memory and always compared exactly.
-
 
 @dataclass(frozen=True, eq=False)
 class Tail:
@@ -271,12 +269,10 @@ def check_lengths(dimension: int, generation: Generation | None, tail: Tail) -> 
 
 @dataclass(frozen=True, eq=False)
 class SearchHits:
-    """The nearest frames that a search found.
+    """The nearest frames that a search found: keys (r,), and their distances (r,), which rise.
 
     Parameters
     ----------
-    keys : (r,) int64 of the frames
-    distances : (r,) int64, exact, rising; equal ones by key
     exact : every frame of the map was compared, so that these are the nearest
     compared : frames whose exact distance was computed
     """
@@ -349,9 +345,6 @@ def _nearest(keys: Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp
     order = np.lexsort((keys[candidates], found[candidates]))
     chosen: NDArray[np.intp] = candidates[order[:size]]
     return chosen
-
-
-# Publication.
 
 
 def publish(
@@ -440,7 +433,8 @@ def _write_segments(
     if previous is None and len(new_keys) == 0:
         raise ValueError("an index of no frames that follows none")
     sources = segment_sources(() if previous is None else previous.segments, new_keys, stored, drop)
-    most = sketch_threshold(sources, flat_bytes)
+    is_large = sum(len(each) * each.vectors.shape[1] for each in sources) > flat_bytes
+    most = FLAT_SHARE * flat_bytes if is_large else np.inf
     groups = merge_plan([len(each) for each in sources])
     records = tuple(
         write_segment(folder, [sources[at] for at in group], clean=clean, flat_bytes=most)

@@ -117,12 +117,12 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Signatures of some frames, in files; see `Generation`.
+    """Signatures of some frames, in parts that are mapped.
 
     Parameters
     ----------
-    record : of its files
-    keys : (N,) int64, rising, of all frames in its files
+    record : the names of its parts
+    keys : (N,) int64, rising, of all frames in its parts
     index : of FAISS, over their signatures in the same order
     sketches : of its frames; None where all of them are compared
     gone : (g,) int64, rising, of the frames that do not count: deleted since, or signed anew and
@@ -140,7 +140,7 @@ class Segment:
 
     @cached_property
     def vectors(self) -> Bytes:
-        """Signatures (N, D) uint8 where they are mapped, read-only, in the order of the keys."""
+        """Signatures (N, D) uint8, read-only, in the order of the keys."""
         return codes_of(self.index)
 
     @cached_property
@@ -280,10 +280,6 @@ class SegmentSource:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def is_worn(self, clean: bool) -> bool:
-        """Whether it is to be written again, as too much of it is gone."""
-        return len(self.gone) > (0 if clean else GONE_SHARE * len(self.keys))
-
 
 def segment_sources(
     segments: Sequence[Segment], new_keys: Keys, stored: Bytes, drop: frozenset[int]
@@ -334,20 +330,16 @@ def write_segment(
 ) -> SegmentFiles:
     """Write the frames of some sources as one segment, in the order of their keys.
 
-    A segment that is not to change is not read, and its files are named again.
+    A segment that is not to change is not read, and its parts are named again.
 
     Parameters
     ----------
-    sources : of which at least one has frames
     clean : leave nothing of frames that are gone
     flat_bytes : of signatures, above which there are sketches
-
-    Raises
-    ------
-    OSError, UnusableStore : a file cannot be written.
     """
     only = sources[0]
-    if len(sources) == 1 and only.segment is not None and not only.is_worn(clean):
+    may_be_gone = 0 if clean else GONE_SHARE * len(only.keys)
+    if len(sources) == 1 and only.segment is not None and len(only.gone) <= may_be_gone:
         return _keep_segment(folder, only.segment, only.gone, flat_bytes)
     keys = np.concatenate([each.keys[each.rows] for each in sources])
     by_key = np.argsort(keys)
@@ -403,9 +395,3 @@ def _keep_segment(folder: Path, segment: Segment, gone: Keys, flat_bytes: float)
         more.append(put(folder, "gone", lambda take: take(gone.astype("<i8").tobytes())))
     files = [one for one in segment.record.files if one[0].rpartition(".")[2] in kept]
     return SegmentFiles(files=(*files, *more), recall=recall)
-
-
-def sketch_threshold(sources: Sequence[SegmentSource], flat_bytes: int) -> float:
-    """Bytes of signatures of one segment above which it has sketches."""
-    total = sum(len(each) * each.vectors.shape[1] for each in sources)
-    return FLAT_SHARE * flat_bytes if total > flat_bytes else np.inf

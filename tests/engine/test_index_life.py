@@ -98,7 +98,7 @@ def test_a_frame_signed_anew_is_found_once_with_its_new_signature() -> None:
     tail.append(SignatureChange(7, "", 1, None), np.full(4, 1, np.uint8))
     tail.append(SignatureChange(8, "", 2, None), np.full(4, 2, np.uint8))
     handed_out = tail.tail()
-    other = tail.without({7})
+    other = tail.copy(0, without={7})
     other.append(SignatureChange(7, "", 3, None), np.full(4, 3, np.uint8))
     assert (tail.revision_of(7), other.revision_of(7), other.revision_of(9)) == (1, 3, 0)
     np.testing.assert_array_equal(other.tail().keys, [8, 7])
@@ -121,7 +121,7 @@ def test_a_tail_in_a_file_is_as_one_in_memory(
     for n, view in zip(range(1, 300, 50), views, strict=True):
         np.testing.assert_array_equal(view.signatures, rows[:n])
         np.testing.assert_array_equal(view.keys, np.arange(n))
-    late = tail.after(200)
+    late = tail.copy(200)
     np.testing.assert_array_equal(late.tail().signatures, rows[200:])
     np.testing.assert_array_equal(late.tail().keys, np.arange(200, 300))
     assert list(tmp_path.glob("index/*")) == []  # nothing to be left behind

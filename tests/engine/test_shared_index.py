@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -181,49 +180,6 @@ def append(place: str) -> Callable[..., Generation]:
     return run
 
 
-def test_an_append_puts_and_fetches_what_is_new(
-    make_engine: Make, append: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Counted by the server: a sixteenth more is two files and a manifest, and a sixteenth more."""
-    with ObjectServer(log=tmp_path / "log") as server:
-        for name, value in server.env.items():
-            monkeypatch.setenv(name, value)
-        given: dict[str, Any] = {
-            "database_url": f"sqlite:///{tmp_path}/own.db", "blob_url": f"file://{tmp_path}/common",
-            "index_url": f"{server.bucket('segments')}/fleet",
-        }  # fmt: skip
-        (tmp_path / "common" / "blobs").mkdir(parents=True)
-        one, two = (make_engine(tmp_path / name, **given) for name in ("one", "two"))
-        one.create_map(NewMap(name="hall", model="depth"))
-        row, objects = row_of(one), open_objects(given["index_url"])
-
-        def stored() -> dict[str, int]:
-            return {each.key: each.size for each in objects.list("index/")}
-
-        def asked(do: Callable[[], object]) -> Counter[str]:
-            before = server.requests()
-            do()
-            return server.requests() - before
-
-        for n in (1600, 400):
-            append(one, n)
-        shared(two).sync(row)
-        before = stored()
-        puts = asked(lambda: append(one, 125))
-        new = {key: size for key, size in stored().items() if key not in before}
-        assert puts["PUT"] == 3
-        assert sorted(key.rpartition(".")[2] for key in new) == ["faiss", "json", "keys"]
-        assert sum(new.values()) / sum(before.values()) == pytest.approx(1 / 17, abs=0.01)
-        gets = asked(lambda: shared(two).sync(row))
-        assert (gets["GET"], gets["PUT"]) == (4, 0)  # the folder is listed
-        assert numbers(two) == [3]
-        found = newest(folder_of(two), row.model_id, 448)
-        assert found is not None
-        assert [len(each) for each in found.segments] == [1600, 400, 125]
-        puts = asked(lambda: append(one, 0, frozenset([3])))
-        assert puts["PUT"] == 2  # what is gone, and the manifest
-
-
 def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
     built: Engine, append: Any, place: str, host: Callable[..., Engine],
     monkeypatch: pytest.MonkeyPatch,
@@ -299,49 +255,6 @@ def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
         shared(other)._get(objects, folder_of(built), name, size)
     shared(built).prune(row, clean=True)
     assert set(keys(objects)) == files[2] | {f"{third.number:010d}.json"}
-
-
-def test_a_purge_writes_the_segment_that_held_the_frame(
-    host: Callable[..., Engine], fill: Any, ids: Any, uploads: Any, place: str
-) -> None:
-    """Two segments, of nine frames and of three; one of the three is deleted."""
-    engine, objects = host("one"), open_objects(place)
-    engine.create_map(NewMap(name="hall", model="depth"))
-    names = fill(engine, range(9))
-    assert engine.publish_due() == 1
-    names += fill(engine, range(9, 12))
-    assert engine.publish_due() == 1
-    secret, before = signature(engine, names[10]), set(keys(objects))
-    head = shared(engine).head(row_of(engine))
-    assert head is not None
-    assert [one.frames for one in head.segments] == [9, 3]
-    engine.delete_frame("hall", names[10])
-    assert engine.purging.now().indexes == 1
-    head = shared(engine).head(row_of(engine))
-    assert head is not None
-    assert [one.frames for one in head.segments] == [9, 2]
-    assert {name for name, _ in head.segments[0].files} <= before
-    assert all(secret not in objects.get(one.key) for one in objects.list("index/"))
-    assert engine.purging.now().indexes == 0
-
-
-def test_a_purge_removes_what_a_shared_index_had_only_marked(
-    host: Callable[..., Engine], fill: Any, place: str
-) -> None:
-    engine, objects = host("one", tail_frames=1), open_objects(place)
-    engine.create_map(NewMap(name="hall", model="depth"))
-    names = fill(engine, range(12))
-    assert engine.publish_due() == 1
-    secret = signature(engine, names[2])
-    for name in names[2:4]:
-        engine.delete_frame("hall", name)
-    assert engine.publish_due() == 1
-    head = shared(engine).head(row_of(engine))
-    assert head is not None
-    assert (head.frames, len(head.worn_keys)) == (10, 1)
-    assert any(secret in objects.get(one.key) for one in objects.list("index/"))
-    assert engine.purging.now().indexes == 1
-    assert all(secret not in objects.get(one.key) for one in objects.list("index/"))
 
 
 def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
@@ -550,18 +463,6 @@ def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(
     shared(other).sync(row_of(other))
     assert numbers(other) == [2]
     assert ask(other, uploads).index_generation == 2
-
-
-def test_what_was_removed_while_it_is_fetched_is_not_damage(built: Engine, fill: Any) -> None:
-    """Number 1 stays what it is where 2 has come: only the newest can be withdrawn."""
-    fill(built, range(4, 8))
-    assert built.publish_due() == 1
-    row = row_of(built)
-    shared(built).prune(row, clean=True)
-    head = shared(built).head(row)
-    assert head is not None
-    assert head.number == 2
-    assert shared(built).sync(row) == head
 
 
 def test_a_file_that_is_damaged_here_is_fetched_again(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import update
 
@@ -201,6 +202,25 @@ def test_purging_removes_what_a_publication_had_only_marked(
     fresh = make_engine(tail_frames=1)
     answer = fresh.queries.upload(["hall"], uploads[5].data, uploads[5].meta, ALL)
     assert (answer.counts.map, answer.index_generation) == (10, 3)
+
+
+def test_purging_writes_an_index_again_whose_keys_are_damaged(
+    make_engine: Make, uploads: Any, work_off: Any
+) -> None:
+    """Nobody knows any more whether it holds the frame."""
+    engine = make_engine(tail_frames=1, undo_s=0)
+    engine.create_map(NewMap(name="hall", model="depth"))
+    names = fill(engine, uploads, work_off, range(4))
+    assert engine.publish_due() == 1
+    (folder,) = engine.settings.indexes.glob("hall*")
+    (path,) = folder.glob("*.keys")
+    row = engine.view("hall")[2].generation.vectors_of(np.array([2])).tobytes()
+    engine.delete_frame("hall", names[1])
+    path.write_bytes(b"damaged" + path.read_bytes()[7:-8])
+    assert engine.purging.now().indexes == 1
+    assert all(row not in one.read_bytes() for one in folder.iterdir())
+    ((number, _),) = manifests(folder)
+    assert number == 2
 
 
 def test_maps_of_whole_fisher_vectors_have_no_index(

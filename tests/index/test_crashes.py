@@ -49,14 +49,6 @@ for line in sys.stdin:
     print("dead", flush=True)
 """
 
-HOLDER = """
-import fcntl, sys
-file = open(sys.argv[1], "w")
-fcntl.flock(file, fcntl.LOCK_EX)
-print("held", flush=True)
-sys.stdin.read()
-"""
-
 
 def deadline(process: subprocess.Popen[str], seconds: float = 120) -> threading.Timer:
     """Kill a process that has not done in that time, so that nobody waits for it any more."""
@@ -117,28 +109,6 @@ def test_a_builder_killed_at_any_moment(tmp_path: Path) -> None:
     assert again is not None
     assert is_whole(again)
     assert not list(tmp_path.glob(".*.part"))
-
-
-def test_another_process_builds(tmp_path: Path) -> None:
-    keys = np.arange(30)
-    block = (keys, signatures_at(keys))
-    folder = tmp_path / "map"
-    folder.mkdir()
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(folder / ".lock")],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as holder:  # fmt: skip
-        timer = deadline(holder)
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "held\n"
-        refused = publish(folder, model_id="model", revision=30, blocks=[block], previous=None)
-        assert refused is None
-        assert newest_number(folder) is None
-        timer.cancel()
-        holder.kill()  # the kernel frees the lock of the dead
-    made = publish(folder, model_id="model", revision=30, blocks=[block], previous=None)
-    assert made is not None
-    assert is_whole(made)
 
 
 def test_readers_go_on_while_generations_pass(

@@ -19,7 +19,6 @@ from sceneprint.atomic_files import folder_turn
 from sceneprint.index import (
     Generation,
     clear,
-    faiss_index,
     newest,
     newest_number,
     publish,
@@ -348,26 +347,3 @@ def test_a_failure_at_any_step_leaves_the_old_or_the_new(
                 break
         assert step >= 3
     assert {("replace", 1), ("replace", 2), ("fsync", 1), ("fsync", 2)} <= seen
-
-
-def test_a_disk_that_is_full_is_said_as_it_was(
-    walk: Walk, published: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """While FAISS writes, which has errors of its own."""
-    first = published(np.arange(10), walk(20)[:10])
-    before = files(tmp_path / "map")
-
-    def full(_index: object, take: Callable[[bytes], None]) -> None:
-        def refuse(data: bytes) -> None:
-            raise OSError(28, "No space left on device")
-
-        write(first.segments[0].index, refuse)
-
-    write = faiss_index.write_index
-    monkeypatch.setattr(faiss_index, "write_index", full)
-    with pytest.raises(OSError, match="No space left"):
-        published(np.arange(10, 20), walk(20)[10:], first)
-    assert {name for name in files(tmp_path / "map") if not name.endswith(".keys")} == {
-        name for name in before if not name.endswith(".keys")
-    }
-    assert newest_number(tmp_path / "map") == 1

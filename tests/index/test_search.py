@@ -11,14 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.geometry.retrieval import ranking
 from sceneprint.index import (
     Generation,
     SearchHits,
     Tail,
     publish,
     search,
-    segment,
     signatures_of,
 )
 from sceneprint.types import Bytes
@@ -34,46 +32,8 @@ def answer(hits: SearchHits) -> tuple[list[int], list[int]]:
     return hits.keys.tolist(), hits.distances.tolist()
 
 
-def keys_of(*keys: int) -> np.ndarray:
-    return np.array(keys, np.int64)
-
-
 def frames_of(keys: np.ndarray, signatures: Bytes) -> dict[int, Bytes]:
     return dict(zip(keys.tolist(), signatures, strict=True))
-
-
-def bits(n: int, length: int, seed: int) -> Bytes:
-    """Signatures of 0 and 1 alone, so that many distances are equal."""
-    return np.random.default_rng(seed).integers(0, 2, (n, length), np.uint8)
-
-
-@pytest.mark.parametrize("size", [0, 1, 7, 40, 400])
-@pytest.mark.parametrize("exact", [False, True])
-def test_a_map_in_parts_is_searched_as_one(
-    published: Publish, nearest: Nearest, size: int, exact: bool
-) -> None:
-    """Ties, deleted, replaced and doubled frames, and a tail."""
-    signatures = bits(200, 24, 1)
-    keys = np.random.default_rng(2).permutation(1000)[:200].astype(np.int64)
-    first = published(keys[:90], signatures[:90])
-    second = published(keys[90:120], signatures[90:120], first, drop=frozenset(keys[:9].tolist()))
-    replaced = bits(10, 24, 3)
-    third = published(keys[20:30], replaced, second)
-    newer = bits(5, 24, 4)
-    tail = Tail(
-        np.concatenate([keys[40:45], keys[120:]]), np.concatenate([newer, signatures[120:]])
-    )
-    dead = frozenset([*keys[60:70].tolist(), *keys[120:125].tolist(), 5000])
-    frames = frames_of(keys, signatures)
-    frames |= frames_of(keys[20:30], replaced) | frames_of(keys[40:45], newer)
-    for gone in (*keys[:9].tolist(), *dead):
-        frames.pop(gone, None)
-    assert len(frames) == 200 - 9 - 15
-    query = bits(1, 24, 5)[0]
-    hits = search_l2(query, third, tail, size, dead=dead, exact=exact)
-    assert answer(hits) == nearest(query, frames, size)
-    assert (hits.exact, hits.compared, len(hits)) == (True, 176, min(size, 176))
-    assert {hits.keys.dtype, hits.distances.dtype} == {np.dtype(np.int64)}
 
 
 @settings(max_examples=60)
@@ -96,67 +56,6 @@ def test_a_tail_alone(n: int, size: int, seed: int, dead: set[int], metric: Any)
     )
     assert answer(hits) == ([k for _, k in right[:size]], [d for d, _ in right[:size]])
     assert (hits.exact, hits.compared) == (True, len(alive))
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Generation, Tail, frozenset[int]]:
-    """A generation, a tail that replaces and adds, and deletions in both."""
-    made = publish(
-        tmp_path_factory.mktemp("map"), model_id="model", revision=0, previous=None,
-        blocks=[(3 * np.arange(120, dtype=np.int64), bits(200, 24, 1)[:120])],
-    )  # fmt: skip
-    assert made is not None
-    tail = Tail(np.array([3, 30, *range(360, 600, 3)], np.int64), bits(200, 24, 1)[118:])
-    return made, tail, frozenset([6, 9, 363, 5000])
-
-
-@settings(max_examples=150)
-@given(
-    among=st.none() | st.sets(st.integers(0, 640), max_size=300),
-    size=st.integers(0, 130),
-    exact=st.booleans(),
-)
-def test_only_what_may_be_found_is(
-    nearest: Nearest, shared: tuple[Generation, Tail, frozenset[int]],
-    among: set[int] | None, size: int, exact: bool,
-) -> None:  # fmt: skip
-    """Keys that are in neither part, deleted, replaced or in the tail alone are among them."""
-    generation, tail, dead = shared
-    signatures = bits(200, 24, 1)
-    frames = {3 * i: signatures[i] for i in range(120)} | frames_of(tail.keys, tail.signatures)
-    wanted = frames.keys() if among is None else among
-    allowed = {key: row for key, row in frames.items() if key in wanted and key not in dead}
-    query, given_keys = signatures[77], None if among is None else keys_of(*among)
-    hits = search_l2(query, generation, tail, size, dead=dead, among=given_keys, exact=exact)
-    assert answer(hits) == nearest(query, allowed, size)
-    assert (hits.exact, hits.compared) == (True, len(allowed))
-
-
-def test_nothing_among_finds_nothing(shared: tuple[Generation, Tail, frozenset[int]]) -> None:
-    generation, tail, dead = shared
-    for among in (keys_of(), keys_of(1, 2), keys_of(6, 363)):
-        for part in (generation, None):
-            hits = search_l2(tail.signatures[0], part, tail, 5, dead=dead, among=among)
-            assert (answer(hits), hits.exact, hits.compared) == (([], []), True, 0)
-
-
-def test_rows_that_may_not_be_found_are_not_read(
-    shared: tuple[Generation, Tail, frozenset[int]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    generation, tail, dead = shared
-    read: list[int] = []
-
-    def counted(query: Bytes, stored: Bytes, metric: Any, rows: np.ndarray) -> np.ndarray:
-        read.append(len(rows))
-        return ranking.distances(query, stored, metric, rows=rows)
-
-    monkeypatch.setitem(search.__globals__, "distances", counted)
-    monkeypatch.setattr(segment, "distances", counted)
-    monkeypatch.delattr(segment, "nearest")  # FAISS reads all rows, whatever may be found
-    among = keys_of(12, 15, 369)
-    hits = search_l2(tail.signatures[0], generation, tail, 5, dead=dead, among=among)
-    assert sorted(hits.keys.tolist()) == [12, 15, 369]
-    assert sum(read) == 3
 
 
 @settings(max_examples=30)
@@ -208,15 +107,6 @@ def test_an_empty_map(published: Publish, walk: Walk) -> None:
         hits = search_l2(query, generation, Tail.empty(LENGTH), 5)
         assert answer(hits) == ([], [])
         assert (hits.exact, hits.compared) == (True, 0)
-
-
-@pytest.mark.parametrize("readonly", [False, True])
-def test_a_query_may_be_any_array_of_bytes(published: Publish, walk: Walk, readonly: bool) -> None:
-    signatures = walk(50)
-    generation = published(np.arange(50), signatures)
-    query: Bytes = np.repeat(signatures[7], 2)[::2]
-    query.flags.writeable = not readonly
-    assert answer(search_l2(query, generation, Tail.empty(LENGTH), 1)) == ([7], [0])
 
 
 def test_signatures_of_hits(published: Publish, walk: Walk) -> None:

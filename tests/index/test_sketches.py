@@ -110,23 +110,6 @@ def test_recall_is_what_searches_find(
     assert 0.5 <= recall.share < 1
 
 
-def test_no_more_frames_are_selected_than_are_needed(
-    walk: Walk, published: Publish, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    signatures = walk(4000, LENGTH, walks=30)
-    probes = []
-    monkeypatch.setattr(sketches, "LEAST_SELECTED", 4)
-    for enough in (0.0, 0.5, 0.9, 1.0):
-        monkeypatch.setattr(sketches, "ENOUGH", enough)
-        folder = tmp_path / str(enough)
-        recall = published(np.arange(4000), signatures, folder=folder, flat_bytes=0).manifest.recall
-        assert recall.share >= enough
-        probes.append(recall.probes)
-    assert probes[0] == 4
-    assert probes == sorted(probes)
-    assert probes[-1] > probes[1] > 4
-
-
 def test_what_queries_from_elsewhere_find(walk: Walk, published: Publish) -> None:
     """Places of the map with other noise: recall of the ten nearest."""
     signatures = walk(6000, LENGTH, walks=12)
@@ -186,18 +169,6 @@ def test_bits_are_compared_whatever_the_length(length: int) -> None:
     some = own.nearest(rows[5], 100, free)
     assert free[some].all()
     assert [bits[row] for row in some] == sorted(np.array(bits)[free].tolist())[:100]
-
-
-def test_means_are_of_a_sample_and_blocks_make_no_difference(
-    walk: Walk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    signatures = walk(500, LENGTH)
-    whole = make_sketches(signatures)
-    monkeypatch.setattr(sketches, "BLOCK_BYTES", 7 * LENGTH)
-    np.testing.assert_array_equal(codes_of(make_sketches(signatures.copy())), codes_of(whole))
-    monkeypatch.setattr(sketches, "MEASURED", 90)
-    means = signatures[draw(500, 90, 0)].mean(axis=0).astype(np.uint8)
-    np.testing.assert_array_equal(make_sketches(signatures).means, means)
 
 
 @pytest.mark.parametrize("most", [1, 20, 299, 400])

@@ -118,13 +118,12 @@ IN_MEMORY = 256 << 20
 
 
 class AppendBuffer:
-    """Signatures in the order of their revisions; what is handed out never changes.
+    """Signatures in the order of their revisions; a tail that it returns never changes.
 
     Parameters
     ----------
     length : bytes of a signature
-    folder : where a file for many of them may be made; the system's for temporary files where
-        that one cannot be written
+    folder : where a file for many of them may be created, else the system's temporary folder
     capacity : signatures to make room for at first
     """
 
@@ -137,9 +136,6 @@ class AppendBuffer:
 
     def __len__(self) -> int:
         return len(self._places)
-
-    def __contains__(self, key: int) -> bool:
-        return key in self._places
 
     @property
     def bytes_held(self) -> int:
@@ -173,15 +169,10 @@ class AppendBuffer:
         self._keys[n], self._revisions[n], self._rows[n] = change.number, change.revision, row
         self._places[change.number] = n
 
-    def after(self, revision: int) -> AppendBuffer:
-        """Those indexed after a revision, in arrays of their own."""
-        return self._only(self._revisions[: len(self)] > revision)
-
-    def without(self, keys: Collection[int]) -> AppendBuffer:
-        """All but some, in arrays of their own."""
-        return self._only(~np.isin(self._keys[: len(self)], list(keys)))
-
-    def _only(self, wanted: NDArray[np.bool_]) -> AppendBuffer:
+    def copy(self, after: int, without: Collection[int] = ()) -> AppendBuffer:
+        """Return the signatures indexed after a revision, without some keys, in other arrays."""
+        n = len(self)
+        wanted = (self._revisions[:n] > after) & ~np.isin(self._keys[:n], list(without))
         places = np.flatnonzero(wanted)
         n = len(places)
         kept = AppendBuffer(self._rows.shape[1], self._folder, n)
@@ -191,12 +182,12 @@ class AppendBuffer:
         return kept
 
     def revision_of(self, key: int) -> int:
-        """The revision with which the signature of a frame came; 0 where it is not there."""
+        """Return the revision of the signature of a frame; 0 where it is not there."""
         place = self._places.get(key)
         return 0 if place is None else int(self._revisions[place])
 
     def tail(self) -> Tail:
-        """All that is there now."""
+        """Return all that is there now."""
         n = len(self)
         return Tail(self._keys[:n], self._rows[:n])
 
@@ -338,9 +329,9 @@ class Reader:
             if self._view.revision < row.revision:
                 self._catch_up(connection, row)
             self._swap(connection, row)
-            gone = {number for number in self._dead if number in self._tail}
+            gone = {number for number in self._dead if self._tail.revision_of(number)}
             if gone:
-                self._tail = self._tail.without(gone)
+                self._tail = self._tail.copy(0, without=gone)
                 self._publish(self._view.generation, self._view.revision)
 
     def _is_time(self) -> bool:
@@ -367,8 +358,8 @@ class Reader:
             self._damaged.add(change.number)
         elif self._tail.revision_of(change.number) < change.revision:
             # else an error ended the last time half way
-            if change.number in self._tail:  # signed anew, as it had been damaged
-                self._tail = self._tail.without({change.number})
+            if self._tail.revision_of(change.number):  # signed anew, as it had been damaged
+                self._tail = self._tail.copy(0, without={change.number})
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))
             self._dead.pop(change.number, None)  # rejected by a model, and tried again by another
 
@@ -388,7 +379,7 @@ class Reader:
             if found is not None and found.revision < since:  # a fleet's, older than one made here
                 self._unsound = found.number, time.monotonic() + _AGAIN_S
             return
-        self._tail = self._tail.after(found.revision)
+        self._tail = self._tail.copy(found.revision)
         self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > found.revision}
         self._publish(found, view.revision)
 
