@@ -98,6 +98,21 @@ def test_what_is_restored_is_what_was_there(
 
 
 @file_only
+def test_queries_that_only_held_an_answer_are_not_restored(
+    data, tmp_path, answers, uploads, settings
+):
+    answers(data, uploads[:2])
+    changed(data, "UPDATE queries SET listed = number > (SELECT min(number) FROM queries)")
+    place, new = str(tmp_path / "bundles"), tmp_path / "new"
+    take_backup(settings(data), place)
+    restore_to_folder(place, new)
+    with closing(sqlite3.connect(data / "sceneprint.db")) as database:
+        listed = database.execute("SELECT id FROM queries WHERE listed ORDER BY id").fetchall()
+    with closing(sqlite3.connect(new / "sceneprint.db")) as database:
+        assert database.execute("SELECT id FROM queries ORDER BY id").fetchall() == listed != []
+
+
+@file_only
 def test_what_is_there_stays(place, data, tmp_path, content, sceneprint):
     before = content(data)
     said = sceneprint("restore", place, "--data", data, expect=2)
