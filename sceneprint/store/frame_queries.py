@@ -443,34 +443,6 @@ def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
     return [*own, *_common_conditions(run)]
 
 
-def session_frames(
-    connection: Connection, map_number: int, session: str, robot: str | None, after: int, limit: int
-) -> list[int]:
-    """Return the numbers of existing frames of a session above `after`."""
-    numbers = connection.execute(
-        select(frames.c.number)
-        .where(*_of_name(map_number, session, robot), frames.c.number > after)
-        .order_by(frames.c.number)
-        .limit(limit)
-    )
-    return list(numbers.scalars())
-
-
-def count_session(
-    connection: Connection, map_number: int, session: str, robot: str | None, after: int = 0
-) -> int:
-    """Return the number of existing frames of a session above `after`."""
-    own = _of_name(map_number, session, robot)
-    return count_rows(connection, *own, frames.c.number > after)
-
-
-def _of_name(map_number: int, session: str, robot: str | None) -> list[ColumnElement[bool]]:
-    own = [frames.c.map_number == map_number, frames.c.session == session]
-    if robot is not None:
-        own.append(frames.c.robot == robot)
-    return [*own, frames.c.state.in_(_LIVING)]
-
-
 # Frames of sessions in the order of capture, for jobs that associate them.
 
 

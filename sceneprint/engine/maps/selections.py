@@ -22,20 +22,15 @@ from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import InvalidRequest, UnknownSession
 from sceneprint.store import Store
 from sceneprint.store.deletion import delete_frames
-from sceneprint.store.frame_queries import (
-    TakenPosition,
-    count_listed,
-    count_session,
-    list_frames,
-    session_frames,
-)
+from sceneprint.store.frame_queries import TakenPosition, count_listed, list_frames
 from sceneprint.store.frames import write_frame
-from sceneprint.store.maps import find_frame, find_map, frame_of
+from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.base import MOST_TAGS
 from sceneprint_client.api.listing import (
     MOST_SELECTED,
+    FrameListing,
     FramesDeleted,
     FramesEdit,
     FramesEdited,
@@ -120,12 +115,7 @@ def edit_selection(
 
 
 def edited_tags(frame: FrameRow, edit: FramesEdit | SessionEdit) -> list[str]:
-    """The tags of a frame after an edit.
-
-    Raises
-    ------
-    InvalidRequest : they are too many.
-    """
+    """Return the tags of a frame after an edit; raise InvalidRequest if they are too many."""
     gone = set(edit.remove_tags)
     tags = [tag for tag in frame.tags if tag not in gone]
     tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]
@@ -208,24 +198,9 @@ def delete_session(
     ------
     UnknownMap, UnknownSession : there is none.
     """
-    until, deleted = time.monotonic() + seconds, 0
-    deletion: int | None = None
-    while True:
-        with store.database.write() as connection:
-            row = find_map(connection, map_name)
-            numbers = session_frames(connection, row.number, session, robot, 0, AT_ONCE)
-            deletion = deletion or tombstones.begin(row)
-            blobs = delete_frames(connection, row, numbers, deletion=deletion)
-            left = count_session(connection, row.number, session, robot)
-            record = tombstones.find(connection, row, deletion)
-        collect_deleted_blobs(store, blobs)
-        deleted += len(numbers)
-        if not left or time.monotonic() >= until:
-            break
-    _require_frames(deleted, row, session, robot)
-    return SessionChange(
-        map=row.name, session=session, robot=robot, frames=deleted, remaining=left, deletion=record
-    )
+    done = delete_selection(store, map_name, _of_session(session, robot), tombstones, seconds)
+    _require_frames(done.frames, map_name, session, robot)
+    return SessionChange(session=session, robot=robot, **dict(done))
 
 
 def edit_session(
@@ -253,22 +228,21 @@ def edit_session(
         changed.
     """
     until, done, at = time.monotonic() + seconds, 0, after
+    wanted = _of_session(session, robot)
     while True:
         with store.database.write() as connection:
             row = find_map(connection, map_name)
             last = 0 if at is None else find_frame(connection, row, at).number
-            numbers = session_frames(connection, row.number, session, robot, last, AT_ONCE)
-            if numbers:
-                for number in numbers:
-                    frame = frame_of(connection, number)
-                    write_frame(connection, row, frame, _values(frame, edit))
-                at, last = frame.id, number
-            left = count_session(connection, row.number, session, robot, last)
-        done += len(numbers)
+            some = _selected(connection, row, wanted, last, AT_ONCE)
+            for frame in some:
+                write_frame(connection, row, frame, _values(frame, edit))
+                at, last = frame.id, frame.number
+            left = _count(connection, row, wanted, last)
+        done += len(some)
         if not left or time.monotonic() >= until:
             break
     if after is None:
-        _require_frames(done, row, session, robot)
+        _require_frames(done, map_name, session, robot)
     return SessionChange(
         map=row.name, session=edit.session or session, robot=edit.robot or robot, frames=done,
         remaining=left, last_frame_id=at if left else None,
@@ -287,10 +261,17 @@ def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
     return values
 
 
-def _require_frames(count: int, row: MapRow, session: str, robot: str | None) -> None:
+def _of_session(session: str, robot: str | None) -> FrameSelection:
+    """Return the selection of a session, whose name no rule for new names applies to."""
+    robots = [] if robot is None else [robot]
+    wanted = FrameListing.model_construct(session=[session], robot=robots)
+    return FrameSelection.model_construct(filter=wanted)
+
+
+def _require_frames(count: int, map_name: str, session: str, robot: str | None) -> None:
     if not count:
         by = "" if robot is None else f" by robot {robot!r:.140}"
         raise UnknownSession(
-            f"Map {row.name!r} has no frame of session {session!r:.140}{by}. "
-            f"`sceneprint sessions {row.name}` lists them."
+            f"Map {map_name!r} has no frame of session {session!r:.140}{by}. "
+            f"`sceneprint sessions {map_name}` lists them."
         )
