@@ -196,12 +196,8 @@ async def housekeeping(service: Service) -> AsyncIterator[None]:
 
 
 def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
-    """The service as an ASGI application.
-
-    Parameters
-    ----------
-    settings : see Settings; callers must show a key where it `asks_for_keys`
-    warm : load models and kernels before the first request
+    """Return the service as an ASGI application; `warm` loads models and kernels before the first
+    request.
     """
     figures = Metrics()
 

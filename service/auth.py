@@ -23,14 +23,16 @@ from inspect import iscoroutinefunction
 from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.routing import APIRoute
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.types import Scope as AsgiScope
 
+from sceneprint.engine.results.query_entry import unknown_query
 from sceneprint.errors import Forbidden, KeyRequired, SceneprintError
 from sceneprint.process import NOBODY, Actor, set_actor, set_tenant
 from sceneprint.store.maps import unknown_map
+from sceneprint.store.query_rows import QueryRow
 from sceneprint.store.queue import unknown_job
 from sceneprint_client.api import Job, Page
 from sceneprint_client.api.admin import EVERY, SCOPES, Scope
@@ -52,17 +54,23 @@ log = logging.getLogger(__name__)
 
 
 def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> bool:
-    """Whether grants, by the names of maps, are enough.
-
-    Parameters
-    ----------
-    grants : of a key; those for `*` hold for every map
-    scope : that is needed
-    map_name : for which it is; default: for all maps
+    """Return whether grants, by names of maps and `*` for all, include a scope for a map, by
+    default for all maps.
     """
     least = SCOPES.index(scope)
     held = [grants[name] for name in (EVERY, map_name) if name in grants]
     return any(SCOPES.index(one) >= least for one in held)
+
+
+#: The map of a match, in requests for one.
+MatchMap = Annotated[
+    str | None,
+    Query(
+        alias="map",
+        max_length=128,
+        description="Where matches of several maps have the same id; default: the first of them.",
+    ),
+]
 
 
 # Who asks, and what they may.
@@ -96,12 +104,8 @@ class Caller:
         return allows(self.grants, scope, map_name)
 
     def require(self, map_name: str, scope: Scope) -> None:
-        """See that the caller may do that with a map.
-
-        Raises
-        ------
-        UnknownMap : it may not even read it.
-        Forbidden : it may read it, and not that.
+        """Check that the caller may use a map in this scope. Raise UnknownMap if it may not read
+        the map, and Forbidden if it may only read it.
         """
         if not self.may("read", map_name):
             raise unknown_map(map_name)
@@ -119,12 +123,8 @@ class Caller:
             raise _forbidden(self, scope, "all maps")
 
     def require_job(self, job: Job, scope: Scope = "read") -> Job:
-        """The job, where the caller may do that with it.
-
-        Raises
-        ------
-        UnknownJob : it may not see it.
-        Forbidden : it may see it, and not that.
+        """Return the job if the caller may use it in this scope. Raise UnknownJob if it may not see
+        the job, and Forbidden if it may only see it.
         """
         of = EVERY if job.map is None else job.map
         if not self.may("read" if job.map is not None else "admin", of):
@@ -148,6 +148,17 @@ class Caller:
         return None if self.reads_every else tuple(sorted(set(self.grants) - {EVERY}))
 
 
+def require_readable(query_id: str, here: Service, asking: Caller) -> QueryRow:
+    """Return the row of a query. Raise UnknownQuery, with the same text, if its answer is not
+    stored or the caller may not read all maps that it names.
+    """
+    row = here.context.query_log.find_row(query_id)
+    maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
+    if len(asking.readable(maps)) < len(maps):
+        raise unknown_query(query_id)
+    return row
+
+
 def anybody() -> Caller:
     """Where no key is asked for: whoever reaches the service is on its machine."""
     return Caller("", {EVERY: "admin"})
@@ -157,13 +168,9 @@ async def caller(
     request: Request, here: Here,
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller:  # fmt: skip
-    """Return who asks, by the key that was shown; where no key is required, one that is shown
-    counts all the same: a wrong one would else go unnoticed until the service requires it.
-
-    Raises
-    ------
-    KeyRequired : none was shown, or one that is unknown, revoked or expired.
-    RateLimited, Busy : its tenant asks too often, or too much at once.
+    """Return the caller by the key in the request. A key is checked even if none is required: a
+    wrong one would otherwise go unnoticed. Raise KeyRequired if it is missing, unknown, revoked or
+    expired, and RateLimited or Busy if its tenant sends too many requests.
     """
     if given is None:
         if requires_key(request, here):
@@ -209,13 +216,8 @@ def release_place(request: Request) -> None:
 
 
 async def hold_read(request: Request, here: Service, tenant: str) -> None:
-    """Wait for a turn of the shared threads, held until the answer begins; Busy.
-
-    Parameters
-    ----------
-    request : a page of many rows takes several turns
-    here : of the service
-    tenant : that asks; where no key is asked for there is nobody to share with
+    """Wait for a turn of the shared threads, several for a page of many rows, held until the answer
+    begins. Raise Busy if none comes in time; requests without a key share with nobody.
     """
     if tenant == NOBODY:
         return
@@ -227,13 +229,8 @@ async def hold_read(request: Request, here: Service, tenant: str) -> None:
 def v1_router(
     prefix: str = "", tag: str | None = None, *depends: Callable[..., object]
 ) -> APIRouter:
-    """A router of paths below /v1, each of which asks who calls.
-
-    Parameters
-    ----------
-    prefix : of its paths, below /v1
-    tag : of its operations in the OpenAPI document
-    depends : what else each of its paths depends on
+    """Return a router of paths below /v1, each of which checks the caller and `depends`. `tag`
+    names its operations in the OpenAPI document.
     """
     dependencies = [Depends(one) for one in (caller, *depends)]
     tags: list[str | Enum] | None = None if tag is None else [tag]
@@ -279,11 +276,8 @@ async def guest(
     request: Request, here: Here,
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller | None:  # fmt: skip
-    """For routes that answer anybody, and tell more to some: None where no key was shown.
-
-    Raises
-    ------
-    KeyRequired : one was shown that is unknown, revoked or expired.
+    """Return the caller of a route that anybody may use; None without a key. Raise KeyRequired if
+    the key is unknown, revoked or expired.
     """
     if given is None and requires_key(request, here):
         return None
@@ -367,12 +361,8 @@ ALL_AT_ONCE, ALL_PER_S = 20, 1.0
 
 
 class RefusalFilter:
-    """Which refusals are noted: however many there are, they do not fill the log or the disk.
-
-    Parameters
-    ----------
-    clock : seconds, never going back
-    most : callers and addresses that are remembered
+    """Decides which refusals are logged: however many there are, they fill neither log nor disk. It
+    remembers the `most` latest callers and addresses.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, most: int = 10_000) -> None:

@@ -167,11 +167,8 @@ def unspoolable(error: OSError) -> UnusableStore:
 
 
 def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
-    """The query string of a request that is not a form.
-
-    Raises
-    ------
-    InvalidRequest : it has something twice, or that is not known.
+    """Return the query string of a request that is not a form; raise InvalidRequest for unknown or
+    repeated parameters.
     """
     given: dict[str, str] = {}
     for name, value in request.query_params.multi_items():
@@ -396,12 +393,7 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
 
 @asynccontextmanager
 async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
-    """Read a form; its files are gone afterwards.
-
-    Raises
-    ------
-    UnsupportedType, MalformedBody, StoreFull, UnusableStore : as `uploaded`.
-    """
+    """Read a form; its files are closed afterwards. Errors as for `uploaded`."""
     if _has_no_body(request):
         raise MalformedBody(_NO_BODY)
     if media_type(request) != FORM:
@@ -448,11 +440,8 @@ def texts_of(form: FormData) -> dict[str, str]:
 
 
 def priority_of(fields: Mapping[str, str]) -> int:
-    """The field `priority` of an upload; 0 where there is none.
-
-    Raises
-    ------
-    InvalidRequest : no whole number within MOST_PRIORITY of 0.
+    """Return the field `priority` of an upload, by default 0; raise InvalidRequest beyond
+    MOST_PRIORITY.
     """
     text = fields.get("priority", "0")
     number = int(text) if re.fullmatch(r"[+-]?[0-9]{1,3}", text.strip(), re.ASCII) else None
@@ -473,12 +462,8 @@ def json_body(record: str, *, required: bool = True) -> dict[str, Any]:
 
 
 async def read_json(request: Request) -> Any:
-    """What the body is as JSON.
-
-    Raises
-    ------
-    MalformedBody : no JSON.
-    TooLarge : more than anyone has to say; no more of it is read.
+    """Return the JSON body of a request. Raise MalformedBody if it is not JSON, and TooLarge,
+    without reading on, if it is longer than any valid one.
     """
     body = bytearray()
     async for chunk in request.stream():

@@ -24,12 +24,7 @@ _NOTHING = b"default-src 'none'; frame-ancestors 'none'"
 
 
 def security_headers(given: Headers) -> Headers:
-    """Headers that an answer needs and has not.
-
-    Parameters
-    ----------
-    given : headers that the answer has
-    """
+    """Return the headers that an answer needs and does not have."""
     there = {name.lower() for name, _ in given}
     wanted = [
         *_ALWAYS,
@@ -169,12 +164,8 @@ class Origins:
 
 
 def origins_of(settings: Settings) -> Origins:
-    """The origins that an operator allows.
-
-    Raises
-    ------
-    InvalidRequest : all, where no key is asked for: any page that is opened on this machine could
-        then read and delete all maps.
+    """Return the origins that an operator allows. Raise InvalidRequest for `*` where no key is
+    required: any page opened on this machine could then read and delete all maps.
     """
     if "*" in settings.cors_origins and not settings.asks_for_keys:
         raise InvalidRequest(

@@ -77,12 +77,8 @@ class Feed:
         return self._streams.total
 
     def join(self, tenant: str = NOBODY) -> None:
-        """Take a place, to be given back by `leave`.
-
-        Raises
-        ------
-        Busy : as many listen as may.
-        RateLimited : as many of the tenant do.
+        """Take a place, to be given back by `leave`. Raise Busy if all are taken, and RateLimited
+        if the tenant has its share.
         """
         if self._closed or self._streams.total >= self._most:
             raise Busy(
@@ -267,13 +263,7 @@ def alive(place: str) -> bytes:
 
 
 class EventStream(Response):
-    """A body that goes on until its source ends or nobody listens any more.
-
-    Parameters
-    ----------
-    source : of the parts of the body
-    left : called when it is over
-    """
+    """A body that goes on until its source ends or nobody listens; then `left` is called."""
 
     media_type = MEDIA_TYPE
 

@@ -74,12 +74,7 @@ def share(room: int) -> int:
 
 
 class Turns:
-    """Turns of requests: see TurnOrder.
-
-    Parameters
-    ----------
-    count, beside, clock, rests : see TurnOrder
-    """
+    """Turns of requests: see TurnOrder."""
 
     def __init__(
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
@@ -122,12 +117,7 @@ class Turns:
 
 
 class SharedLooks:
-    """Results of slow looks that concurrent requests share.
-
-    Parameters
-    ----------
-    most_s : maximum age of a result, seconds, counted from the beginning of its look
-    """
+    """Results of slow looks that concurrent requests share, until they are `most_s` seconds old."""
 
     def __init__(self, most_s: float) -> None:
         self._most_s = most_s
@@ -135,13 +125,8 @@ class SharedLooks:
         self._found: dict[str, tuple[float, Any]] = {}
 
     async def get(self, name: str, look: Callable[[], T]) -> T:
-        """Return what a look found, or raise what it raised.
-
-        Who waits while another request looks holds no thread.
-
-        Parameters
-        ----------
-        look : called in a thread where no result of this name is young enough
+        """Return what a look found, or raise what it raised. `look` runs in a thread if no result
+        of this name is young enough; who waits meanwhile holds no thread.
         """
         arrived = time.monotonic()
         async with self._locks[name]:
@@ -188,12 +173,8 @@ class Gate:
 
     @asynccontextmanager
     async def place(self) -> AsyncIterator[None]:
-        """A place inside. Take it before the body is read: who is sent away has spooled nothing.
-
-        Raises
-        ------
-        Busy : as many are inside as may.
-        RateLimited : as many of the tenant are.
+        """Hold a place. Take it before reading the body: a rejected request has then spooled
+        nothing. Raise Busy if all are taken, and RateLimited if the tenant has its share.
         """
         tenant = current_tenant()
         if self._taken.total >= self._places:
@@ -204,6 +185,11 @@ class Gate:
             yield
         finally:
             self._taken.give(tenant, 1)
+
+    async def enter(self, do: Callable[[], T]) -> T:
+        """Take a place, and do the work when it is its turn; see `place` and `run`."""
+        async with self.place():
+            return await self.run(do)
 
     async def run(self, do: Callable[[], T], *, patient: bool = False) -> T:
         """Do it in a thread, off the event loop, when it is its turn; for who has a place.
@@ -342,12 +328,8 @@ class TokenBucket:
 
 
 class RateLimits:
-    """What callers of one service are held to.
-
-    Parameters
-    ----------
-    requests_per_s : of each tenant; it may make those of five seconds at once
-    failed_per_minute : wrong keys from each address
+    """Rate limits of one service: requests of each tenant, with bursts of five seconds, and wrong
+    keys of each address.
     """
 
     def __init__(self, requests_per_s: float, failed_per_minute: float) -> None:
@@ -517,11 +499,8 @@ class RequestBody:
         return self._bytes
 
     async def next(self) -> Message:
-        """The next part; after the last, whatever else is told.
-
-        Raises
-        ------
-        Broken : `fault` says why.
+        """Return the next part, and after the last one every further message; raise Broken, with
+        the reason in `fault`.
         """
         if self._whole:
             return await self._receive()

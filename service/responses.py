@@ -27,11 +27,8 @@ _QUALITY = re.compile(r";\s*q\s*=\s*(\d+(?:\.\d*)?)", re.ASCII)
 
 
 def expected(request: Request) -> Collection[str] | None:
-    """Entity tags of If-Match, one of which the resource must have; None for any.
-
-    Raises
-    ------
-    InvalidRequest : a header that holds no tag.
+    """Return the entity tags of If-Match, or None for any; raise InvalidRequest if the header has
+    no tag.
     """
     header = ", ".join(request.headers.getlist("if-match")).strip()
     if header in ("", "*"):
@@ -95,11 +92,6 @@ def file_responses(
     return {200: done, 304: known, **declared(*statuses)}
 
 
-async def look(here: Service, find: Callable[[], Output[T]]) -> Output[T]:
-    """Look for it in a thread."""
-    return await here.run(find)
-
-
 def tagged(output: Output[Any]) -> dict[str, str]:
     """Its headers."""
     return {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
@@ -113,8 +105,7 @@ async def sent(
     headers |= tagged(output)
     if is_known(request, output.tag):
         return Response(None, 304, headers)
-    async with here.gate.place():
-        data = await here.gate.run(output.make)
+    data = await here.gate.enter(output.make)
     if name is not None:
         headers["Content-Disposition"] = f'inline; filename="{safe(name)}"'
     return Response(data, 200, headers, kind)

@@ -211,11 +211,8 @@ UNENCRYPTED_BYTES = 64 << 10
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:
-    """How the service proves who it is; None: it speaks plain HTTP.
-
-    Raises
-    ------
-    InvalidRequest : certificate or key cannot be read, or do not belong together.
+    """Return the TLS context of the service, or None for plain HTTP; raise InvalidRequest if
+    certificate or key cannot be read, or do not match.
     """
     if settings.tls_cert is None or settings.tls_key is None:
         return None
@@ -333,11 +330,8 @@ GRACE_S = 20
 
 
 def listen(settings: Settings) -> socket.socket:
-    """A socket on the address of the settings.
-
-    Raises
-    ------
-    UnusableStore : the address is not of this machine, or taken.
+    """Open a socket on the address of the settings; raise UnusableStore if the address is taken or
+    not of this machine.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     # the protocol named, or asyncio leaves Nagle on and every answer waits 40 ms for an ACK

@@ -23,12 +23,8 @@ if TYPE_CHECKING:
 
 
 class Front:
-    """An ASGI application that loads another.
-
-    Parameters
-    ----------
-    load : makes the application, in a thread
-    failed : called where it could not be made or begun; `error` says why
+    """An ASGI application that loads another in a thread. If that fails, it calls `failed`, and
+    `error` says why.
     """
 
     def __init__(

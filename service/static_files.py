@@ -121,11 +121,8 @@ _LIBRARY = ("swagger-ui.css", "swagger-ui-bundle.js")
 
 
 def routes(document: Callable[[], dict[str, Any]]) -> APIRouter:
-    """Return the routes of the page, its files and the OpenAPI document.
-
-    Parameters
-    ----------
-    document : makes the OpenAPI document, which takes a while; called by the first request for it
+    """Return the routes of the page, its files and the OpenAPI document, which the first request
+    for it makes.
     """
     router = APIRouter(include_in_schema=False)
     rendered: list[StaticFile] = []

@@ -31,12 +31,7 @@ def files_in(folder: Path) -> dict[str, StaticFile]:
 
 
 def routes(files: Mapping[str, StaticFile]) -> APIRouter:
-    """Routes of the dashboard.
-
-    Parameters
-    ----------
-    files : as `files_in` found them
-    """
+    """Return the routes of the dashboard for files of `files_in`."""
     router = APIRouter(include_in_schema=False)
 
     def sent(request: Request, name: str) -> Response:

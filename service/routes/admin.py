@@ -100,10 +100,7 @@ def _look(context: Context) -> Readiness:
 
 
 @router.get(
-    "/metrics",
-    response_class=Response,
-    responses=declared(),
-    dependencies=[Depends(reads_every)],
+    "/metrics", response_class=Response, responses=declared(), dependencies=[Depends(reads_every)]
 )
 def metrics(here: Here) -> Response:
     """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
@@ -270,9 +267,7 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
 
 
 @operations_router.delete(
-    "/maps/{map_name}/reencoding",
-    responses=declared(404, 409),
-    dependencies=[Depends(may_admin)],
+    "/maps/{map_name}/reencoding", responses=declared(404, 409), dependencies=[Depends(may_admin)]
 )
 def cancel_reencoding(map_name: str, here: Here) -> Map:
     """Let a map keep the model that it has; what was made for the other is removed."""

@@ -7,14 +7,7 @@ from typing import Annotated
 
 from fastapi import Depends, Query, Request, Response
 
-from sceneprint.engine.maps.map_frames import (
-    JSON,
-    NPY,
-    PLY,
-    PNG,
-    Output,
-    upload_type,
-)
+from sceneprint.engine.maps.map_frames import JSON, NPY, PLY, PNG, Output, upload_type
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.export import LIMIT, MEDIA_TYPE, MOST
 from sceneprint_client.api.results import (
@@ -28,20 +21,17 @@ from sceneprint_client.api.results import (
     View,
 )
 from sceneprint_client.formats import BYTES, HEAD, media_types_of
-from service.auth import Asking, may_read, v1_router
+from service.auth import Asking, MatchMap, may_read, require_readable, v1_router
 from service.responses import (
     file_responses,
     files,
     is_known,
-    look,
     preferred_media_type,
     safe,
     send_file,
     sent,
     tagged,
 )
-from service.routes.queries import require_readable
-from service.routes.results import MapName
 from service.running_service import Here, Service
 
 router = v1_router("/maps/{map_name}/frames/{frame_id}", "frames", may_read)
@@ -74,7 +64,7 @@ async def get_cloud(
     compares it; of a point cloud, a range image's about its viewpoint. The samples themselves are
     in the upload.
     """
-    found = await look(here, lambda: here.outputs.cloud(map_name, frame_id, frame))
+    found = await here.run(lambda: here.outputs.cloud(map_name, frame_id, frame))
     return await sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
 
 
@@ -82,9 +72,7 @@ async def get_cloud(
     "/preview.png",
     response_class=Response,
     responses=file_responses(
-        PNG,
-        description="What its colours mean is in the tEXt chunks.",
-        statuses=(404, 409, 422),
+        PNG, description="What its colours mean is in the tEXt chunks.", statuses=(404, 409, 422)
     ),
 )
 async def get_preview(
@@ -105,7 +93,7 @@ async def get_preview(
     width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
 ) -> Response:
     """A picture of a frame, for people."""
-    found = await look(here, lambda: here.outputs.preview(map_name, frame_id, view, width))
+    found = await here.run(lambda: here.outputs.preview(map_name, frame_id, view, width))
     return await sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
 
 
@@ -116,7 +104,7 @@ async def get_preview(
 )
 async def get_patches(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The surface patches of a frame, by level, and those that validation compares."""
-    found = await look(here, lambda: here.outputs.patches(map_name, frame_id))
+    found = await here.run(lambda: here.outputs.patches(map_name, frame_id))
     told = Output(found.tag, lambda: found.make().model_dump_json().encode())
     return await sent(request, here, told, JSON)
 
@@ -137,10 +125,10 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
     """
     outputs, kind = here.outputs, preferred_media_type(request, (JSON, BYTES, NPY))
     if kind == JSON:
-        made = await look(here, lambda: outputs.signature(map_name, frame_id))
+        made = await here.run(lambda: outputs.signature(map_name, frame_id))
         told = Output(made.tag, lambda: made.make().model_dump_json().encode())
     else:
-        told = await look(here, lambda: outputs.vector(map_name, frame_id, kind))
+        told = await here.run(lambda: outputs.vector(map_name, frame_id, kind))
     return await sent(request, here, told, kind, Vary="Accept")
 
 
@@ -151,11 +139,10 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """The frame's upload: what you sent in is yours to take out."""
-    found = await look(here, lambda: here.outputs.upload(map_name, frame_id))
+    found = await here.run(lambda: here.outputs.upload(map_name, frame_id))
     if is_known(request, found.tag):
         return Response(None, 304, tagged(found))
-    async with here.gate.place():
-        return await here.gate.run(lambda: _upload(request, here, found, frame_id))
+    return await here.gate.enter(lambda: _upload(request, here, found, frame_id))
 
 
 def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str) -> Response:
@@ -202,8 +189,7 @@ async def get_frame_points(
     limit: Limit = LIMIT,
 ) -> Response:
     """The points of `cloud.ply` in a third of its bytes, for a page to draw."""
-    clouds = here.points
-    found = await look(here, lambda: clouds.frame(map_name, frame_id, frame, limit))
+    found = await here.run(lambda: here.points.frame(map_name, frame_id, frame, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
 
@@ -222,7 +208,7 @@ async def get_query_points(
 ) -> Response:
     """The surface that a query saw, for a page to draw, in the query's sensor's frame."""
     await here.run(require_readable, query_id, here, asking)
-    found = await look(here, lambda: here.points.query(query_id, limit))
+    found = await here.run(lambda: here.points.query(query_id, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
 
@@ -243,7 +229,7 @@ async def get_match_points(
     request: Request,
     here: Here,
     asking: Asking,
-    map_name: MapName = None,
+    map_name: MatchMap = None,
     side: Annotated[PointsSide, Query(description="Whose points.")] = "query",
     transform: Annotated[
         OverlayTransform,
@@ -258,8 +244,7 @@ async def get_match_points(
     says how far it is from the surface that the other saw.
     """
     await here.run(require_readable, query_id, here, asking)
-    clouds = here.points
-    found = await look(
-        here, lambda: clouds.match(query_id, frame_id, map_name, side, transform, limit)
+    found = await here.run(
+        lambda: here.points.match(query_id, frame_id, map_name, side, transform, limit)
     )
     return await sent(request, here, found, MEDIA_TYPE)

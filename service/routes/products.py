@@ -20,13 +20,7 @@ from sceneprint_client.api.coverage import (
     CoverageOutcome,
     MapCoverage,
 )
-from sceneprint_client.api.sessions import (
-    Association,
-    Difference,
-    Edge,
-    Graph,
-    GraphFormat,
-)
+from sceneprint_client.api.sessions import Association, Difference, Edge, Graph, GraphFormat
 from service.auth import may_read, may_write, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
@@ -222,9 +216,7 @@ def list_edges(
 
 
 @associations_router.get(
-    "/{job_id}/graph",
-    response_class=Response,
-    responses={**_GRAPH, **declared(404, 409, 422)},
+    "/{job_id}/graph", response_class=Response, responses={**_GRAPH, **declared(404, 409, 422)}
 )
 async def get_graph(
     map_name: str,
@@ -261,11 +253,10 @@ async def get_graph(
     """
     kinds = {media: name for name, media in MEDIA_TYPES.items()}
     wanted: Any = kind or kinds[preferred_media_type(request, list(kinds))]
-    async with here.gate.place():
-        text = await here.gate.run(
-            lambda: here.associations.graph(
-                map_name, job_id, wanted, min_overlap, odometry=odometry, consistent=consistent
-            )
+    text = await here.gate.enter(
+        lambda: here.associations.graph(
+            map_name, job_id, wanted, min_overlap, odometry=odometry, consistent=consistent
         )
+    )
     name = f'attachment; filename="{job_id}.{wanted}"'
     return Response(text, media_type=MEDIA_TYPES[wanted], headers={"Content-Disposition": name})

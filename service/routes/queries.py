@@ -18,10 +18,9 @@ from fastapi import Depends, Request
 from pydantic import BaseModel
 from starlette.datastructures import FormData, UploadFile
 
-from sceneprint.engine.results.query_entry import SentQuery, query_row, unknown_query
+from sceneprint.engine.results.query_entry import SentQuery, query_row
 from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint.errors import InvalidRequest, MalformedBody, NotFound
-from sceneprint.store.query_rows import QueryRow
 from sceneprint_client.api import (
     Answer,
     Comparison,
@@ -36,7 +35,7 @@ from sceneprint_client.api import (
 from sceneprint_client.api.base import Given, Label, record_of
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from service import bodies
-from service.auth import Asking, Caller, may_read, v1_router
+from service.auth import Asking, Caller, may_read, require_readable, v1_router
 from service.bodies import (
     FORM,
     FRAME_BODY,
@@ -126,8 +125,7 @@ async def read_object(request: Request) -> dict[str, Any]:
 def unnamed(name: str) -> InvalidRequest:
     """That a query has no frame: neither a file nor the name of a stored one."""
     return InvalidRequest(
-        f"The query has no frame. Give `{name}`, or send a frame as a form.",
-        ((name, "missing"),),
+        f"The query has no frame. Give `{name}`, or send a frame as a form.", ((name, "missing"),)
     )
 
 
@@ -232,14 +230,9 @@ class PairBody:
 
 @asynccontextmanager
 async def pair(request: Request) -> AsyncIterator[PairBody]:
-    """Read two frames: from JSON, or from a form with parts `a` and `b`.
-
-    Raises
-    ------
-    UnsupportedType : neither JSON nor a form.
-    MalformedBody : it cannot be parsed.
-    InvalidRequest : a frame is missing or there twice, or a field is not as it should be.
-    StoreFull, UnusableStore : the machine cannot keep a file until it is read.
+    """Read two frames from JSON, or from a form with parts `a` and `b`. Raise UnsupportedType or
+    MalformedBody if the body is neither, InvalidRequest for a missing or repeated frame or an
+    invalid field, and StoreFull or UnusableStore if a file cannot be spooled.
     """
     if media_type(request) == JSON:
         how = record_of(Comparison, await read_object(request), "The comparison")
@@ -387,10 +380,7 @@ async def localize_sequence(
     """
     since, at = time.perf_counter(), time.time()
     options = tuple(Query.model_fields)
-    async with (
-        here.gate.place(),
-        frames_of(request, *options, most=MOST_OF_SEQUENCE) as sent,
-    ):
+    async with here.gate.place(), frames_of(request, *options, most=MOST_OF_SEQUENCE) as sent:
         query = record_of(Query, sent.texts, _QUERY)
         wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
         if wrong is not None:
@@ -437,20 +427,6 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
         return await run_query(
             here, sent, since, lambda: queries.stored(maps, named, query, since, sent)
         )
-
-
-def require_readable(query_id: str, here: Service, asking: Caller) -> QueryRow:
-    """Return the row of a query, if the caller may read all maps that it names.
-
-    Raises
-    ------
-    UnknownQuery : its answer is not stored, or the caller may not see it: the text is the same.
-    """
-    row = here.context.query_log.find_row(query_id)
-    maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
-    if len(asking.readable(maps)) < len(maps):
-        raise unknown_query(query_id)
-    return row
 
 
 async def _repeated(

@@ -27,22 +27,12 @@ from sceneprint_client.api.results import (
     StoredQuery,
     View,
 )
-from service.auth import Asking, Caller, v1_router
+from service.auth import Asking, Caller, MatchMap, require_readable, v1_router
 from service.bodies import json_body, read_record
 from service.problems import declared
-from service.routes.queries import require_readable
 from service.running_service import Here, Service
 
 router = v1_router("/queries/{query_id}", "queries")
-
-MapName = Annotated[
-    str | None,
-    Query(
-        alias="map",
-        max_length=128,
-        description="Where matches of several maps have the same id; default: the first of them.",
-    ),
-]
 
 
 def _ply(description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -67,10 +57,8 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
 )
 async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
     """The surface that the query saw, as validation compares it: binary PLY, metres."""
-    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
-    async with here.gate.place():
-        data = await here.gate.run(lambda: inspection.cloud(query_id))
+    data = await here.gate.enter(lambda: here.inspection.cloud(query_id))
     return Response(data, media_type=PLY)
 
 
@@ -84,25 +72,21 @@ async def get_similarities(
     ] = 50,
 ) -> Similarities:
     """How alike the query and its nearest frames are, each to each: what the selection sees."""
-    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
-    async with here.gate.place():
-        return await here.gate.run(lambda: inspection.similarities(query_id, limit))
+    return await here.gate.enter(lambda: here.inspection.similarities(query_id, limit))
 
 
 @router.get("/matches/{frame_id}", responses=declared(404, 409, 422))
 async def get_match(
-    query_id: str, frame_id: str, here: Here, asking: Asking, map_name: MapName = None
+    query_id: str, frame_id: str, here: Here, asking: Asking, map_name: MatchMap = None
 ) -> MatchDetails:
     """One match with what it rests on: its rival, patches that coincide, points for and against.
 
     It is validated once more, with the seed and the options of the query; one that the query
     passed over is validated now.
     """
-    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
-    async with here.gate.place():
-        return await here.gate.run(lambda: inspection.match(query_id, frame_id, map_name))
+    return await here.gate.enter(lambda: here.inspection.match(query_id, frame_id, map_name))
 
 
 @router.get(
@@ -115,7 +99,7 @@ async def get_overlay(
     frame_id: str,
     here: Here,
     asking: Asking,
-    map_name: MapName = None,
+    map_name: MatchMap = None,
     color: Annotated[
         OverlayColour,
         Query(
@@ -135,12 +119,10 @@ async def get_overlay(
     ] = "aligned",
 ) -> Response:
     """The query laid on a match, to see how well they fit: binary PLY, metres."""
-    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
-    async with here.gate.place():
-        data = await here.gate.run(
-            lambda: inspection.overlay(query_id, frame_id, map_name, color, transform)
-        )
+    data = await here.gate.enter(
+        lambda: here.inspection.overlay(query_id, frame_id, map_name, color, transform)
+    )
     return Response(data, media_type=PLY)
 
 
@@ -166,16 +148,13 @@ async def get_query_preview(
     here: Here,
     asking: Asking,
     view: Annotated[
-        View,
-        Query(description="As of a frame; `patches` are not stored of a query, and refused."),
+        View, Query(description="As of a frame; `patches` are not stored of a query, and refused.")
     ] = "depth",
     width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
 ) -> Response:
     """A picture of what the query saw, for people."""
-    inspection = here.inspection
     await here.run(require_readable, query_id, here, asking)
-    async with here.gate.place():
-        data = await here.gate.run(lambda: inspection.preview(query_id, view, width))
+    data = await here.gate.enter(lambda: here.inspection.preview(query_id, view, width))
     return Response(data, 200, {"Cache-Control": "private, no-cache"}, PNG)
 
 

@@ -40,10 +40,9 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
     it.
     """
     wanted = await read_record(request, FrameSelection, "The selection")
-    async with here.upload_gate.place():
-        return await here.upload_gate.run(
-            partial(delete_selection, here.context.store, map_name, wanted, here.tombstones)
-        )
+    return await here.upload_gate.enter(
+        partial(delete_selection, here.context.store, map_name, wanted, here.tombstones)
+    )
 
 
 @router.post(
@@ -57,10 +56,7 @@ async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdit
     has what undoes it.
     """
     edit = await read_record(request, FramesEdit, "The edit of the frames")
-    async with here.upload_gate.place():
-        return await here.upload_gate.run(
-            partial(edit_selection, here.context.store, map_name, edit)
-        )
+    return await here.upload_gate.enter(partial(edit_selection, here.context.store, map_name, edit))
 
 
 @router.post(
@@ -95,5 +91,4 @@ async def restore_deletion(map_name: str, deletion_id: str, here: Here) -> Frame
     A call ends after ten seconds: repeat it while `remaining` is not 0. 403 where the map may not
     hold so many frames.
     """
-    async with here.upload_gate.place():
-        return await here.upload_gate.run(partial(here.tombstones.restore, map_name, deletion_id))
+    return await here.upload_gate.enter(partial(here.tombstones.restore, map_name, deletion_id))

@@ -60,17 +60,9 @@ async def delete_session_frames(
     A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
     POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it.
     """
-    async with here.upload_gate.place():
-        return await here.upload_gate.run(
-            partial(
-                delete_session,
-                here.context.store,
-                map_name,
-                session,
-                here.tombstones,
-                robot,
-            )
-        )
+    return await here.upload_gate.enter(
+        partial(delete_session, here.context.store, map_name, session, here.tombstones, robot)
+    )
 
 
 @router.patch(
@@ -94,18 +86,14 @@ async def patch_session(
     A call ends after ten seconds: repeat it with `after` while `remaining` is not 0.
     """
     edit = await read_record(request, SessionEdit, "The edit of the session")
-    async with here.upload_gate.place():
-        return await here.upload_gate.run(
-            partial(edit_session, here.context.store, map_name, session, edit, robot, after)
-        )
+    return await here.upload_gate.enter(
+        partial(edit_session, here.context.store, map_name, session, edit, robot, after)
+    )
 
 
 @router.get("/trajectory", response_class=Response, responses=_TRAJECTORY)
 async def get_trajectory(
-    map_name: str,
-    request: Request,
-    here: Here,
-    run: Annotated[Run, Query()],
+    map_name: str, request: Request, here: Here, run: Annotated[Run, Query()]
 ) -> Response:
     """The poses of a run in the order of time: of the sensors' frames, in metres.
 
@@ -118,6 +106,5 @@ async def get_trajectory(
         found = trajectory(here.context.store, map_name, run)
         return (found.model_dump_json() if kind == _JSON else trajectory_file(found)).encode()
 
-    async with here.gate.place():
-        data = await here.gate.run(make)
+    data = await here.gate.enter(make)
     return Response(data, 200, {"Vary": "Accept"}, kind)

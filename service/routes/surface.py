@@ -20,7 +20,7 @@ from sceneprint_client.api.surface import (
 )
 from service.auth import may_read, may_write, v1_router
 from service.problems import declared
-from service.responses import file_responses, is_known, look, sent
+from service.responses import file_responses, is_known, sent
 from service.running_service import Here
 
 router = v1_router("/maps/{map_name}/surface", "surface", may_read)
@@ -136,9 +136,7 @@ def list_surface_frames(
     "/plan.png",
     response_class=Response,
     responses=file_responses(
-        _PNG,
-        description="Seen from above, transparent where nothing is.",
-        statuses=(404, 422),
+        _PNG, description="Seen from above, transparent where nothing is.", statuses=(404, 422)
     ),
 )
 async def get_surface_plan(
@@ -147,8 +145,7 @@ async def get_surface_plan(
     here: Here,
     parent: Parent = None,
     width: Annotated[
-        int,
-        Query(ge=PLAN_WIDTHS[0], le=PLAN_WIDTHS[1], description="Pixels of the longer side."),
+        int, Query(ge=PLAN_WIDTHS[0], le=PLAN_WIDTHS[1], description="Pixels of the longer side.")
     ] = PLAN_WIDTH,
     low: Annotated[
         float | None,
@@ -160,16 +157,13 @@ async def get_surface_plan(
     ] = None,
 ) -> Response:
     """A surface as a picture. `plan` of GET /v1/maps/{map_name}/surface tells where it lies."""
-    output = await look(here, lambda: here.surfaces.picture(map_name, parent, width, low, high))
+    output = await here.run(lambda: here.surfaces.picture(map_name, parent, width, low, high))
     return await sent(request, here, output, _PNG, "surface.png")
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:
-    """Numbers that a parameter lists.
-
-    Raises
-    ------
-    InvalidRequest : they are not so many, or none that are sensible.
+    """Return the numbers that a parameter lists; raise InvalidRequest if there are too few, too
+    many or invalid ones.
     """
     try:
         found = [float(part) for part in text.split(",")]
