@@ -22,13 +22,7 @@ from sceneprint.engine.jobs.job_runner import JobRunner
 from sceneprint.engine.upkeep.housekeeping import Housekeeping
 from sceneprint.errors import NewerSchema, SceneprintError, StoreAway
 from sceneprint.maintenance.scrub import Scrub
-from sceneprint.process import (
-    StopSignal,
-    limit_memory,
-    log_as_json,
-    of_request,
-    raise_descriptors,
-)
+from sceneprint.process import StopSignal, limit_memory, log_as_json, of_request, raise_descriptors
 from sceneprint.settings import Settings
 from sceneprint.store.wakeup import Listening, process_name
 
@@ -88,13 +82,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
 
 
 class Worker:
-    """What one process has at hand.
-
-    Parameters
-    ----------
-    context, trace, stop : see there
-    listener : of the bell
-    """
+    """Does the work of one process."""
 
     def __init__(
         self, context: Context, listener: Listening, trace: Trace, stop: StopSignal
@@ -135,10 +123,7 @@ class Worker:
             return True
         held = claimed.job
         asked = held.data or {}
-        with (
-            of_request(asked.get("request_id")),
-            self._trace.job(held.id, held.token, self._job_s),
-        ):
+        with of_request(asked.get("request_id")), self._trace.job(held.id, held.token, self._job_s):
             self._jobs.run(claimed, self._break)
         return True
 

@@ -52,12 +52,7 @@ class Post:
 
 
 class Supervisor:
-    """Keeps a number of workers running.
-
-    Parameters
-    ----------
-    settings : see Settings; `workers` of it are kept
-    """
+    """Keeps a number of workers running, as the settings say."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings

@@ -28,11 +28,7 @@ from sceneprint.geometry.views import plan
 from sceneprint.models import PRESETS, read_model
 
 #: A kernel of each part that is among the last to be compiled: where it is, so are the others.
-_LAST = {
-    "signing": pair_features._count,
-    "validation": icp.refine_in_place,
-    "clouds": plan._add,
-}
+_LAST = {"signing": pair_features._count, "validation": icp.refine_in_place, "clouds": plan._add}
 #: What a service for depth images needs, and what it needs for clouds as well.
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
 #: Seconds between two looks whether they are compiled.
@@ -126,12 +122,7 @@ def _run(
 
 def _compile(part: str, cache_dir: Path) -> None:
     """Use every kernel of a part once."""
-    from sceneprint.engine.signers import (
-        warm_clouds,
-        warm_signing,
-        warm_validation,
-        warm_views,
-    )
+    from sceneprint.engine.signers import warm_clouds, warm_signing, warm_validation, warm_views
     from sceneprint.pipeline import open_signer
 
     model = read_model(PRESETS[0])

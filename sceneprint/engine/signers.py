@@ -32,12 +32,8 @@ KERNELS_S = 20.0
 
 
 class Signers:
-    """Signers by the id of their model; the model's file is the one in the database.
-
-    Parameters
-    ----------
-    database : that holds the models
-    cache_dir : of pair tables
+    """Signers by the id of their model, whose file is in the database; `cache_dir` has the pair
+    tables.
     """
 
     def __init__(self, database: Database, cache_dir: Path) -> None:
@@ -56,12 +52,7 @@ class Signers:
         self._compiled.set()
 
     def require_kernels(self, wait_s: float | None = None) -> None:
-        """See that nobody has to compile.
-
-        Raises
-        ------
-        Busy : kernels are still being compiled after these seconds (default: KERNELS_S).
-        """
+        """Wait until kernels are compiled; raise Busy after `wait_s` (default: KERNELS_S)."""
         if not self._compiled.wait(KERNELS_S if wait_s is None else wait_s):
             raise Busy(
                 "The service is waiting for its kernels, which the first start after an "
@@ -69,12 +60,8 @@ class Signers:
             )
 
     def __call__(self, model_id: str) -> Signer:
-        """The signer of a model that a map refers to.
-
-        Raises
-        ------
-        UnreadableModel : another version of sceneprint stored it.
-        Busy : kernels are still being compiled.
+        """Return the signer of a map's model. Raise UnreadableModel if another version of
+        sceneprint stored it, and Busy while kernels are being compiled.
         """
         self.require_kernels()
         with self._lock:  # building a table takes seconds: once is enough

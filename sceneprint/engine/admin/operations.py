@@ -258,13 +258,9 @@ class Audit:
             audit_log.record_change(connection, action, map_name, target, **data)
 
     def tidy(self, now: float | None = None) -> int:
-        """Remove expired lines if the last removal was long enough ago; return their number.
-
-        Errors are logged, and the next call tries again.
-
-        Parameters
-        ----------
-        now : seconds since 1970; default: by the clock of the database
+        """Remove expired lines if it is time, and return their number. Errors are logged, and the
+        next call tries again. `now` is in seconds since 1970, by default by the clock of the
+        database.
         """
         if time.monotonic() - self._pruned < PRUNE_S or self._store.database.read_only:
             return 0

@@ -31,23 +31,12 @@ from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
 from sceneprint.store.frames import relax_novelty, renew_frame
 from sceneprint.store.keys import IdempotentRequest, Overtaken
-from sceneprint.store.maps import (
-    add_frame,
-    find_map,
-    frames_of_content,
-    living_frame,
-    require_room,
-)
+from sceneprint.store.maps import add_frame, find_map, frames_of_content, living_frame, require_room
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.queue import enqueue, signing_jobs
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint_client.api import Added, FrameMeta, FrameState
-from sceneprint_client.api.frames import (
-    BatchItem,
-    SampleRange,
-    check_frame_id,
-    problem_of,
-)
+from sceneprint_client.api.frames import BatchItem, SampleRange, check_frame_id, problem_of
 
 # Identity: an upload is a new frame, a duplicate, or a conflict.
 

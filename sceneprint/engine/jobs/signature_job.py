@@ -189,10 +189,7 @@ def _store(
         if not is_kept:
             nearest = find_nearest(store.database, readers, work.map, signature)
         number = work.frame.map_number
-        with (
-            suppress(Stale),
-            store.database.write(map_number=number) as connection,
-        ):
+        with suppress(Stale), store.database.write(map_number=number) as connection:
             is_indexed = is_kept and index_claimed_frame(
                 connection, work.job, work.frame, work.map.name, signature
             )

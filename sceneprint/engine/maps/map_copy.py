@@ -99,12 +99,8 @@ class MapCopies:
         return b"".join((head.model_dump_json().encode(), b"\n", *sent))
 
     def artifact(self, map_name: str, digest: str) -> bytes:
-        """The artifact of one of its indexed frames.
-
-        Raises
-        ------
-        UnknownMap, NotFound : there is no such map, or none of its frames has it.
-        DamagedBlob : it is damaged, or was removed just now.
+        """Return the artifact of an indexed frame. Raise UnknownMap or NotFound if no frame of the
+        map has it, and DamagedBlob if it is damaged or was just removed.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -150,11 +146,8 @@ _MARK = "map-copy.json"
 
 
 def claim_folder(folder: Path) -> None:
-    """Let a data folder be one for copies of maps.
-
-    Raises
-    ------
-    InvalidRequest : it holds something else.
+    """Mark a data folder as one for copies of maps; raise InvalidRequest if it holds something
+    else.
     """
     if (folder / _MARK).is_file():
         return
@@ -272,11 +265,8 @@ def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
 
 
 def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) -> int:
-    """Have an artifact here, durable; returns the bytes that were fetched.
-
-    Raises
-    ------
-    DamagedBlob : the service sent other bytes than it named.
+    """Fetch an artifact, store it durably, and return its bytes; raise DamagedBlob if the service
+    sent others.
     """
     if store.blobs.holds(digest):
         return 0
@@ -355,11 +345,8 @@ def _copied(head: MapCopy, row: Row) -> CopiedFrame:
 
 
 def _prepared(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:
-    """The map in the store, made where it is not there; one of before goes.
-
-    Raises
-    ------
-    Conflict : it has frames that were uploaded here, and are nowhere else.
+    """Return the map in the store, created where missing; an earlier copy is replaced. Raise
+    Conflict if the map has frames that were uploaded here, and exist nowhere else.
     """
     rows = {one.name: one for one in list_maps(connection)}
     before, row = rows.get(head.name), _here(connection, head)

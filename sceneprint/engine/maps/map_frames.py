@@ -61,13 +61,7 @@ FORM = 1
 
 @dataclass(frozen=True, eq=False)
 class IndexedFrame:
-    """A frame that has been signed.
-
-    Parameters
-    ----------
-    row : its map
-    artifact : blob of its geometry
-    """
+    """A signed frame with its map, and the blob of its geometry."""
 
     row: MapRow
     frame: FrameRow
@@ -80,12 +74,8 @@ class IndexedFrame:
 
 
 def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
-    """The indexed frame of an id.
-
-    Raises
-    ------
-    UnknownMap, UnknownFrame : there is none, or it was deleted.
-    NotIndexed : nothing has been made of it, or not yet.
+    """Return an indexed frame. Raise UnknownMap or UnknownFrame if there is no such frame, and
+    NotIndexed if it is not indexed.
     """
     with store.database.read() as connection:
         row = find_map(connection, map_name)
@@ -108,12 +98,8 @@ def living(row: MapRow, frame: FrameRow) -> FrameRow:
 
 
 def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry:
-    """The geometry artifact of a frame; a damaged one is made again from the upload.
-
-    Raises
-    ------
-    DamagedBlob : it is lost or damaged, and so is the upload.
-    UnknownFrame, NotIndexed, Busy : see `check_unchanged`.
+    """Return the geometry of a frame; a damaged artifact is made again from the upload. Raise
+    DamagedBlob if both are lost or damaged, and see `check_unchanged`.
     """
     try:
         return read_geometry(store.blobs.get(found.artifact))
@@ -125,12 +111,8 @@ def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry
 
 
 def check_unchanged(store: Store, found: IndexedFrame) -> None:
-    """See that a frame is still what it was when it was found.
-
-    Raises
-    ------
-    UnknownFrame, NotIndexed : it was deleted, or lost what was made of it.
-    Busy : its map came to have another model.
+    """Check that a frame is still as it was found. Raise UnknownFrame or NotIndexed if it was
+    deleted or lost its artifact, and Busy if its map has changed its model.
     """
     now = find_indexed(store, found.row.name, found.frame.id)
     if (now.frame.number, now.artifact) != (found.frame.number, found.artifact):
@@ -148,12 +130,8 @@ _MOST_NAMES = 20
 def list_frames(
     store: Store, map_name: str, wanted: FrameListing, cursor: str | None, limit: int
 ) -> Page[Frame]:
-    """Frames of a map in the order they came, the newest first, or in the order they were taken.
-
-    Raises
-    ------
-    UnknownMap : no such map.
-    InvalidRequest : a cursor that was not given out.
+    """Return a page of frames, newest first, or in the order they were taken. Raise UnknownMap, and
+    InvalidRequest for a cursor that was not issued.
     """
     beyond = _position_of(store, cursor, wanted)
     with store.database.read() as connection:
@@ -202,12 +180,8 @@ def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> Take
 
 
 def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:
-    """Sessions of a map by their name and robot; frames that name none are one, the first.
-
-    Raises
-    ------
-    UnknownMap : no such map.
-    InvalidRequest : a cursor that was not given out.
+    """Return a page of sessions by name and robot; frames without a session come first, as one.
+    Raise UnknownMap, and InvalidRequest for a cursor that was not issued.
     """
     after = None if cursor is None else _names_of(cursor)
     with store.database.read() as connection:
@@ -221,13 +195,9 @@ def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -
 
 
 def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
-    """The poses of one run in the order of their stamps; of one stamp the first that was taken.
-
-    Raises
-    ------
-    UnknownMap : no such map.
-    InvalidRequest : the session is of several robots, or its poses lead to several frames, and it
-        is not said which; or it has more than MOST_POSES.
+    """Return the poses of one run by their stamps; of equal stamps the first that was taken. Raise
+    UnknownMap, and InvalidRequest if robot or parent frame are ambiguous, or there are more than
+    MOST_POSES.
     """
     with store.database.read() as connection:
         row = find_map(connection, map_name)
@@ -444,11 +414,8 @@ class FrameFiles:
     def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = 320
     ) -> Output[bytes]:
-        """A picture of a frame as PNG; see `sceneprint.pictures`. Errors as of `cloud`.
-
-        Raises
-        ------
-        DamagedBlob : for patches: the upload is lost.
+        """Return a picture of a frame as PNG; see `sceneprint.pictures`. Errors as for `cloud`; for
+        patches also DamagedBlob if the upload is lost.
         """
         found = find_indexed(self._store, map_name, frame_id)
 
@@ -480,11 +447,8 @@ class FrameFiles:
         return Output(found.tag("patches", found.frame.id, found.row.name), make)
 
     def signature(self, map_name: str, frame_id: str) -> Output[FrameSignature]:
-        """The signature of a frame. Errors as of `cloud`.
-
-        Raises
-        ------
-        DamagedSignature : its bytes are not those that were stored; it is made again.
+        """Return the signature of a frame; errors as for `cloud`. Raise DamagedSignature if its
+        bytes are damaged; the frame is then signed again.
         """
         found = find_indexed(self._store, map_name, frame_id)
 
@@ -514,13 +478,9 @@ class FrameFiles:
         return Output(found.tag("vector", media_type), make)
 
     def upload(self, map_name: str, frame_id: str) -> Output[bytes]:
-        """A frame's upload, byte for byte as it came.
-
-        Raises
-        ------
-        UnknownMap, UnknownFrame : there is none, or it was deleted.
-        NotIndexed : it was not kept, as the map had its place.
-        DamagedBlob : it is lost.
+        """Return a frame's upload, byte for byte as it came. Raise UnknownMap or UnknownFrame if
+        there is no such frame, NotIndexed if it was redundant and not kept, and DamagedBlob if it
+        is lost.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -570,12 +530,8 @@ class FrameFiles:
 
 
 def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]:
-    """What some coordinates of a frame are called, and the (4, 4) that leads there from its
-    sensor's.
-
-    Raises
-    ------
-    InvalidRequest : its pose, or where the sensor sits on its base, is not known.
+    """Return the name of a coordinate frame, and the (4, 4) transform to it from the frame's
+    sensor; raise InvalidRequest if the pose or the base of the frame is not known.
     """
     optical = sensor_of(frame)
     name, matrix = {

@@ -198,11 +198,8 @@ def edit_map(
 
 
 def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns of a frame as a patch wants them; those that it does not touch are left out.
-
-    Raises
-    ------
-    InvalidRequest, InvalidPose : see `edit_frame`.
+    """Return the columns that a patch changes; raise InvalidRequest or InvalidPose as `edit_frame`
+    does.
     """
     meta = _merged(frame, patch)
     if meta.pose is not None and meta.pose.of != "sensor":
@@ -328,12 +325,8 @@ def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Pat
 
 
 def cancel_reencoding(store: Store, map_name: str) -> Map:
-    """Let a map keep the model it has, and remove what was made for the other.
-
-    Raises
-    ------
-    UnknownMap : no such map.
-    Conflict : no other model is on its way.
+    """Cancel the switch to another model, and remove what was made for it. Raise UnknownMap if
+    there is no such map, and Conflict if no switch is in progress.
     """
     with store.database.write() as connection:
         row = find_map(connection, map_name)
@@ -350,11 +343,8 @@ def cancel_reencoding(store: Store, map_name: str) -> Map:
 
 
 class Reencodings:
-    """Brings maps on to their next models, and removes what the former left.
-
-    Parameters
-    ----------
-    upkeep : that publishes the index of the next model before the switch
+    """Switches maps to their next models, whose indexes `upkeep` publishes first, and removes what
+    the previous models left.
     """
 
     def __init__(self, store: Store, upkeep: Upkeep) -> None:
@@ -462,23 +452,15 @@ def _still(now: MapRow, row: MapRow) -> bool:
 
 
 class Catalogue:
-    """Models by their ids; each is read once a process, as it never changes.
-
-    Parameters
-    ----------
-    database : that holds those that maps were made with
-    """
+    """Models by their ids; each is read once a process, as it never changes."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._known: dict[str, Model] = {}
 
     def tell(self, may_read: Callable[[str], bool]) -> list[ModelInfo]:
-        """All that can be read: the presets first, then by label.
-
-        Parameters
-        ----------
-        may_read : whether a map may be named
+        """Return all readable models, presets first, then by label; name only maps that `may_read`
+        allows.
         """
         with self._database.read() as connection:
             found = {model.id: model for model in self._stored(connection)}

@@ -149,11 +149,8 @@ def localisability(cell: CoverageCell) -> float:
 def plan_changes(
     before: Sequence[CoveragePlan], after: Sequence[CoveragePlan]
 ) -> list[PlanChanges]:
-    """Cells that have queried frames in either of two results, by parent frame.
-
-    Parameters
-    ----------
-    before, after : plans with cells of one width and, of one parent frame, the same axes
+    """Return cells with queried frames in either of two results, whose plans have the same cells
+    and axes.
     """
     names = dict.fromkeys(plan.parent_frame for plan in (*after, *before))
     told = []

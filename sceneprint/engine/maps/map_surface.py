@@ -14,12 +14,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.maps.map_plans import PlanFrame, plan_frame, surface_picture
-from sceneprint.engine.maps.surface_job import (
-    SURFACE,
-    scale_of,
-    surface_points,
-    tile_cells,
-)
+from sceneprint.engine.maps.surface_job import SURFACE, scale_of, surface_points, tile_cells
 from sceneprint.engine.products.product import BACKGROUND
 from sceneprint.engine.serializers import tag_of, when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
@@ -117,11 +112,8 @@ class MapSurfaces:
         return told, begun
 
     def remove(self, map_name: str) -> None:
-        """Remove the surface of a map; workers do not build it again until somebody asks for it.
-
-        Raises
-        ------
-        UnknownMap : no such map.
+        """Remove the surface of a map; workers build it again only on request. Raise UnknownMap if
+        there is no such map.
         """
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
@@ -171,13 +163,8 @@ class MapSurfaces:
         return Page[SurfaceTile](items=items, next_cursor=more)
 
     def tile(self, map_name: str, digest: str) -> Output[bytes]:
-        """The cells of a tile.
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        NotFound : the map has no such tile now.
-        DamagedBlob : its bytes are lost, when they are made; a worker makes the tile again.
+        """Return the cells of a tile. Raise UnknownMap or NotFound if the map has no such tile now.
+        The output raises DamagedBlob if the bytes are lost; a worker then makes the tile again.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
@@ -414,11 +401,8 @@ _ROWS_AT_ONCE = 100
 
 
 class SurfaceUpkeep:
-    """Begins jobs for surfaces that lack frames; any number of processes may.
-
-    Parameters
-    ----------
-    auto : whether frames that came are fused unasked; deleted ones are always taken out
+    """Begins jobs for surfaces that lack frames, or, unless `auto`, only for deleted ones; any
+    number of processes may.
     """
 
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:

@@ -79,11 +79,8 @@ def surface_points(geometry: Geometry) -> Floats:
 
 
 def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
-    """A tile as it is given out, its sums encoded where it is of the finest level.
-
-    Raises
-    ------
-    DamagedBlob : it is lost, or not what it was.
+    """Return a tile as clients receive it, its sums encoded at the finest level; raise DamagedBlob
+    if it is lost or damaged.
     """
     data = store.blobs.get(tile.blob or "")
     if tile.level:
@@ -484,11 +481,8 @@ class _Sessions:
 def parent_records(
     connection: Connection, row: MapRow, known: Mapping[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Parent frames of a surface, that of most frames first: frames, and which way is up.
-
-    Parameters
-    ----------
-    known : records by parent frame; up and axes of these are not looked for again
+    """Return the parent frames of a surface by their number of frames, with their up. Those that
+    are `known` keep up and axes.
     """
     counts = stored.count_fused(connection, row.number)
     names = sorted(counts, key=lambda name: (-counts[name], name))[:MOST_PARENTS]

@@ -27,12 +27,7 @@ from sceneprint.store.tombstones import (
     tombstones_of,
 )
 from sceneprint_client.api import Page
-from sceneprint_client.api.listing import (
-    MOST_REFUSED,
-    FrameDeletion,
-    FramesRestored,
-    RefusedFrame,
-)
+from sceneprint_client.api.listing import MOST_REFUSED, FrameDeletion, FramesRestored, RefusedFrame
 
 #: Frames deleted, edited or restored in one transaction: other writers wait for some 20 ms.
 AT_ONCE = 100
@@ -55,11 +50,8 @@ class Tombstones:
         self._store, self._seconds, self._wake = store, seconds, wake
 
     def begin(self, row: MapRow) -> int | None:
-        """Return the number of a deletion that begins now; None if it cannot be undone.
-
-        Parameters
-        ----------
-        row : of the map, as the writing transaction reads it
+        """Return the number of a deletion that begins now; None if it cannot be undone. `row` is
+        the map as the writing transaction reads it.
         """
         return row.revision + 1 if self._seconds > 0 else None
 
@@ -79,12 +71,8 @@ class Tombstones:
         return None if found is None else self._record(found)
 
     def list_all(self, map_name: str, cursor: str | None, limit: int) -> Page[FrameDeletion]:
-        """Return the deletions of a map that can be undone, the newest first.
-
-        Raises
-        ------
-        UnknownMap : there is none.
-        InvalidRequest : a cursor that was not given out.
+        """Return a page of the deletions that can be undone, newest first. Raise UnknownMap, and
+        InvalidRequest for a cursor that was not issued.
         """
         before = self._store.seals.row("deletion", cursor)
         with self._store.database.read() as connection:
@@ -95,13 +83,9 @@ class Tombstones:
         return Page[FrameDeletion](items=items, next_cursor=more)
 
     def restore_one(self, map_name: str, frame_id: str) -> None:
-        """Restore a deleted frame; queries find it again at once.
-
-        Raises
-        ------
-        UnknownMap, UnknownFrame : there is none, or it can no longer be restored.
-        Conflict : its content was uploaded again.
-        QuotaExceeded : the map has no room for it.
+        """Restore a deleted frame, so that queries find it again at once. Raise UnknownMap or
+        UnknownFrame if it cannot be restored, Conflict if its content was uploaded again, and
+        QuotaExceeded if the map has no room for it.
         """
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)

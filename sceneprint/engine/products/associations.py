@@ -58,13 +58,7 @@ from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Geometry
 from sceneprint_client.api import Page
 from sceneprint_client.api.base import Transform
-from sceneprint_client.api.sessions import (
-    APART,
-    Association,
-    Edge,
-    GraphFormat,
-    NewAssociation,
-)
+from sceneprint_client.api.sessions import APART, Association, Edge, GraphFormat, NewAssociation
 
 #: Most frames of both sessions together: more are hours, and edges past what a page holds.
 MOST_FRAMES = 5000
@@ -77,12 +71,8 @@ def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
 
 
 def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> list[list[PathFrame]]:
-    """Return the frames of each session that pass the filter, in the order of time.
-
-    Raises
-    ------
-    InvalidRequest : a session has no indexed frame, or frames of several robots; or there are too
-        many frames.
+    """Return the frames of each session that pass the filter, by time. Raise InvalidRequest if a
+    session has no indexed frame, frames of several robots, or too many frames.
     """
     sides, found = sessions_of(request), []
     numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
@@ -256,11 +246,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             return None
 
     def _view(self, of: MapRow) -> tuple[MapRow, Model, IndexView]:
-        """The map as it is now: frames of it may be deleted, and its model may change.
-
-        Raises
-        ------
-        UnknownMap : it was deleted, whether or not another has its name.
+        """Return the map as it is now: its model may have changed, and frames may be deleted. Raise
+        UnknownMap if it was deleted, even if another map has its name.
         """
         row = of
         while True:  # its signer opened while no connection is held
@@ -273,12 +260,9 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
                     return row, model, self._context.readers.view(connection, row)
 
     def undo_join(self, map_name: str, job_id: str) -> Association:
-        """Undo the join of an association: all frames have the poses that the other joins give
-        them, those of no join as they were sent. Without a join that stands nothing changes.
-
-        Raises
-        ------
-        UnknownMap, UnknownJob, NotIndexed : it does not exist, or did not succeed.
+        """Undo the join of an association: its frames get the poses that the remaining joins give
+        them, or those that were sent. Raise UnknownMap, UnknownJob or NotIndexed if there is no
+        finished association; without a join nothing changes.
         """
         with self._store.database.write() as connection:
             job = self.find(connection, map_name, job_id)
@@ -373,11 +357,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
 
 def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> list[str]:
-    """Join parent frames in the commit that ends an association; no blob is of no use after it.
-
-    Raises
-    ------
-    Swept : another association joined one of them meanwhile, and the end is concluded again.
+    """Join parent frames in the commit that ends an association; no blob becomes unused. Raise
+    Swept if another association has joined one of them: the end is then concluded again.
     """
     for one in joins:
         if not join_parent(connection, task.of_map.number, one, task.job.id):

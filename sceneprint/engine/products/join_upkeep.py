@@ -40,12 +40,8 @@ _JOBS = 200
 
 
 class JoinUpkeep:
-    """Starts associations of maps with several parent frames; any number of processes may.
-
-    Parameters
-    ----------
-    store, bell : of the engine
-    auto : whether associations are started at all
+    """Starts associations of maps with several parent frames if `auto`; any number of processes
+    may.
     """
 
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:

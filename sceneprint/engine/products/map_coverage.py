@@ -19,11 +19,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.context import Context
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
-from sceneprint.engine.maps.map_plans import (
-    QueriedPosition,
-    coverage_plans,
-    plan_changes,
-)
+from sceneprint.engine.maps.map_plans import QueriedPosition, coverage_plans, plan_changes
 from sceneprint.engine.products.product import StepwiseProducts
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
@@ -81,11 +77,8 @@ _SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, Unreada
 
 
 def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage) -> list[int]:
-    """Return the numbers of the frames that a coverage job queries, in its order.
-
-    Raises
-    ------
-    InvalidRequest : there is none.
+    """Return the numbers of the frames that a coverage job queries, in its order; raise
+    InvalidRequest if there is none.
     """
     numbers = numbers_of_runs(connection, row.number, request.session, request.robot)[
         :: request.every

@@ -71,11 +71,8 @@ class Products(ABC, Generic[Request, Record]):
     # what each product adds
 
     def start(self, connection: Connection, row: MapRow, request: Request) -> dict[str, Any]:
-        """Return the progress of a job that has done nothing yet, with `done` and `total`.
-
-        Raises
-        ------
-        InvalidRequest : the map does not have what the request names.
+        """Return the progress of a job that has done nothing yet, with `done` and `total`; raise
+        InvalidRequest if the map lacks what the request names.
         """
         raise NotImplementedError
 
@@ -103,12 +100,8 @@ class Products(ABC, Generic[Request, Record]):
     # the mechanism
 
     def begin(self, map_name: str, request: Request) -> Record:
-        """Queue a job.
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : see `start`.
+        """Queue a job; raise UnknownMap if there is no such map, and InvalidRequest as `start`
+        does.
         """
         with self._store.database.read() as connection:
             progress = self.start(connection, find_map(connection, map_name), request)
@@ -127,12 +120,8 @@ class Products(ABC, Generic[Request, Record]):
             return self.start(connection, current_map(connection, row), request)
 
     def list_all(self, map_name: str, cursor: str | None = None, limit: int = 100) -> Page[Record]:
-        """Return the jobs of a map, the newest first.
-
-        Raises
-        ------
-        UnknownMap : no such map.
-        InvalidRequest : the service did not issue the cursor.
+        """Return a page of the jobs of a map, newest first. Raise UnknownMap, and InvalidRequest
+        for a cursor that was not issued.
         """
         seals = self._store.seals
         before = seals.row("job", cursor)
@@ -150,12 +139,9 @@ class Products(ABC, Generic[Request, Record]):
             return self.record_of(job, map_name, **self.details(connection, job))
 
     def remove(self, map_name: str | None, job_id: str) -> None:
-        """Delete a job with its results, also while a worker runs it.
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : it does not exist.
-        Conflict : the map depends on it; see `check_removal`.
+        """Delete a job with its results, also while a worker runs it. Raise UnknownMap or
+        UnknownJob if it does not exist, and Conflict if the map depends on it (see
+        `check_removal`).
         """
         with self._store.database.write() as connection:
             job = self.find(connection, map_name, job_id)
@@ -215,11 +201,8 @@ class Products(ABC, Generic[Request, Record]):
         )  # fmt: skip
 
     def require_success(self, job: JobRow, what: str) -> dict[str, Any]:
-        """Return the result of a job; raise NotIndexed until it has succeeded.
-
-        Parameters
-        ----------
-        what : part of the result, such as graph
+        """Return the result of a job; raise NotIndexed, which names the part that is wanted, until
+        it has succeeded.
         """
         if job.state != JobState.SUCCEEDED or job.result is None:
             why = "" if job.error is None else f" ({job.error})"
@@ -230,13 +213,8 @@ class Products(ABC, Generic[Request, Record]):
         return job.result
 
     def file(self, map_name: str | None, job_id: str, name: str) -> queue.JobFile:
-        """Return a file that a job has made.
-
-        Raises
-        ------
-        UnknownMap, UnknownJob : the job does not exist.
-        NotIndexed : it did not succeed.
-        DamagedBlob : the file is lost.
+        """Return a file that a job has made. Raise UnknownMap or UnknownJob if the job does not
+        exist, NotIndexed if it did not succeed, and DamagedBlob if the file is lost.
         """
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)

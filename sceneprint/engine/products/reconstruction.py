@@ -176,13 +176,9 @@ def _own(
 
 
 def _read(store: Store, view: JobView, model_id: str, asked_at: float) -> tuple[DepthFrame, Source]:
-    """A match's depth as it was sent; where that is lost, as validation compares it.
-
-    Raises
-    ------
-    NotFound : its map or it is gone, whether or not another has its name.
-    DamagedBlob, UnreadableGeometry : both are lost.
-    FrameError : there is nothing in it.
+    """Return a match's depth as it was sent; if that is lost, as validation compares it. Raise
+    NotFound if map or frame is gone, DamagedBlob or UnreadableGeometry if both are lost, and
+    FrameError if it is empty.
     """
     with store.database.read() as connection:
         row = find_map(connection, view.map)

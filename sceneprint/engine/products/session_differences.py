@@ -20,11 +20,7 @@ from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, ends_with
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
 from sceneprint.engine.products.product import SLICE_S, Products
 from sceneprint.engine.search.up_vectors import parent_axes
-from sceneprint.errors import (
-    DamagedBlob,
-    InvalidRequest,
-    UnreadableGeometry,
-)
+from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.export import MEDIA_TYPE, encode_points
 from sceneprint.geometry.cells import (
@@ -71,11 +67,8 @@ SIDES: tuple[Side, Side] = ("before", "after")
 
 
 def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -> str:
-    """Return the parent frame in which two sessions are compared.
-
-    Raises
-    ------
-    InvalidRequest : a session does not exist, has no poses, or they share no parent frame.
+    """Return the parent frame in which two sessions are compared; raise InvalidRequest if a session
+    has no poses, or they share no parent frame.
     """
     counts = {}
     for side in SIDES:

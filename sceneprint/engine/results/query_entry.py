@@ -171,12 +171,8 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
 
 
 def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) -> QueryRecord:
-    """Return a row as JSON.
-
-    Parameters
-    ----------
-    days : that queries are stored
-    may_read : whether the caller may read a map: the names of others are left out
+    """Return a row as JSON, with its expiry after `days`, and without names of maps that `may_read`
+    refuses.
     """
     frame = pose = None
     if row.frame_id is not None and row.frame_map is not None and may_read(row.frame_map):

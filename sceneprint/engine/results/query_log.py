@@ -29,12 +29,7 @@ from sceneprint.engine.results.query_entry import (
     query_record,
     unknown_query,
 )
-from sceneprint.errors import (
-    QuotaExceeded,
-    ReadOnlyStore,
-    SceneprintError,
-    UnusableStore,
-)
+from sceneprint.errors import QuotaExceeded, ReadOnlyStore, SceneprintError, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Store
 from sceneprint.store.answer_files import AnswerFiles
@@ -105,12 +100,7 @@ class _Waiting:
 
 
 class QueryLog:
-    """The queries of one store; safe to share between threads.
-
-    Parameters
-    ----------
-    settings : for how long queries are stored, and the room for answers
-    """
+    """The queries of one store; safe to share between threads."""
 
     def __init__(self, store: Store, files: AnswerFiles, settings: Settings) -> None:
         self._store, self._files = store, files
@@ -134,12 +124,8 @@ class QueryLog:
     def note(
         self, row: NewQuery, answer: StoredAnswer | None = None, shown: Sequence[int] = ()
     ) -> None:
-        """Have a query written in a moment; nobody waits, and nothing is raised.
-
-        Parameters
-        ----------
-        answer : to be stored with it, if there is room
-        shown : numbers of the frames that the answer shows
+        """Have a query written in a moment, with its answer if there is room, and the numbers of
+        the frames that the answer shows. Nobody waits, and nothing is raised.
         """
         if self._days == 0 or not (row.listed or (answer is not None and self._room > 0)):
             return
@@ -291,11 +277,8 @@ class QueryLog:
         return Page[QueryRecord](items=items, next_cursor=more)
 
     def find_row(self, query_id: str) -> QueryRow:
-        """Return the row of a query whose answer can be looked at.
-
-        Raises
-        ------
-        UnknownQuery : there is none, or it expired, or a map or the frame of it was deleted.
+        """Return the row of a query whose answer is stored. Raise UnknownQuery if there is none, it
+        has expired, or one of its maps or its frame was deleted.
         """
         row = self._current(query_id)
         if row is None:  # it may be on its way, from this process or from another one
@@ -346,12 +329,9 @@ class QueryLog:
     # kept
 
     def keep(self, query_id: str, title: str | None) -> QueryRecord:
-        """Keep an answer until it is released, or change the title of a kept one.
-
-        Raises
-        ------
-        UnknownQuery : as for `find_row`.
-        QuotaExceeded : as many answers are kept as may be.
+        """Keep an answer until it is released, or change the title of a kept one. Raise
+        UnknownQuery as `find_row` does, and QuotaExceeded if the map keeps as many answers as it
+        may.
         """
         row = self.find_row(query_id)
         data = self._data(row)

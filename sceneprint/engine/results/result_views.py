@@ -110,13 +110,9 @@ class Pairs:
         self._remembered = _ValidationCache()
 
     def find(self, query_id: str, frame_id: str, map_name: str | None = None) -> StoredPair:
-        """A query with one of its matches, while that is still the frame that was matched.
-
-        Raises
-        ------
-        UnknownQuery : its answer is not stored, or no longer.
-        UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
-        NotIndexed : the query was asked without validation, or the map has changed its model.
+        """Return a query with one of its matches. Raise UnknownQuery if the answer is not stored,
+        UnknownMap or UnknownFrame if it has no such match or the match was deleted, and NotIndexed
+        if the query ran without validation or the map has changed its model.
         """
         stored = self._log.find(query_id)
         match = _match_of(stored, frame_id, map_name)
@@ -139,12 +135,9 @@ class Pairs:
         )  # fmt: skip
 
     def opened(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
-        """The artifacts of the query and of the match.
-
-        Raises
-        ------
-        DamagedBlob : the match's is damaged, and so is its upload. Else it is made again.
-        UnknownFrame : the match was deleted meanwhile.
+        """Return the geometry of the query and of the match; a damaged one of the match is made
+        again. Raise DamagedBlob if the upload is damaged too, and UnknownFrame if the match was
+        deleted.
         """
         query = geometry_of_query(pair.stored)
         try:
@@ -256,11 +249,8 @@ class Inspection:
     def question(
         self, query_id: str, may_read: Callable[[str], bool] = lambda _: True
     ) -> StoredQuery:
-        """Return how a query was sent; UnknownQuery where its answer is not stored, or no longer.
-
-        Parameters
-        ----------
-        may_read : whether the caller may read a map: the names of others are left out
+        """Return how a query was sent, without names of maps that `may_read` refuses; raise
+        UnknownQuery if its answer is not stored.
         """
         stored, record = self._log.find(query_id), self._log.record(query_id, may_read)
         return StoredQuery(
@@ -271,13 +261,9 @@ class Inspection:
         )
 
     def preview(self, query_id: str, view: View = "depth", width: int = 320) -> bytes:
-        """Return a picture of what the query saw as PNG; see `sceneprint.pictures`.
-
-        Raises
-        ------
-        UnknownQuery : its answer is not stored, or no longer.
-        NotIndexed : it was sent without validation, for which alone its points are computed.
-        InvalidRequest : its patches, which are not stored.
+        """Return a picture of what the query saw as PNG; see `sceneprint.pictures`. Raise
+        UnknownQuery if its answer is not stored, NotIndexed if it was sent without validation, and
+        InvalidRequest for patches, which are not stored.
         """
         stored = self._log.find(query_id)
         if view == "patches":
@@ -290,12 +276,8 @@ class Inspection:
         return picture(colours, width, {"view": view, "model": stored.answer.model, **text})
 
     def cloud(self, query_id: str) -> bytes:
-        """The query's points and normals as PLY, in the coordinates of its sensor.
-
-        Raises
-        ------
-        UnknownQuery : its answer is not stored, or no longer.
-        NotIndexed : it was asked without validation, for which alone its points are made.
+        """Return the query's points and normals as PLY, in its sensor's frame. Raise UnknownQuery
+        if its answer is not stored, and NotIndexed if it was sent without validation.
         """
         stored = self._log.find(query_id)
         points, normals = points_of(geometry_of_query(stored).surface)
@@ -467,12 +449,8 @@ class PointClouds:
         return Output(tag, make)
 
     def query(self, query_id: str, limit: int = LIMIT) -> Output[bytes]:
-        """Points of a query in its sensor's frame, with normals and patches.
-
-        Raises
-        ------
-        UnknownQuery : its answer is not stored, or no longer.
-        NotIndexed : it was asked without validation.
+        """Return points of a query in its sensor's frame, with normals and patches. Raise
+        UnknownQuery if its answer is not stored, and NotIndexed if it was sent without validation.
         """
         stored = self._log.find(query_id)
         check_geometry(stored)

@@ -99,12 +99,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
 
 
 def check_model(one: str, other: str) -> None:
-    """See that signatures are of one model before they are compared.
-
-    Raises
-    ------
-    ModelMismatch : they are not.
-    """
+    """Raise ModelMismatch unless signatures that are to be compared are of one model."""
     if one != other:
         raise ModelMismatch(
             f"Signatures of two models cannot be compared: {one[:12]} and {other[:12]}. Send the "
@@ -225,14 +220,7 @@ def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
 
 
 class Queries:
-    """Asks one or more maps of one model.
-
-    Parameters
-    ----------
-    store, signers, readers : of the engine
-    query_log : where answers are stored
-    cores : that queries share
-    """
+    """Queries one or more maps of one model."""
 
     def __init__(self, context: Context) -> None:
         self._store, self._signers, self._readers = context.store, context.signers, context.readers
@@ -503,12 +491,7 @@ def check_localizes(query: Query) -> None:
 
 
 def localization_of(answer: Answer) -> Localization:
-    """Return the pose of the query with its confidence, as one record.
-
-    Parameters
-    ----------
-    answer : of a query to one map, validated
-    """
+    """Return the pose of a validated query to one map with its confidence, as one record."""
     accepted = [one for one in answer.matches if one.validation.status == "accepted"]
     status: LocalizationStatus = "not_found"
     if answer.status in ("found", "ambiguous"):

@@ -97,13 +97,7 @@ class Candidates:
 
 
 def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
-    """Return matches without those accepted beyond the first `k`.
-
-    Parameters
-    ----------
-    matches : in the order of `associate`, so that the first accepted ones are those to believe most
-    k : how many accepted ones to list
-    """
+    """Return matches in their order, without those accepted beyond the first `k`."""
     accepted = [one.index for one in matches if one.validation.status == "accepted"]
     return [one for one in matches if one.index not in accepted[k:]]
 
@@ -111,12 +105,8 @@ def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
 def match_records(
     candidates: Candidates, chosen: Sequence[int], matches: Sequence[PairMatch]
 ) -> list[MatchRecord]:
-    """Return the matches, the most trusted first, then the other candidates in the order of R.
-
-    Parameters
-    ----------
-    chosen : positions in R of the candidates
-    matches : of `associate`
+    """Return the matches, the most trusted first, then the other chosen candidates in the order of
+    R.
     """
     position = {int(candidates.ranking.indices[i]): i for i in chosen}
     tried = {match.index: match.validation for match in matches}
@@ -393,11 +383,8 @@ class ExplainedQuery:
 
 
 def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
-    """Explain at which stage a frame dropped out, and how it would align.
-
-    Raises
-    ------
-    UnknownFrame : no map that is asked has one of that id.
+    """Explain at which stage a frame dropped out, and how it would align; raise UnknownFrame if no
+    queried map has it.
     """
     part, row = _locate_frame(asking, frame_id)
     absent = _absent(asking, part, row)

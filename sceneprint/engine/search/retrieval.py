@@ -49,12 +49,7 @@ _TIDY_S = 10.0
 
 
 class Readers:
-    """The readers of all maps that were asked.
-
-    Parameters
-    ----------
-    place : where the indexes are
-    """
+    """The readers of all queried maps, whose indexes `place` has."""
 
     def __init__(self, signers: Signers, place: IndexPlace) -> None:
         self._signers, self._place = signers, place

@@ -114,12 +114,8 @@ class PlanAxes:
 
 
 def plan_axes(up: Floats) -> Floats:
-    """(2, 3) axes of a plan seen from above: the first along the parent's x axis, or its y axis
-    where that is nearly vertical.
-
-    Parameters
-    ----------
-    up : (3,) unit vector
+    """Return (2, 3) axes of a plan seen from above: the first along the parent's x axis, or its y
+    axis if x is nearly vertical.
     """
     along = np.eye(3)[int(abs(up[0]) > 0.9)]
     right = along - (along @ up) * up

@@ -22,10 +22,7 @@ from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
 from sceneprint.geometry.registration.icp import transform_covariance
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.validation.acceptance import Mode
-from sceneprint.geometry.validation.map_verification import (
-    MapParameters,
-    MapViews,
-)
+from sceneprint.geometry.validation.map_verification import MapParameters, MapViews
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import PoseEstimate, localize
 from sceneprint.models import Model

@@ -38,15 +38,10 @@ _LEFT_AT_ONCE = 1_000
 
 
 def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
-    """Remove blobs that nothing refers to any more.
-
-    They are found in writing transactions, so that no upload comes to refer to one in between, and
-    short ones. While a snapshot is being taken they stay, as it may refer to them, and while
-    another process removes some: `collect_doomed_blobs` removes them later.
-
-    Raises
-    ------
-    UnusableStore : they could not be removed; those that are left are doomed.
+    """Remove blobs that nothing refers to any more. Short write transactions find them, so that no
+    upload can refer to one meanwhile. During a snapshot, which may refer to them, and while another
+    process removes blobs, they stay, and `collect_doomed_blobs` removes them later. Raise
+    UnusableStore if some could not be removed; those are doomed.
     """
     store.geometries.forget(blobs)
     if not blobs:

@@ -60,11 +60,8 @@ REASON = "retention"
 
 
 class Retention:
-    """Deletes what is too old; any number of processes may.
-
-    Parameters
-    ----------
-    rows_days : for which rows of deleted and redundant frames stay
+    """Deletes frames that are too old, and rows of deleted and redundant frames after `rows_days`;
+    any number of processes may.
     """
 
     def __init__(self, store: Store, rows_days: float) -> None:
@@ -217,12 +214,9 @@ class Purging:
         return self._all(before, self._upkeep.is_rested, seconds=min(_SWEEP_S, self._every_s))
 
     def now(self) -> Purged:
-        """Remove all that is left at once; no deletion can be undone afterwards.
-
-        Raises
-        ------
-        BusyIndex : another process is building one that has to be made anew; the rest is removed.
-        StoreError, OSError : as it cannot be removed; the rest is.
+        """Remove at once everything that deletions have left; none can be undone afterwards. Raise
+        BusyIndex if another process is building an index that must be rebuilt, and StoreError or
+        OSError if something cannot be removed; the rest is.
         """
         failed: list[Exception] = []
         found = self._all(None, lambda _: True, failed)

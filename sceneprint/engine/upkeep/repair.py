@@ -42,12 +42,8 @@ _LOST = re.compile(r"its upload is (lost|damaged): .* upload it again to heal")
 
 
 def reason_of_loss(condition: Condition, *, found: bool) -> str:
-    """What `reason` of a frame says whose upload is gone.
-
-    Parameters
-    ----------
-    condition : of the upload, missing or damaged
-    found : whether the frame is indexed, and so still found
+    """Return the `reason` of a frame whose upload is missing or damaged, and which queries may
+    still find.
     """
     what = "lost" if condition == "missing" else "damaged"
     but = "it can be found, but not signed again" if found else "it cannot be signed"
