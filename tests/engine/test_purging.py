@@ -233,12 +233,12 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
     lived_in, make_engine, store_url, ids, tmp_path, monkeypatch
 ):
     first, names = lived_in, ids(lived_in)
-    monkeypatch.setattr(postgres, "IDLE_S", 0.1)  # shorter than it takes to make an index
+    monkeypatch.setattr(postgres, "IDLE_S", 1.0)  # shorter than it takes to make an index
     built = index_upkeep.publish
 
     def slow(*args, **more):
         found = built(*args, **more)
-        time.sleep(0.25)
+        time.sleep(1.25)
         return found
 
     monkeypatch.setattr(index_upkeep, "publish", slow)
