@@ -59,13 +59,13 @@ class Library:
         )
         selection = clock.run("diversify", lambda: diversify(ranking, self._signatures))
         geometry = read_geometry(write_geometry(seen))  # as both have it
-        matching = partial(associate, geometry, ranking, selection.indices.tolist(), self._geometry)
-        matches = clock.run("validate", lambda: matching(pose_of=self._pose))
+        validate = partial(associate, geometry, ranking, selection.indices.tolist(), self._geometry)
+        matches = clock.run("validate", lambda: validate(pose_of=self._pose))
         estimate = clock.run("locate", lambda: self._locate(geometry, matches))
         before = unguided_validations(matches)
         # as a service does
         if before is not None and estimate is not None and estimate.status != "found":
-            matches = matching(known=before)
+            matches = validate(known=before)
         return clock.stages, [
             (match.index, match.validation.T_match_query.tolist())
             for match in matches

@@ -214,9 +214,9 @@ class Server:
             self.execute(f"ALTER SYSTEM SET synchronous_standby_names = '{name}'")
             self.execute("SELECT pg_reload_conf()")
         wanted = (name, "streaming", "sync" if synchronous else "async")
-        asked = "SELECT application_name, state, sync_state FROM pg_stat_replication"
+        statement = "SELECT application_name, state, sync_state FROM pg_stat_replication"
         try:
-            until(lambda: wanted in self.execute(asked), PATIENCE_S, 0.05)
+            until(lambda: wanted in self.execute(statement), PATIENCE_S, 0.05)
         except AssertionError:
             follower.kill()
             raise NoServer(f"the standby in {folder} does not follow") from None

@@ -54,7 +54,7 @@ class OperationFigures:
 
 
 def call_operations(
-    caller: str, url: str, folder: Path, options: Sequence[str], known: Mapping[str, str]
+    caller: str, url: str, folder: Path, options: Sequence[str], path_values: Mapping[str, str]
 ) -> OperationFigures:
     """Call every operation of a service.
 
@@ -63,12 +63,15 @@ def call_operations(
     caller, url : see OperationFigures, and of the service
     folder : for the configuration
     options : more options of schemathesis
-    known : parameters of paths, such as path.map_name, of stored things, so that more than 404
-        comes back. Nothing is deleted then
+    path_values : parameters of paths by name, such as path.map_name, of objects that exist, so that
+        not every answer is 404. Nothing is deleted then
     """
     lines = [f"max-stream-events = {_EVENTS}", "request-timeout = 30.0"]
-    if known:
-        lines += ["[parameters]", *(f"{json.dumps(n)} = {json.dumps(v)}" for n, v in known.items())]
+    if path_values:
+        lines += [
+            "[parameters]",
+            *(f"{json.dumps(n)} = {json.dumps(v)}" for n, v in path_values.items()),
+        ]
     config = folder / "schemathesis.toml"
     config.write_text("\n".join(lines) + "\n")
     command = [
@@ -76,7 +79,7 @@ def call_operations(
         "run", f"{url}/openapi.json", "--checks", ",".join(CHECKS), "--seed", "1",
         "--generation-database", "none", "--suppress-health-check", "all", "--no-color",
         "--warnings", "off", "--workers", "1", "--continue-on-failure", "--no-shrink", *options,
-        *(("--exclude-method", "DELETE") if known else ()),
+        *(("--exclude-method", "DELETE") if path_values else ()),
     ]  # fmt: skip
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     return read_report(caller, done.stdout + done.stderr, done.returncode)

@@ -451,7 +451,7 @@ def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
 def array_sendable(
     array: NDArray[Any], meta: MetaInput | None, *, up: Sequence[float] | None = None
 ) -> tuple[bytes, FrameMeta]:
-    """Return an array as NPY, and what is known of it: with a camera it is depth, else points.
+    """Return an array as an NPY file, and its metadata: with a camera it is depth, else points.
 
     Parameters
     ----------
@@ -487,7 +487,7 @@ _DEPTH = ("u2", "f2", "f4", "f8")
 
 
 def _checked_points(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array of points; UnreadableFrame for what is depth without its camera."""
+    """Return an array of points; raise UnreadableFrame for depth without a camera."""
     if array.ndim == 2 and array.shape[1] in (3, 4) and array.dtype.kind == "f":
         if array.dtype.itemsize in (2, 4, 8):
             return array

@@ -108,7 +108,7 @@ class QueryMethods(ServiceConnection):
         if isinstance(wanted, NamedFrame):
             request = {"json": {**query_json(several), **given(robot=robot)}}
         else:
-            request = query_form(*_asked_by(robot, *wanted), several)
+            request = query_form(*_with_robot(robot, *wanted), several)
         return self._ask(Answer, "POST", "/v1/queries", **request)
 
     def localize(
@@ -363,11 +363,11 @@ def _query_request(frame: QueryFrame, query: Query, robot: str | None) -> dict[s
     if isinstance(frame, NamedFrame):
         named = {"frame_id": frame.frame_id, **given(robot=robot)}
         return {"json": {**named, **query_json(query)}}
-    return query_form(*_asked_by(robot, *frame), query)
+    return query_form(*_with_robot(robot, *frame), query)
 
 
-def _asked_by(robot: str | None, data: bytes, meta: FrameMeta) -> tuple[bytes, FrameMeta]:
-    """Return a frame that is asked for, with who asks where its metadata does not say."""
+def _with_robot(robot: str | None, data: bytes, meta: FrameMeta) -> tuple[bytes, FrameMeta]:
+    """Return a frame with the robot that sends the query, unless its metadata names one."""
     if robot is None or meta.robot is not None:
         return data, meta
     return data, meta.model_copy(update={"robot": robot})

@@ -550,7 +550,7 @@ class Spool:
             if "full" in str(error):
                 raise errors.StoreFull(
                     f"{self._path}: The disk has no room for the spool ({error}), and nothing was "
-                    "changed. Free some, or upload what waits: `sceneprint spool FILE --to MAP`."
+                    "changed. Free some, or upload the frames: `sceneprint spool FILE --to MAP`."
                 ) from error
             if "locked" in str(error):
                 raise errors.StoreLocked(
@@ -675,7 +675,7 @@ _OF_A_FRAME = (400, 409, 413, 415, 422)
 
 
 def _is_about_content(error: errors.SceneprintError) -> bool:
-    """Return whether a request was refused for what is in it."""
+    """Return whether the service refused the content of a request."""
     if isinstance(error, errors.Refused):  # a proxy before the service, or a problem we do not know
         return error.status in (409, 413, 415, 422)
     return isinstance(error, (errors.FrameError, errors.Conflict, errors.InvalidRequest))

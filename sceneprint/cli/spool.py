@@ -39,8 +39,8 @@ def add_spool(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("upload")
     group.add_argument(
         "--to", metavar="MAP",
-        help="upload what waits to this map, which must exist, oldest first; exit code 2 if "
-        "anything was refused or frames wait",
+        help="upload the waiting frames to this map, which must exist, oldest first; exit code 2 "
+        "if anything was refused or frames wait",
     )  # fmt: skip
     group.add_argument(
         "--retry-refused", action="store_true", help="upload again what was refused before"

@@ -215,7 +215,9 @@ class DecoderProcess:
         asleep_s = 0.0
         while not waiting.poll(1e3 * _LOOK_S):
             asleep_s = asleep_s + _LOOK_S if self._is_asleep() else 0.0
-            if max(self._cpu_s() - begun, asleep_s) > cpu_s or time.monotonic() > until:
+            if asleep_s > cpu_s:
+                raise DecoderFailure(f"its decoder has been idle for {cpu_s:g} s")
+            if self._cpu_s() - begun > cpu_s or time.monotonic() > until:
                 raise DecoderFailure(f"it takes longer than {cpu_s:g} s to decode")
         try:
             message = self._socket.recv(MESSAGE_BYTES)

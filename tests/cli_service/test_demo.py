@@ -72,10 +72,10 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(
     process = demo("--dataset", rooms)
     out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, err
-    service, uploaded, asked, queries, head, *lines = out.splitlines()
+    service, uploaded, sent, queries, head, *lines = out.splitlines()
     assert re.match(r"service: http://127\.0\.0\.1:\d+, empty data folder, 1 worker", service)
     assert uploaded.startswith("map: 4 of 4 frames uploaded, signed and indexed in ")
-    assert re.fullmatch(r"asked: 4 queries over HTTP in \d+\.\d s", asked)
+    assert re.fullmatch(r"sent: 4 queries over HTTP in \d+\.\d s", sent)
     assert queries.startswith("queries: 2: ")
     assert re.fullmatch(r"whole demo: \d+\.\d s", lines[-2])
     assert head.split()[:4] == ["first", "answer", "within", "5cm/5deg"]

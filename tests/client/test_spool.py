@@ -309,7 +309,7 @@ def test_a_full_file_system_is_told_and_emptied_by_sync(
     told, counted, emptied, explained = ran.stdout.splitlines()
     assert told == (
         f"{tmp_path}/spool: The disk has no room for the spool (database or disk is full), and "
-        "nothing was changed. Free some, or upload what waits: `sceneprint spool FILE --to MAP`."
+        "nothing was changed. Free some, or upload the frames: `sceneprint spool FILE --to MAP`."
     )
     taken = int(counted.split()[0])
     assert 0.4 * most <= taken <= most

@@ -111,9 +111,11 @@ def test_memory_is_limited(pool: DecoderPool) -> None:
     assert do(pool, "hoard", numbers=2) == {"sum": 2.0}
 
 
-@pytest.mark.parametrize("task", ["hang", "sleep"])
-def test_time_is_limited_of_work_and_of_sleep(pool: DecoderPool, task: str) -> None:
-    with pytest.raises(errors.DecoderFailure, match=r"longer than 0\.5 s"):
+@pytest.mark.parametrize(
+    ("task", "reason"), [("hang", r"longer than 0\.5 s"), ("sleep", r"idle for 0\.5 s")]
+)
+def test_time_is_limited_of_work_and_of_sleep(pool: DecoderPool, task: str, reason: str) -> None:
+    with pytest.raises(errors.DecoderFailure, match=reason):
         do(pool, task)
     assert do(pool, "hoard", numbers=3) == {"sum": 3.0}
 

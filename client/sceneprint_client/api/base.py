@@ -280,7 +280,7 @@ _OF_JOBS = {
 
 
 def checked(kind: type[Record], what: str, **fields: Any) -> Record:
-    """Return a record of the API, or what is wrong with its fields in our words.
+    """Return a record of the API; the error lists its invalid fields.
 
     Raises
     ------
@@ -591,7 +591,7 @@ NOVEL = 0.25
 
 
 def novelty_of(given: bool | float | str | None) -> float | None:
-    """Return the distance beyond which a frame is kept, as a share of that of unrelated frames.
+    """Return the minimum distance of a new place, as a share of that of unrelated frames.
 
     Parameters
     ----------

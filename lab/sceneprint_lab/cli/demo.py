@@ -292,7 +292,7 @@ def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
             tqdm.write(f"skipped: {one.reference.name}: {error}")
             continue
         answered.append(DemoQuery(one, ranked, diverse, time.perf_counter() - start))
-    print(f"asked: {2 * len(answered)} queries over HTTP in {time.perf_counter() - begun:.1f} s")
+    print(f"sent: {2 * len(answered)} queries over HTTP in {time.perf_counter() - begun:.1f} s")
     return answered
 
 
