@@ -235,13 +235,15 @@ def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
     third = append(built, 31)
     assert [len(each.segments) for each in (first, second, third)] == [1, 2, 1]
     files = [{name for name, _ in each.manifest.files} for each in (first, second, third)]
-    # all is an hour old but the newest, which has just come
-    listed = objects.list
+    # a builder that has lost its turn may still name a part that it has put
+    fresh = f"{64 * '0'}.keys"
+    objects.put(f"index/{folder_of(built).name}/{fresh}", b"new")
+    # all is an hour old but this and the newest, which have just come
+    listed, new = objects.list, (f"{third.number:010d}.json", fresh)
 
     def aged(prefix: str) -> list[Any]:
-        newest_name = f"{third.number:010d}.json"
         return [
-            one if one.key.endswith(newest_name) else replace(one, changed_at=one.changed_at - 3600)
+            one if one.key.endswith(new) else replace(one, changed_at=one.changed_at - 3600)
             for one in listed(prefix)
         ]
 
@@ -249,6 +251,7 @@ def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
     shared(built).prune(row)
     left = set(keys(objects))
     assert left >= files[1] | files[2] | {f"{n.number:010d}.json" for n in (second, third)}
+    assert fresh in left
     assert f"{first.number:010d}.json" not in left
     assert head is not None
     for name, size in head.files:  # who began before goes on
