@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.products import associations
 from sceneprint.engine.products.edge_consensus import finish_association
-from sceneprint.engine.products.join_upkeep import JoinUpkeep
+from sceneprint.engine.upkeep.housekeeping import Housekeeping
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.settings import Settings
@@ -130,7 +131,9 @@ def test_parent_frames_are_associated_unasked(
     def look(*, auto: bool = True) -> list[NewAssociation]:
         """What a process asks for that looks for the first time."""
         before = {one.job_id for one in engine.associations.list_all("hall").items}
-        JoinUpkeep(engine.store, engine.bell, auto=auto).run()
+        joins = {"joins": "auto" if auto else "asked"}
+        settings = engine.settings.model_copy(update=joins)
+        Housekeeping(replace(engine.context, settings=settings)).run()
         after = engine.associations.list_all("hall").items
         return [one.request for one in after if one.job_id not in before]
 

@@ -17,6 +17,7 @@ from sqlalchemy import func, select
 from sceneprint.engine.maps import map_surface, surface_job
 from sceneprint.engine.maps.map_surface import SurfaceUpkeep
 from sceneprint.engine.maps.surface_job import surface_points
+from sceneprint.engine.upkeep.housekeeping import Housekeeping
 from sceneprint.errors import DamagedBlob, InvalidRequest, NotFound
 from sceneprint.geometry.rigid import transform_points
 from sceneprint.settings import Settings
@@ -321,7 +322,7 @@ def test_workers_begin_by_themselves_once_frames_have_come(
     engine: Engine, work_off: WorkOff, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(map_surface, "LOOK_S", 0.0)
-    by_itself = SurfaceUpkeep(engine.store, engine.bell, auto=True)
+    by_itself = Housekeeping(engine.context)
     asked_only = SurfaceUpkeep(engine.store, engine.bell, auto=False)
 
     def begun() -> bool:
