@@ -271,19 +271,25 @@ def _known_parts(place: BundlePlace) -> dict[tuple[str, str], Part]:
 
 
 def in_order(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
-    """Yield what `work` returns for each item, in order; some items are worked at at once."""
-    with ThreadPoolExecutor(THREADS, thread_name_prefix="bundle") as pool:
-        waiting: deque[Future[B]] = deque()
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) >= 2 * THREADS:
-                    yield waiting.popleft().result()
-            while waiting:
+    """Yield what `work` returns for each item, in order; some items are worked at at once.
+
+    An iterator that is not exhausted ends without waiting for its threads: the garbage collector
+    may close it in a thread that is just starting, which could then never join another.
+    """
+    pool, wait = ThreadPoolExecutor(THREADS, thread_name_prefix="bundle"), True
+    waiting: deque[Future[B]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) >= 2 * THREADS:
                 yield waiting.popleft().result()
-        finally:
-            for one in waiting:
-                one.cancel()
+        while waiting:
+            yield waiting.popleft().result()
+    except GeneratorExit:
+        wait = False
+        raise
+    finally:
+        pool.shutdown(wait, cancel_futures=True)
 
 
 def referred(connection: Connection) -> Iterator[str]:

@@ -13,6 +13,7 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -25,9 +26,10 @@ import pytest
 from pydantic import SecretStr
 from sqlalchemy import insert
 
+from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle import backup
 from sceneprint.bundle import place as place_module
-from sceneprint.bundle.backup import listed_blobs, take_backup
+from sceneprint.bundle.backup import in_order, listed_blobs, take_backup
 from sceneprint.bundle.place import BundlePlace
 from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
 from sceneprint.bundle.rows import cut_rows
@@ -514,3 +516,19 @@ def test_it_is_one_state(postgres_url, tmp_path):
     assert found[-3:] == [
         ("map.created", None), ("frame.received", "a"), ("frame.received", "b"),
     ]  # fmt: skip
+
+
+def test_an_iterator_that_is_given_up_waits_for_no_thread() -> None:
+    go, finished = threading.Event(), list[int]()
+
+    def work(item: int) -> int:
+        if item:
+            go.wait(PATIENCE_S)
+            finished.append(item)
+        return item
+
+    found = in_order(work, range(100))
+    assert next(found) == 0
+    found.close()  # type: ignore[attr-defined]
+    assert finished == []
+    go.set()
