@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.index import Generation, Tail, publish, search
+from sceneprint.index import IndexVersion, Tail, publish, search
 from sceneprint.models import PRESETS, read_model
 from sceneprint.types import Bytes
 from sceneprint_lab.evaluation.pair_run import Clock
@@ -45,10 +45,10 @@ small = Tail(np.arange(2), queries[:2])
 search(queries[0], None, small, 2, metric="l2")
 import faiss
 before, begin = held(), time.perf_counter()
-generation = newest(folder, "bench", queries.shape[1])
+version = newest(folder, "bench", queries.shape[1])
 opened = time.perf_counter() - begin
 for query in queries:
-    search(query, generation, Tail.empty(queries.shape[1]), 200, metric="l2")
+    search(query, version, Tail.empty(queries.shape[1]), 200, metric="l2")
 print(1e3 * opened, *(held() - before))
 """
 
@@ -89,26 +89,26 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
             if len(keys):
                 yield keys, signatures(keys, length)
 
-    def published(folder: Path, previous: Generation | None, first: int, last: int) -> Generation:
-        generation = publish(
+    def published(folder: Path, previous: IndexVersion | None, first: int, last: int) -> IndexVersion:
+        version = publish(
             folder, model_id="bench", revision=last, blocks=blocks(first, last), previous=previous,
             flat_bytes=flat_bytes,
         )  # fmt: skip
-        if generation is None:
+        if version is None:
             raise RuntimeError(f"another process publishes in {folder}")
-        return generation
+        return version
 
     whole = Clock()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "index"
         folder.mkdir()
-        generation = whole.run("publish", lambda: published(folder, None, 0, frames))
+        version = whole.run("publish", lambda: published(folder, None, 0, frames))
         opened, held, shared = _probed(folder, queries)
         grown = frames + 1000
-        whole.run("append", lambda: published(folder, generation, frames, grown))
+        whole.run("append", lambda: published(folder, version, frames, grown))
         rows: dict[str, Callable[[Bytes], object]] = {
-            "search": lambda query: search(query, generation, tail, SIZE, metric="l2"),
-            "exact": lambda query: search(query, generation, tail, SIZE, metric="l2", exact=True),
+            "search": lambda query: search(query, version, tail, SIZE, metric="l2"),
+            "exact": lambda query: search(query, version, tail, SIZE, metric="l2", exact=True),
         }
         times: dict[str, list[float]] = {one: [] for one in rows}
         for run, query in enumerate(queries, -1):  # the first warms up
@@ -118,9 +118,9 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
                 if run >= 0:
                     times[one].append(clock.stages[one])
     searched, every = (np.array(times[one]) for one in rows)
-    recall, stages = generation.manifest.recall, whole.stages
+    recall, stages = version.manifest.recall, whole.stages
     return (
-        f"| {len(generation):,} | {length} | {'by sketches' if recall.probes else 'all'} "
+        f"| {len(version):,} | {length} | {'by sketches' if recall.probes else 'all'} "
         f"| {np.median(searched):.2f} | {np.median(every):.2f} "
         f"| {np.median(searched / every):.2f} | {recall.share:.4f} "
         f"| {stages['publish'] / 1e3:.1f} | {stages['append'] / 1e3:.1f} | {opened / 1e3:.2f} "

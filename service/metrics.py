@@ -173,8 +173,8 @@ class Metrics:
         self._oldest = self._gauge(
             "oldest_waiting_seconds", "Age of the oldest waiting job; 0: none waits."
         )
-        self._generation = self._gauge(
-            "index_generation", "Newest index; of the maps with the longest tails.", "map"
+        self._version = self._gauge(
+            "index_version", "Newest index; of the maps with the longest tails.", "map"
         )
         self._tail = self._gauge(
             "index_tail_frames", "Indexed frames that the newest index lacks; of these maps.", "map"
@@ -244,10 +244,10 @@ class Metrics:
         self._damaged.set(0 if stats.scrub is None else stats.scrub.damaged)
         self._maps.set(stats.maps)
         self._oldest.set(stats.oldest_waiting_s or 0.0)
-        for gauge in (self._generation, self._tail):
+        for gauge in (self._version, self._tail):
             gauge.clear()  # maps come and go
         for index in stats.indexes[:MOST_MAPS]:
-            self._generation.labels(index.map).set(index.generation or 0)
+            self._version.labels(index.map).set(index.version or 0)
             self._tail.labels(index.map).set(index.tail)
         busy = sum(worker.job_id is not None for worker in workers)
         self._workers.labels("busy").set(busy)

@@ -1,6 +1,6 @@
 """The index of one map: a cache on disk of the signatures that the database holds.
 
-    blocks of (keys, signatures)  --publish-->  Generation --\\
+    blocks of (keys, signatures)  --publish-->  IndexVersion --\\
     frames newer than that        ----------->  Tail       ---+--search-->  Hits
 
 A published index is numbered and never changes: the signatures of the map in a few segments, each
@@ -10,8 +10,8 @@ well, which select the frames that are compared. The database is the truth: dele
 loses nothing but the time to publish it again.
 """
 
-from sceneprint.index.generation import (
-    Generation,
+from sceneprint.index.index_version import (
+    IndexVersion,
     SearchHits,
     Tail,
     clear,
@@ -23,7 +23,7 @@ from sceneprint.index.generation import (
 from sceneprint.index.index_manifest import manifests, newest_number, scrub
 
 __all__ = [
-    "Generation",
+    "IndexVersion",
     "SearchHits",
     "Tail",
     "clear",

@@ -85,7 +85,7 @@ class SegmentFiles(StrictRecord):
         return next((one for one in self.files if one[0].endswith(f".{kind}")), None)
 
 
-class GenerationManifest(StrictRecord):
+class IndexManifest(StrictRecord):
     """One published state of a map's index.
 
     Parameters
@@ -164,14 +164,14 @@ def newest_number(folder: Path) -> int | None:
     return next((number for number, _ in manifests(folder)), None)
 
 
-def write_manifest(folder: Path, manifest: GenerationManifest) -> Path:
+def write_manifest(folder: Path, manifest: IndexManifest) -> Path:
     """Write a manifest durably, after everything that it names."""
     path = folder / manifest.name
     write_durable(path, seal(manifest))
     return path
 
 
-def read_manifest(path: Path) -> GenerationManifest:
+def read_manifest(path: Path) -> IndexManifest:
     """Read a manifest; DamagedIndex where it is missing, unreadable, changed, or another's."""
     try:
         data = path.read_bytes() if path.stat().st_size <= MAXIMUM_BYTES else b""
@@ -180,7 +180,7 @@ def read_manifest(path: Path) -> GenerationManifest:
     return decode_manifest(path.name, data, str(path))
 
 
-def decode_manifest(name: str, data: bytes, place: str) -> GenerationManifest:
+def decode_manifest(name: str, data: bytes, place: str) -> IndexManifest:
     """Return a manifest from its bytes.
 
     Parameters
@@ -193,7 +193,7 @@ def decode_manifest(name: str, data: bytes, place: str) -> GenerationManifest:
     DamagedIndex : they are none, changed, of another schema or number.
     """
     try:
-        found = GenerationManifest.model_validate_json(json.dumps(unseal(data)))
+        found = IndexManifest.model_validate_json(json.dumps(unseal(data)))
     except (ValueError, RecursionError) as error:
         said = str(error).partition("\n")[0]
         raise DamagedIndex(f"{place}: no manifest of an index, or damaged ({said}).") from error

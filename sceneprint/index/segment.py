@@ -1,7 +1,7 @@
-"""Segments: the immutable parts of a generation, searched one by one and merged as they grow many.
+"""Segments: the immutable parts of a version, searched one by one and merged as they grow many.
 
     frames that are new  --\\
-    segments of the generation before  --merge_plan-->  sources  --write_segment-->  segments
+    segments of the version before  --merge_plan-->  sources  --write_segment-->  segments
 
 A publication writes what is new as one segment, and merges into it what is not at least `RATIO`
 times as large as the next smaller: each time a frame is written again, its segment is larger by a
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 #: A segment has at least this many times the frames of the next smaller one. By 2 a map of 100,000
 #: frames has up to 7 segments, a search takes a fifth longer, and a fifth less is written.
 RATIO = 3
-#: Segments of a generation, at most: of more, the two smallest are merged.
+#: Segments of a version, at most: of more, the two smallest are merged.
 MOST_SEGMENTS = 8
 #: Share of a segment's frames that may be gone before it is written again without them.
 GONE_SHARE = 0.25

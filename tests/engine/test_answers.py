@@ -189,7 +189,7 @@ def test_the_same_question_has_the_same_answer(full: Engine, uploads: Any, ids: 
         first, second = ask(), ask()
         assert first.query_id != second.query_id
         assert same(first, second)
-        assert (first.seed, first.exact, first.index_generation) == (9, True, 0)
+        assert (first.seed, first.exact, first.index_version) == (9, True, 0)
         assert first.model == full.get_map("hall").model
 
 

@@ -170,9 +170,9 @@ def test_an_index_is_published_before_it_would_be_too_old(
     assert late.publish_due() == 1
     assert late.publish_due() == 0
     assert after(late, DAYS) == 1
-    generation = make_engine(data, tail_frames=5).view("hall")[2].generation
-    assert generation is not None
-    assert generation.revision == pruned(late)
+    version = make_engine(data, tail_frames=5).view("hall")[2].version
+    assert version is not None
+    assert version.revision == pruned(late)
     assert found(late, uploads) == sorted(set(names) - {names[4]})
 
 

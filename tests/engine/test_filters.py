@@ -157,7 +157,7 @@ def ask(engine: Engine, own: Known, wanted: Filter, *, exact: bool = False) -> A
 
 @pytest.mark.parametrize("published", [False, True])
 def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: bool) -> None:
-    """With a tail alone and with a generation; frames come and go; another map is beside it."""
+    """With a tail alone and with a version; frames come and go; another map is beside it."""
     engine = make_engine(tail_frames=50)
     for name in ("hall", "other"):
         engine.create_map(NewMap(name=name, model="depth"))
@@ -175,7 +175,7 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: 
         own = askers[int(rng.integers(len(askers)))]
         wanted = draw(rng, frames)
         answer = ask(engine, own, wanted, exact=i % 2 == 1)
-        assert answer.index_generation == int(published)
+        assert answer.index_version == int(published)
         sizes.append(hold(answer, frames, own, wanted))
     assert min(sizes) == 0
     assert sum(size > 20 for size in sizes) > 10

@@ -28,11 +28,11 @@ pytestmark = pytest.mark.usefixtures("_always_look")
 
 def ask(engine: Engine, uploads: Any) -> tuple[list[tuple[str, int]], int]:
     answer = engine.queries.upload(["hall"], uploads[2].data, uploads[2].meta, ALL)
-    return [(match.frame_id, match.distance) for match in answer.matches], answer.index_generation
+    return [(match.frame_id, match.distance) for match in answer.matches], answer.index_version
 
 
 def until_healed(engine: Engine) -> int:
-    """Generations that upkeep publishes until a round of verifying is over."""
+    """Versions that upkeep publishes until a round of verifying is over."""
     published = 0
     for _ in range(20):
         published += engine.publish_due()
@@ -87,8 +87,8 @@ def test_rebuilding_makes_the_same_index_from_nothing(
     wanted, _ = ask(engine, uploads)
     assert engine.publish_due() == 1
     names = {path.name for path in data.glob("index/hall-*/*.faiss")}
-    generation = engine.rebuild_index("hall")
-    assert generation == 2
+    version = engine.rebuild_index("hall")
+    assert version == 2
     assert {path.name for path in data.glob("index/hall-*/*.faiss")} == names
     assert ask(engine, uploads) == (wanted, 2)
 

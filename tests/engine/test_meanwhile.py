@@ -131,14 +131,14 @@ def test_queries_beside_deletions_and_publishing_see_one_state(
     assert raised == []
     for seen in sizes:
         assert seen == sorted(seen, reverse=True)
-    assert engine.query_frame("hall", names[0], R).index_generation == 1
+    assert engine.query_frame("hall", names[0], R).index_version == 1
 
 
 def test_what_is_deleted_while_an_index_is_published_stays_deleted(
     full: Engine, make_engine: Callable[..., Engine], uploads: Any, ids: Ids, work_off: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """The generation holds it, and readers have heard of its end but never of its beginning."""
+    """The version holds it, and readers have heard of its end but never of its beginning."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     reader, builder = make_engine(tail_frames=5), make_engine(tail_frames=5)
     names, publish = ids(full), index_upkeep.publish
@@ -160,6 +160,6 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
     full.delete_frame("hall", names[11])
     for engine in (reader, make_engine(tail_frames=5)):
         answer = engine.query_frame("hall", names[0], R)
-        assert answer.index_generation == 1
+        assert answer.index_version == 1
         assert answer.counts.map == answer.counts.ranked == len(answer.matches) == 10
         assert {m.frame_id for m in answer.matches} == set(names[1:11])

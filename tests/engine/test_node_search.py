@@ -107,7 +107,7 @@ def test_signatures_are_read_once_and_compared_exactly_until_there_is_an_index(
         again = ask(service, "hall-77", ["hall", "yard"])
         assert sum(read) == sum(SIZES.values())
     assert found(first) == found(again) == wanted
-    assert (first.exact, first.index_generation) == (True, 0)
+    assert (first.exact, first.index_version) == (True, 0)
     assert first.counts.compared == sum(SIZES.values()) - 1
     assert worker.publish_due() == 2
     indexed = ask(worker, "hall-77", ["hall", "yard"])
@@ -130,7 +130,7 @@ def test_a_node_that_is_far_behind_begins_with_the_newest_index(
     with rows_read(service) as read:
         answer = ask(service, "hall-7", ["hall"])
     assert sum(read) == 0
-    assert (answer.index_generation, answer.exact) == (1, True)
+    assert (answer.index_version, answer.exact) == (1, True)
     assert found(answer) == nearest({"hall": made}, "hall-7")
 
 
@@ -143,4 +143,4 @@ def test_maps_of_psi_are_compared_whole_by_l1_without_an_index(
     assert engine.publish_due() == 0
     answer = ask(engine, "old-8", ["old"])
     assert found(answer) == nearest({"old": made}, "old-8", "l1")
-    assert (answer.exact, answer.index_generation, answer.counts.compared) == (True, 0, 99)
+    assert (answer.exact, answer.index_version, answer.counts.compared) == (True, 0, 99)

@@ -129,11 +129,11 @@ def test_indexes_and_sizes_are_told(data, make_engine):
     engine = make_engine(data)
     indexed = engine.get_map("hall").frames["indexed"]
     (index,) = engine.statistics.tell(1).indexes
-    assert (index.map, index.generation, index.tail) == ("hall", None, indexed)
+    assert (index.map, index.version, index.tail) == ("hall", None, indexed)
     assert index.recall is None
     engine.rebuild_index("hall")
     (index,) = engine.statistics.tell(1).indexes
-    assert (index.generation, index.tail) == (1, 0)
+    assert (index.version, index.tail) == (1, 0)
     assert index.recall == IndexRecall(  # compared whole
         share=1, near=10, sample=0, probes=0, frames=indexed
     )
@@ -272,7 +272,7 @@ def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
     other = make_engine(data)
     answer = other.query_frame("hall", other.list_frames("hall").items[0].frame_id,
                                Query(stages=("retrieve",)))  # fmt: skip
-    assert answer.index_generation == 1
+    assert answer.index_version == 1
 
 
 def test_a_map_that_another_process_deleted_is_let_go(data, make_engine, monkeypatch):

@@ -101,9 +101,9 @@ def secret(lived_in, ids, uploads):
         blobs = geometry_blobs(connection, numbers, row.model_id)
     artifacts = [engine.store.blobs.get(blobs[n]) for n in numbers]
     folder = index_folder(engine.settings.indexes, row)
-    generation = newest(folder, row.model_id, len(vectors[0]))
-    assert generation is not None
-    assert len(generation) == len(numbers)
+    version = newest(folder, row.model_id, len(vectors[0]))
+    assert version is not None
+    assert len(version) == len(numbers)
     return {
         "upload": pieces(uploads[0].data, [one.data for one in uploads[1:]]),
         "signature": pieces(vectors[0], vectors[1:]),

@@ -74,7 +74,7 @@ def stored(size: int = 1000, query: Query | None = None) -> StoredAnswer:
     """An answer that takes a little more than `size` bytes."""
     answer = Answer(
         query_id=uuid.uuid4().hex, status="not_found", matches=[], location=None, seed=3,
-        model="m", index_generation=0, exact=True, counts=COUNTS,
+        model="m", index_version=0, exact=True, counts=COUNTS,
         milliseconds={"total": 0.1 + 0.2}, maps=["hall"],
     )  # fmt: skip
     vector = np.arange(64, dtype=np.uint8)

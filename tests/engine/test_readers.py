@@ -53,7 +53,7 @@ def truth(make: Make, uploads: Any, folder: Path, tmp_path: Path) -> list[tuple[
     """What an engine says that has no index and has held nothing before."""
     fresh = make(folder, index_dir=tmp_path / "none", tail_frames=100_000)
     answer = ask(fresh, uploads)
-    assert answer.index_generation == 0
+    assert answer.index_version == 0
     return found(answer)
 
 
@@ -70,8 +70,8 @@ def test_publishing_changes_no_answer(
     for engine in (reader, fresh):
         for query, old in zip((ALL, Query()), before, strict=True):
             new = ask(engine, uploads, query=query)
-            assert new.index_generation == 1  # the reader has looked
-            free = {"query_id": "", "milliseconds": {}, "index_generation": 0}
+            assert new.index_version == 1  # the reader has looked
+            free = {"query_id": "", "milliseconds": {}, "index_version": 0}
             assert new.model_copy(update=free) == old.model_copy(update=free)
     gone = ids(reader)[3]
     builder.delete_frame("hall", gone)
@@ -92,10 +92,10 @@ def test_an_index_is_due_beyond_so_many_frames(
     assert make_engine(data, tail_frames=tail_frames).publish_due() == published
 
 
-@pytest.mark.parametrize(("pause_s", "generation"), [(1e9, 0), (0.0, 1)])
+@pytest.mark.parametrize(("pause_s", "version"), [(1e9, 0), (0.0, 1)])
 def test_a_newer_index_is_looked_for_from_time_to_time(
     data: Path, make_engine: Make, uploads: Any, monkeypatch: pytest.MonkeyPatch, pause_s: float,
-    generation: int,
+    version: int,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(local_index, "_LOOK_S", pause_s)
     reader = make_engine(data)
@@ -103,10 +103,10 @@ def test_a_newer_index_is_looked_for_from_time_to_time(
     assert make_engine(data, tail_frames=1).publish_due() == 1
     answer = ask(reader, uploads)
     assert len(found(answer)) == 12
-    assert answer.index_generation == generation
+    assert answer.index_version == version
 
 
-def test_readers_follow_a_map_through_generations(
+def test_readers_follow_a_map_through_versions(
     data: Path, make_engine: Make, uploads: Any, more: Any, ids: Ids, tmp_path: Path
 ) -> None:
     first, builder = make_engine(data, tail_frames=3), make_engine(data, tail_frames=3)
@@ -127,12 +127,12 @@ def test_readers_follow_a_map_through_generations(
     assert builder.publish_due() == 0
     new += more(builder, 1)
     assert builder.publish_due() == 1
-    more(builder, 1)  # newer than the generation: it stays in the tail
-    builder.delete_frame("hall", new[0])  # in the generation
+    more(builder, 1)  # newer than the version: it stays in the tail
+    builder.delete_frame("hall", new[0])  # in the version
     wanted = truth(make_engine, uploads, data, tmp_path)
     for engine in (first, late, make_engine(data, tail_frames=3)):
         answer = ask(engine, uploads)
-        assert (found(answer), answer.index_generation) == (wanted, 3)
+        assert (found(answer), answer.index_version) == (wanted, 3)
     more(builder, 3)
     wanted = truth(make_engine, uploads, data, tmp_path)
     for engine in (first, late):
@@ -154,7 +154,7 @@ def test_a_map_made_anew_has_none_of_the_old_frames(
     for engine in (reader, other, make_engine(data, tail_frames=5)):
         answer = ask(engine, uploads, 7)
         assert found(answer) == [(added.frame_id, 0)]
-        assert answer.index_generation == 0
+        assert answer.index_version == 0
 
 
 def test_a_crowd_at_a_cold_engine_is_served(data: Path, make_engine: Make, ids: Ids) -> None:

@@ -67,7 +67,7 @@ def ids(engine: Engine, state: FrameState | None = None) -> list[str]:
 def said(engine: Engine, answer: Answer) -> dict[str, Any]:
     """All of an answer but what no two have in common, frames by their places in the map."""
     places = {name: str(i) for i, name in enumerate(ids(engine))}
-    told = answer.model_dump_json(exclude={"query_id", "milliseconds", "index_generation"})
+    told = answer.model_dump_json(exclude={"query_id", "milliseconds", "index_version"})
     for name, place in places.items():
         told = told.replace(name, place)
     found: dict[str, Any] = json.loads(told)
@@ -120,7 +120,7 @@ def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
         engine.rebuild_index("hall")
     before, found = answered()
     assert found == ranked("l1")
-    assert (before.exact, before.index_generation) == (True, 0)
+    assert (before.exact, before.index_version) == (True, 0)
     engine.reencode("hall", "depth")
     during, again = answered()
     assert (during.model, again) == (before.model, found)
@@ -130,7 +130,7 @@ def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
     assert after.model.startswith("depth-")
     assert moved == ranked("l2")
     assert moved[0][1] == 0  # the frame itself
-    assert engine.view("hall")[2].generation is not None
+    assert engine.view("hall")[2].version is not None
     assert engine.publish_due() == 0
 
 

@@ -240,15 +240,15 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     assert set(work_off(engine)) == {JobState.SUCCEEDED}
     for asked in (engine, full):
         answer = asked.query_frame("hall", names[1], R)
-        assert (answer.index_generation, answer.model[:6]) == (1, "depth-")
+        assert (answer.index_version, answer.model[:6]) == (1, "depth-")
     engine.publish_due()
     answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
-    assert (answer.index_generation, answer.counts.map) == (1, 12)
+    assert (answer.index_version, answer.counts.map) == (1, 12)
     assert found(answer) == right(names, by_model, answer.model, 4)
     assert not before.exists()
     after = index_folder(engine.settings.indexes, engine.row("hall"))
     assert [one for one in engine.settings.indexes.iterdir() if one.is_dir()] == [after]
-    # the next generation is due again after as many frames, and not before
+    # the next version is due again after as many frames, and not before
     assert engine.publish_due() == 0
 
 
@@ -261,7 +261,7 @@ def test_an_index_that_cannot_be_written_does_not_hold_the_switch_up(
     engine = make_engine(full.settings.data_dir, tail_frames=5, index_dir=nowhere)
     switch(engine, small_file, work_off)
     answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
-    assert (answer.index_generation, answer.counts.map) == (0, 12)
+    assert (answer.index_version, answer.counts.map) == (0, 12)
 
 
 def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
@@ -295,7 +295,7 @@ def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
     engine.publish_due()
     assert engine.get_map("hall").frames == {"indexed": 12}
     answer = engine.queries.upload(["hall"], uploads[at].data, uploads[at].meta, R)
-    assert answer.index_generation == 1
+    assert answer.index_version == 1
     assert found(answer) == right(names, by_model, answer.model, at)
 
 

@@ -174,7 +174,7 @@ def test_who_passes_a_damaged_signature_over_has_it_made_again(
     assert [job.frame_number for job in waiting(full)] == [number_of(full, other)]
     assert work_off(full) == [JobState.SUCCEEDED]
     answer = make_engine().queries.upload(["hall"], uploads[4].data, uploads[4].meta, ask)
-    assert (answer.index_generation, answer.matches[0].frame_id) == (1, other)
+    assert (answer.index_version, answer.matches[0].frame_id) == (1, other)
     assert len(answer.matches) == answer.counts.map == 12
 
 

@@ -23,7 +23,7 @@ from sceneprint.engine.search.index_place import IN_USE_S, IndexPlace
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
-from sceneprint.index import Generation, clear, manifests, newest, publish
+from sceneprint.index import IndexVersion, clear, manifests, newest, publish
 from sceneprint.settings import Settings
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.events import anchor_of_now
@@ -132,7 +132,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(
     first = ask(other, uploads)  # it waits for nothing
     shared(other).finish()
     second = ask(other, uploads)
-    assert second.index_generation == 1
+    assert second.index_version == 1
     assert found(second) == found(first) == found(ask(built, uploads))
     fetched = {path.name: path.read_bytes() for path in folder_of(other).glob("[0-9a-f]*")}
     assert fetched == own
@@ -140,7 +140,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(
     assert (other.publish_due(), built.publish_due()) == (1, 0)
     ask(built, uploads)
     shared(built).finish()
-    assert ask(built, uploads).index_generation == 2
+    assert ask(built, uploads).index_version == 2
     assert found(ask(built, uploads)) == found(ask(other, uploads))
     assert ask(built, uploads).counts.map == 8
 
@@ -160,10 +160,10 @@ def test_a_host_goes_on_from_what_another_built(
 
 
 @pytest.fixture
-def append(place: str) -> Callable[..., Generation]:
-    """Publish and share signatures that no frame has, as the next generation of map "hall"."""
+def append(place: str) -> Callable[..., IndexVersion]:
+    """Publish and share signatures that no frame has, as the next version of map "hall"."""
 
-    def run(engine: Engine, n: int, drop: frozenset[int] = frozenset(), **more: Any) -> Generation:
+    def run(engine: Engine, n: int, drop: frozenset[int] = frozenset(), **more: Any) -> IndexVersion:
         row, folder = row_of(engine), folder_of(engine)
         previous = newest(folder, row.model_id, 448)
         first = 0 if previous is None else int(previous.keys[-1]) + 1
@@ -219,11 +219,11 @@ def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
     }  # fmt: skip
 
 
-def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
+def test_files_of_a_version_stay_while_somebody_may_fetch_it(
     built: Engine, append: Any, place: str, host: Callable[..., Engine],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Also old ones, that the next generation has merged."""
+    """Also old ones, that the next version has merged."""
     built.create_map(NewMap(name="other", model="depth"))
     row, objects, other = row_of(built), open_objects(place), host("two")
     shared(built).withdraw(row)
@@ -263,7 +263,7 @@ def test_files_of_a_generation_stay_while_somebody_may_fetch_it(
 def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
     host: Callable[..., Engine], append: Any
 ) -> None:
-    """The generation is another each time, and the segment the same."""
+    """The version is another each time, and the segment the same."""
     one, service = host("one"), host("two", purge_s=1)
     one.create_map(NewMap(name="hall", model="depth"))
     append(one, 100)
@@ -354,7 +354,7 @@ def test_a_restored_database_is_not_given_what_came_after(
     assert (answer.matches[0].frame_id, answer.counts.map) == (names[0], 5)
     assert engine.publish_due() == 1
     answer = ask(engine, uploads, 5)
-    assert (answer.index_generation, answer.matches[0].frame_id) == (2, names[0])
+    assert (answer.index_version, answer.matches[0].frame_id) == (2, names[0])
     assert answer.counts.map == 5
 
 
@@ -397,7 +397,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
     assert held() == set()
     assert keys(objects)[:2] == [".swept", "0000000002.json"]
     assert [ask(engine, uploads).counts.map for engine in (built, other, service)] == [3, 3, 3]
-    assert ask(other, uploads).index_generation == 2
+    assert ask(other, uploads).index_version == 2
 
 
 def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(
@@ -465,7 +465,7 @@ def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(
     assert host("three").publish_due() == 1
     shared(other).sync(row_of(other))
     assert numbers(other) == [2]
-    assert ask(other, uploads).index_generation == 2
+    assert ask(other, uploads).index_version == 2
 
 
 def test_a_file_that_is_damaged_here_is_fetched_again(
@@ -496,7 +496,7 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
         assert engine.publish_due() == 0
         answer = ask(engine, uploads)
         shared(engine).finish()
-        assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
+        assert (answer.matches[0].frame_id, answer.index_version) == (names[1], 0)
         assert numbers(engine) == []
     said = {record.message for record in caplog.records}
     assert said >= {"index publication failed", "index not fetched"}

@@ -14,7 +14,7 @@ from sqlalchemy import update
 from sceneprint.engine import signers
 from sceneprint.engine.search import retrieval
 from sceneprint.errors import InvalidRequest, UnreadableModel
-from sceneprint.index import generation, index_manifest, manifests
+from sceneprint.index import index_manifest, index_version, manifests
 from sceneprint.index.index_manifest import read_manifest
 from sceneprint.index.part_files import verify
 from sceneprint.store.tables import models
@@ -51,14 +51,14 @@ def test_an_index_of_a_history_that_was_undone_is_not_believed(
     names = fill(engine, uploads, work_off, range(5, 8))
     for name, i in zip(names, range(5, 8), strict=True):
         answer = engine.queries.upload(["hall"], uploads[i].data, uploads[i].meta, ALL)
-        assert (answer.index_generation, answer.counts.map) == (0, 5)
+        assert (answer.index_version, answer.counts.map) == (0, 5)
         assert (answer.matches[0].frame_id, answer.matches[0].distance) == (name, 0)
     assert engine.publish_due() == 1  # anew, from nothing
     for fresh in (engine, make_engine(data, tail_frames=2)):
         answer = fresh.queries.upload(["hall"], uploads[5].data, uploads[5].meta, ALL)
         assert (answer.matches[0].frame_id, answer.matches[0].distance) == (names[0], 0)
         assert answer.counts.map == 5
-    assert answer.index_generation == 2
+    assert answer.index_version == 2
 
 
 def test_an_index_that_cannot_be_written_costs_no_frame(
@@ -73,7 +73,7 @@ def test_an_index_that_cannot_be_written_costs_no_frame(
         "index publication failed"
     ]
     answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, ALL)
-    assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
+    assert (answer.matches[0].frame_id, answer.index_version) == (names[1], 0)
 
 
 def test_indexes_of_deleted_maps_are_removed_and_nothing_else(
@@ -149,7 +149,7 @@ def test_an_index_is_published_by_what_it_lacks_however_large(
         due.append((engine.publish_due(), other.publish_due()))
     assert due == [(0, 0), (1, 0), (0, 0), (1, 0)]
     answer = engine.queries.upload(["hall"], uploads[11].data, uploads[11].meta, ALL)
-    assert (answer.counts.map, answer.index_generation) == (8, 3)
+    assert (answer.counts.map, answer.index_version) == (8, 3)
 
 
 def test_a_worker_reads_a_file_of_an_index_once(
@@ -166,7 +166,7 @@ def test_a_worker_reads_a_file_of_an_index_once(
     fill(engine, uploads, work_off, range(6))
     assert engine.publish_due() == 1
     assert engine.publish_due() == 0  # and all has been scrubbed
-    monkeypatch.setattr(generation, "verify", noted)
+    monkeypatch.setattr(index_version, "verify", noted)
     monkeypatch.setattr(index_manifest, "verify", noted)
     fill(engine, uploads, work_off, range(6, 8))
     assert engine.publish_due() == 1
@@ -187,8 +187,8 @@ def test_purging_removes_what_a_publication_had_only_marked(
     names = fill(engine, uploads, work_off, range(12))
     assert engine.publish_due() == 1
     (folder,) = engine.settings.indexes.glob("hall*")
-    generation = engine.view("hall")[2].generation
-    row = generation.vectors_of(generation.keys[2:3]).tobytes()
+    version = engine.view("hall")[2].version
+    row = version.vectors_of(version.keys[2:3]).tobytes()
     for name in (names[2], names[3]):
         engine.delete_frame("hall", name)
     assert engine.publish_due() == 1
@@ -201,7 +201,7 @@ def test_purging_removes_what_a_publication_had_only_marked(
     assert engine.purging.now().indexes == 0
     fresh = make_engine(tail_frames=1)
     answer = fresh.queries.upload(["hall"], uploads[5].data, uploads[5].meta, ALL)
-    assert (answer.counts.map, answer.index_generation) == (10, 3)
+    assert (answer.counts.map, answer.index_version) == (10, 3)
 
 
 def test_purging_writes_an_index_again_whose_keys_are_damaged(
@@ -214,7 +214,7 @@ def test_purging_writes_an_index_again_whose_keys_are_damaged(
     assert engine.publish_due() == 1
     (folder,) = engine.settings.indexes.glob("hall*")
     (path,) = folder.glob("*.keys")
-    row = engine.view("hall")[2].generation.vectors_of(np.array([2])).tobytes()
+    row = engine.view("hall")[2].version.vectors_of(np.array([2])).tobytes()
     engine.delete_frame("hall", names[1])
     keys = np.frombuffer(path.read_bytes(), "<i8").copy()
     keys[1] = 0  # that of the deleted frame
@@ -236,7 +236,7 @@ def test_maps_of_whole_fisher_vectors_have_no_index(
     with pytest.raises(InvalidRequest, match="has no index to rebuild"):
         engine.rebuild_index("hall")
     answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, ALL)
-    assert (answer.matches[0].frame_id, answer.index_generation) == (names[1], 0)
+    assert (answer.matches[0].frame_id, answer.index_version) == (names[1], 0)
 
 
 def test_a_model_of_another_version_keeps_its_index(

@@ -41,7 +41,7 @@ def answer(matches: list[dict[str, Any]], pose: Transform | None = None) -> Answ
     location = pose and {"pose": pose, "support": 1, "votes": 1, "spread_m": 0, "spread_deg": 0}
     return Answer.model_validate(
         {"query_id": "q", "status": "found", "matches": matches, "location": location, "seed": 0,
-         "model": "m", "index_generation": 0, "exact": True, "counts": counts, "milliseconds": {}}
+         "model": "m", "index_version": 0, "exact": True, "counts": counts, "milliseconds": {}}
     )  # fmt: skip
 
 

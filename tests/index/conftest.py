@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.index import Generation, publish
+from sceneprint.index import IndexVersion, publish
 from sceneprint.index.part_files import Keys
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
-Publish = Callable[..., Generation]
+Publish = Callable[..., IndexVersion]
 
 
 @pytest.fixture(scope="session")
@@ -44,18 +44,18 @@ def walk() -> Walk:
 
 @pytest.fixture
 def published(tmp_path: Path) -> Publish:
-    """Publish keys and signatures as the next generation of one folder."""
+    """Publish keys and signatures as the next version of one folder."""
 
     def run(
         keys: Keys,
         signatures: Bytes,
-        previous: Generation | None = None,
+        previous: IndexVersion | None = None,
         folder: Path = tmp_path / "map",
         revision: int = 0,
         drop: frozenset[int] = frozenset(),
         **more: Any,
-    ) -> Generation:
-        generation = publish(
+    ) -> IndexVersion:
+        version = publish(
             folder,
             model_id="model",
             revision=revision,
@@ -64,8 +64,8 @@ def published(tmp_path: Path) -> Publish:
             drop=drop,
             **more,
         )
-        assert generation is not None
-        return generation
+        assert version is not None
+        return version
 
     return run
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.index import Generation, Tail, newest, newest_number, publish, search, signatures_of
+from sceneprint.index import IndexVersion, Tail, newest, newest_number, publish, search, signatures_of
 from sceneprint.types import Bytes
 
 LENGTH, STEP = 512, 25
@@ -61,13 +61,13 @@ def signatures_at(keys: np.ndarray) -> Bytes:
     return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
 
 
-def is_whole(generation: Generation) -> bool:
-    """Whether a generation holds the first `revision` frames, and nothing else."""
-    n = generation.revision
-    np.testing.assert_array_equal(generation.keys, np.arange(n))
-    assert len(generation) == n
+def is_whole(version: IndexVersion) -> bool:
+    """Whether a version holds the first `revision` frames, and nothing else."""
+    n = version.revision
+    np.testing.assert_array_equal(version.keys, np.arange(n))
+    assert len(version) == n
     keys = np.arange(0, n, 7)
-    stored = signatures_of(keys, generation, Tail.empty(LENGTH))
+    stored = signatures_of(keys, version, Tail.empty(LENGTH))
     np.testing.assert_array_equal(stored, signatures_at(keys))
     return True
 
@@ -111,10 +111,10 @@ def test_a_builder_killed_at_any_moment(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*.part"))
 
 
-def test_readers_go_on_while_generations_pass(
-    walk: Callable[..., Bytes], published: Callable[..., Generation], tmp_path: Path
+def test_readers_go_on_while_versions_pass(
+    walk: Callable[..., Bytes], published: Callable[..., IndexVersion], tmp_path: Path
 ) -> None:
-    """Threads search an old generation while its files are removed, others follow the newest."""
+    """Threads search an old version while its files are removed, others follow the newest."""
     folder, signatures = tmp_path / "map", walk(1200, LENGTH)
     first = published(np.arange(300), signatures[:300], revision=300)
     old = {path.name for path in folder.iterdir()}
@@ -128,11 +128,11 @@ def test_readers_go_on_while_generations_pass(
             for query, right in zip(queries, expected, strict=True):
                 hits = search(query, first, tail, 20, metric="l2")
                 if (hits.keys != right.keys).any() or (hits.distances != right.distances).any():
-                    errors.append("an old generation has changed")
+                    errors.append("an old version has changed")
             counts[0] += 1
 
     def follow() -> None:
-        known: Generation | None = None
+        known: IndexVersion | None = None
         while not done.is_set():
             found = newest(folder, "model", LENGTH, known=known)
             if found is None or (known is not None and found.number < known.number):
@@ -142,7 +142,7 @@ def test_readers_go_on_while_generations_pass(
             n = known.revision
             hits = search(signatures[n - 1], known, tail, 1, metric="l2")
             if len(known) != n or hits.keys.tolist() != [n - 1]:
-                errors.append(f"generation {known.number} has {len(known)} of {n}")
+                errors.append(f"version {known.number} has {len(known)} of {n}")
             counts[1] += 1
 
     def guarded(work: Callable[[], None]) -> Callable[[], None]:
@@ -157,10 +157,10 @@ def test_readers_go_on_while_generations_pass(
     threads = [threading.Thread(target=guarded(w)) for w in (search_old, search_old, follow)]
     for thread in threads:
         thread.start()
-    generation = first
+    version = first
     for n in range(300, 1200, 30):
         new = np.arange(n, n + 30)
-        generation = published(new, signatures[new], generation, revision=n + 30)
+        version = published(new, signatures[new], version, revision=n + 30)
     deadline = time.monotonic() + PATIENCE_S
     while min(counts) < 3 and not errors and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -169,6 +169,6 @@ def test_readers_go_on_while_generations_pass(
         thread.join(PATIENCE_S)
     assert errors == []
     assert min(counts) >= 3
-    assert generation.number == 31
+    assert version.number == 31
     left = {path.name for path in folder.iterdir()}
     assert old & left == {".lock"}  # the first segment has been merged

@@ -1,4 +1,4 @@
-"""Damage: no changed or shortened file is ever used; the generation before is, or none."""
+"""Damage: no changed or shortened file is ever used; the version before is, or none."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import Generation, newest, part_files, scrub
+from sceneprint.index import IndexVersion, newest, part_files, scrub
 from sceneprint.index.faiss_index import map_index
-from sceneprint.index.index_manifest import GenerationManifest, manifests, read_manifest
+from sceneprint.index.index_manifest import IndexManifest, manifests, read_manifest
 from sceneprint.index.sketches import map_sketches
 from sceneprint.sealed_record import _checksum as checksum
 from sceneprint.sealed_record import unseal
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
-Publish = Callable[..., Generation]
+Publish = Callable[..., IndexVersion]
 LENGTH = 32
 
 
@@ -31,7 +31,7 @@ RECALL = {"share": 1.0, "near": 10, "sample": 0, "probes": 0, "frames": 0}
 
 @pytest.fixture
 def folder(walk: Walk, published: Publish, tmp_path: Path) -> Path:
-    """Two generations, of 20 and of 45 frames, which share no file."""
+    """Two versions, of 20 and of 45 frames, which share no file."""
     signatures = walk(45, LENGTH)
     first = published(np.arange(20), signatures[:20], flat_bytes=0)
     published(np.arange(20, 45), signatures[20:], first, flat_bytes=0)
@@ -44,7 +44,7 @@ def number_of(folder: Path) -> int | None:
 
 
 def own_files(folder: Path) -> dict[str, Path]:
-    """Files of the second generation, by kind."""
+    """Files of the second version, by kind."""
     (_, path), *_ = manifests(folder)
     own = [folder / name for name, _ in read_manifest(path).files]
     return {"json": path} | {path.suffix[1:]: path for path in own}
@@ -65,7 +65,7 @@ def test_a_changed_file_is_passed_over(
         data[at] ^= 1 << at % 8
     path.write_bytes(data)
     assert number_of(folder) == 2
-    assert caplog.record_tuples[0][:2] == ("sceneprint.index.generation", logging.WARNING)
+    assert caplog.record_tuples[0][:2] == ("sceneprint.index.index_version", logging.WARNING)
     assert path.name in caplog.text
 
 
@@ -85,7 +85,7 @@ def test_a_short_long_or_missing_file_is_passed_over(folder: Path, kind: str) ->
 
 
 def test_what_is_open_does_not_vouch_for_what_is_gone(folder: Path) -> None:
-    """The next generation must not name a file that is mapped here and nowhere else."""
+    """The next version must not name a file that is mapped here and nowhere else."""
     second = newest(folder, "model", LENGTH)
     own_files(folder)["faiss"].unlink()
     found = newest(folder, "model", LENGTH, known=second)
@@ -103,7 +103,7 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
     """A builder that publishes twice between the listing of a folder and the opening."""
     passed = False
 
-    def late(path: Path) -> GenerationManifest:
+    def late(path: Path) -> IndexManifest:
         nonlocal passed
         if not passed:
             passed = True
@@ -112,12 +112,12 @@ def test_files_removed_while_they_are_opened_are_not_damaged(
             assert not path.exists() or int(path.name[:10]) > 2
         return read_manifest(path)
 
-    monkeypatch.setattr("sceneprint.index.generation.read_manifest", late)
+    monkeypatch.setattr("sceneprint.index.index_version.read_manifest", late)
     assert number_of(folder) == 4
     assert caplog.record_tuples == []
 
 
-def test_without_a_sound_generation_there_is_none(
+def test_without_a_sound_version_there_is_none(
     folder: Path, walk: Walk, published: Publish
 ) -> None:
     for path in folder.glob("*.faiss"):
@@ -150,7 +150,7 @@ def test_a_damaged_file_is_written_again_when_its_content_is(
         if path.suffix in {".faiss", ".keys", ".sketches", ".means"}:
             path.write_bytes(b"damaged")
     signatures = walk(45, LENGTH)
-    # the very bytes of the first generation
+    # the very bytes of the first version
     published(np.arange(20), signatures[:20], flat_bytes=0)
     assert number_of(folder) == 3
 

@@ -1,4 +1,4 @@
-"""Generations: appended, merged, cleaned, and opened again as they were."""
+"""Versions of an index: appended, merged, cleaned, and opened again as they were."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.atomic_files import folder_turn
 from sceneprint.index import (
-    Generation,
+    IndexVersion,
     clear,
     newest,
     newest_number,
@@ -27,20 +27,20 @@ from sceneprint.index.part_files import Block
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
-Publish = Callable[..., Generation]
+Publish = Callable[..., IndexVersion]
 LENGTH = 256
 
 
-def holds(generation: Generation | None, frames: dict[int, Bytes]) -> bool:
-    """Whether a generation holds these frames with these signatures, in the order of their keys."""
-    assert generation is not None
+def holds(version: IndexVersion | None, frames: dict[int, Bytes]) -> bool:
+    """Whether a version holds these frames with these signatures, in the order of their keys."""
+    assert version is not None
     keys = np.array(sorted(frames), np.int64)
-    assert generation.keys.tolist() == keys.tolist()
-    assert len(generation) == generation.manifest.frames == len(keys)
+    assert version.keys.tolist() == keys.tolist()
+    assert len(version) == version.manifest.frames == len(keys)
     expected = np.array([frames[int(key)] for key in keys], np.uint8).reshape(-1, LENGTH)
-    np.testing.assert_array_equal(generation.vectors_of(keys[::-1]), expected[::-1])
-    assert generation.has(keys).all()
-    for segment in generation.segments:
+    np.testing.assert_array_equal(version.vectors_of(keys[::-1]), expected[::-1])
+    assert version.has(keys).all()
+    for segment in version.segments:
         assert len(segment.keys) == len(segment.vectors) == segment.index.ntotal
     return True
 
@@ -59,16 +59,16 @@ def test_what_is_published_is_what_is_opened(
     keys, signatures = np.arange(300)[::-1] * 7 - 50, walk(300)
     made = published(keys, signatures, revision=41, anchor=lambda: "an event")
     opened = newest(tmp_path / "map", "model", LENGTH)
-    for generation in (made, opened):
-        assert holds(generation, frames_of(keys, signatures))
-        assert generation is not None
-        assert (generation.number, generation.revision, generation.model_id) == (1, 41, "model")
-        assert (generation.manifest.dimension, len(generation)) == (LENGTH, 300)
-        assert generation.manifest.anchor == "an event"
-        (segment,) = generation.segments
+    for version in (made, opened):
+        assert holds(version, frames_of(keys, signatures))
+        assert version is not None
+        assert (version.number, version.revision, version.model_id) == (1, 41, "model")
+        assert (version.manifest.dimension, len(version)) == (LENGTH, 300)
+        assert version.manifest.anchor == "an event"
+        (segment,) = version.segments
         assert not segment.vectors.flags.writeable
         with pytest.raises(ValueError, match="no frames"):
-            generation.vectors_of(np.array([keys[0], 3]))
+            version.vectors_of(np.array([keys[0], 3]))
 
 
 def test_files_are_keys_and_what_faiss_writes(
@@ -134,25 +134,25 @@ def test_all_frames_may_go(walk: Walk, published: Publish, tmp_path: Path) -> No
     first = published(np.arange(30), signatures)
     last = published(np.arange(0), signatures[:0], first, drop=frozenset(range(30)))
     opened = newest(tmp_path / "map", "model", LENGTH)
-    for generation in (last, opened):
-        assert generation is not None
-        assert (len(generation), generation.manifest.files) == (0, ())
-        assert generation.manifest.dimension == LENGTH
+    for version in (last, opened):
+        assert version is not None
+        assert (len(version), version.manifest.files) == (0, ())
+        assert version.manifest.dimension == LENGTH
     anew = published(np.arange(3), signatures[:3], opened)
     assert holds(anew, frames_of(np.arange(3), signatures[:3]))
 
 
-def test_two_generations_are_kept_and_only_our_files_removed(
+def test_two_versions_are_kept_and_only_our_files_removed(
     walk: Walk, published: Publish, tmp_path: Path
 ) -> None:
     folder, signatures = tmp_path / "map", walk(160)
-    generation = published(np.arange(100), signatures[:100])
+    version = published(np.arange(100), signatures[:100])
     left = [".0123456789ab.part", *(f"{'0' * 64}.{kind}" for kind in ("keys", "faiss", "gone"))]
     for name in left:  # of a killed builder, of no manifest
         (folder / name).write_bytes(b"left")
     (folder / "notes.txt").write_text("of somebody else")
     for key in range(100, 105):
-        generation = published(np.array([key]), signatures[key : key + 1], generation)
+        version = published(np.array([key]), signatures[key : key + 1], version)
     names = files(folder)
     assert {".lock", "notes.txt"} <= names
     kinds = sorted(name.rpartition(".")[2] for name in names - {".lock", "notes.txt"})
@@ -188,7 +188,7 @@ def test_what_is_open_is_taken_from_there(
     second = published(np.arange(100, 150), signatures[100:], first)
     read: list[str] = []
     monkeypatch.setattr(
-        "sceneprint.index.generation.verify", lambda _, name, __: read.append(name) or iter(())
+        "sceneprint.index.index_version.verify", lambda _, name, __: read.append(name) or iter(())
     )
     found = newest(folder, "model", LENGTH, known=first)
     assert found is not None
@@ -272,7 +272,7 @@ def test_an_emptied_folder_is_noticed(walk: Walk, published: Publish, tmp_path: 
     assert holds(first, frames_of(np.arange(10), signatures[:10]))
 
 
-def test_mistakes_leave_the_generation_before(
+def test_mistakes_leave_the_version_before(
     walk: Walk, published: Publish, tmp_path: Path
 ) -> None:
     folder, signatures = tmp_path / "map", walk(20)

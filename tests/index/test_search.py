@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.index import (
-    Generation,
+    IndexVersion,
     SearchHits,
     Tail,
     publish,
@@ -22,7 +22,7 @@ from sceneprint.index import (
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
-Publish = Callable[..., Generation]
+Publish = Callable[..., IndexVersion]
 Nearest = Callable[..., tuple[list[int], list[int]]]
 LENGTH = 256
 search_l2 = partial(search, metric="l2")
@@ -74,16 +74,16 @@ def test_of_equal_frames_the_smaller_keys_are_found(
     rng = np.random.default_rng(seed)
     signatures = rng.integers(0, 256, (kinds, length), np.uint8)[rng.integers(0, kinds, n)]
     keys = rng.permutation(5 * n)[:n].astype(np.int64)
-    generation = publish(
+    version = publish(
         tmp_path_factory.mktemp("map"), model_id="model", revision=0, previous=None,
         blocks=[(keys, signatures)],
     )  # fmt: skip
-    assert generation is not None
+    assert version is not None
     query = signatures[0] if seed % 2 else rng.integers(0, 256, length, np.uint8)
     dead = frozenset(keys[rng.random(n) >= share].tolist())
     frames = {k: x for k, x in frames_of(keys, signatures).items() if k not in dead}
     for size in {1, 5, n // 2, n - 1, n}:
-        hits = search_l2(query, generation, Tail.empty(length), size, dead=dead)
+        hits = search_l2(query, version, Tail.empty(length), size, dead=dead)
         assert answer(hits) == nearest(query, frames, size)
 
 
@@ -93,54 +93,54 @@ def test_distances_that_floats_cannot_hold_are_exact(published: Publish, nearest
     for i in range(40):
         signatures[i, : 40 - i] = 254
     keys, query = np.arange(40, dtype=np.int64), np.zeros(512, np.uint8)
-    generation = published(keys, signatures)
+    version = published(keys, signatures)
     for size in (1, 3, 40):
-        hits = search_l2(query, generation, Tail.empty(512), size)
+        hits = search_l2(query, version, Tail.empty(512), size)
         assert hits.distances[0] > 1 << 24
         assert answer(hits) == nearest(query, frames_of(keys, signatures), size)
 
 
 def test_an_empty_map(published: Publish, walk: Walk) -> None:
     query = walk(1)[0]
-    for generation in (None, published(np.arange(0), walk(0), published(np.arange(3), walk(3)),
+    for version in (None, published(np.arange(0), walk(0), published(np.arange(3), walk(3)),
                                        drop=frozenset({0, 1, 2}))):  # fmt: skip
-        hits = search_l2(query, generation, Tail.empty(LENGTH), 5)
+        hits = search_l2(query, version, Tail.empty(LENGTH), 5)
         assert answer(hits) == ([], [])
         assert (hits.exact, hits.compared) == (True, 0)
 
 
 def test_signatures_of_hits(published: Publish, walk: Walk) -> None:
     signatures = walk(60)
-    generation = published(
+    version = published(
         np.arange(20, 50), signatures[20:50], published(np.arange(20), signatures[:20])
     )
     tail = Tail(np.array([55, 3]), signatures[[55, 54]])
     wanted = np.array([55, 49, 3, 0, 20, 49])
     np.testing.assert_array_equal(
-        signatures_of(wanted, generation, tail), signatures[[55, 49, 54, 0, 20, 49]]
+        signatures_of(wanted, version, tail), signatures[[55, 49, 54, 0, 20, 49]]
     )
     np.testing.assert_array_equal(signatures_of(wanted[[2, 0]], None, tail), signatures[[54, 55]])
     assert signatures_of(wanted[:0], None, tail).shape == (0, LENGTH)
-    for where in (generation, None):
+    for where in (version, None):
         with pytest.raises(ValueError, match=r"no frames \[50, 51\]"):
             signatures_of(np.array([3, 50, 51]), where, tail)
 
 
 def test_mistakes_are_refused(published: Publish, walk: Walk) -> None:
     signatures = walk(10)
-    generation, empty = published(np.arange(10), signatures), Tail.empty(LENGTH)
+    version, empty = published(np.arange(10), signatures), Tail.empty(LENGTH)
     query = signatures[0]
     for wrong in (query[None], query.astype(np.int16)):
         with pytest.raises(ValueError, match="for a query"):
-            search_l2(wrong, generation, empty, 1)
+            search_l2(wrong, version, empty, 1)
     with pytest.raises(ValueError, match="-1 for a query"):
-        search_l2(query, generation, empty, -1)
+        search_l2(query, version, empty, -1)
     with pytest.raises(ValueError, match=r"\[255, 256\] bytes where 256"):
-        search_l2(query, generation, Tail.empty(255), 1)
+        search_l2(query, version, Tail.empty(255), 1)
     with pytest.raises(ValueError, match=r"\[256\] bytes where 255"):
-        search_l2(query[1:], generation, empty, 1)
+        search_l2(query[1:], version, empty, 1)
     with pytest.raises(ValueError, match=r"\[255, 256\]"):
-        signatures_of(np.array([1]), generation, Tail.empty(255))
+        signatures_of(np.array([1]), version, Tail.empty(255))
     with pytest.raises(ValueError, match=r"\[4\] are there twice"):
         Tail(np.array([4, 3, 4]), signatures[:3])
     with pytest.raises(ValueError, match="keys"):

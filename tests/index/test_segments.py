@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import Generation, Tail, newest, publish, search, signatures_of
+from sceneprint.index import IndexVersion, Tail, newest, publish, search, signatures_of
 from sceneprint.index.index_manifest import SegmentFiles
 from sceneprint.index.segment import (
     GONE_SHARE,
@@ -25,7 +25,7 @@ from sceneprint.index.segment import (
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
-Publish = Callable[..., Generation]
+Publish = Callable[..., IndexVersion]
 Nearest = Callable[..., tuple[list[int], list[int]]]
 LENGTH = 24
 NONE = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
@@ -36,16 +36,16 @@ def bits(n: int, seed: int) -> Bytes:
     return np.random.default_rng(seed).integers(0, 2, (n, LENGTH), np.uint8)
 
 
-def sizes(generation: Generation) -> list[int]:
-    return [len(one) for one in generation.segments]
+def sizes(version: IndexVersion) -> list[int]:
+    return [len(one) for one in version.segments]
 
 
-def names(generation: Generation) -> set[str]:
-    return {name for name, _ in generation.manifest.files}
+def names(version: IndexVersion) -> set[str]:
+    return {name for name, _ in version.manifest.files}
 
 
-def written(before: Generation | None, after: Generation) -> int:
-    """Bytes of the files that a generation has and the one before has not."""
+def written(before: IndexVersion | None, after: IndexVersion) -> int:
+    """Bytes of the files that a version has and the one before has not."""
     known = set() if before is None else names(before)
     return sum(size for name, size in after.manifest.files if name not in known)
 
@@ -121,7 +121,7 @@ def test_any_history_is_searched_as_one_map(
     """New, signed anew, deleted and indexed again, in any order, against a dict of all frames."""
     folder, rng = tmp_path_factory.mktemp("map"), np.random.default_rng(seed)
     frames: dict[int, Bytes] = {}
-    made: Generation | None = None
+    made: IndexVersion | None = None
     for step in range(data.draw(st.integers(1, 7))):
         new = data.draw(st.sets(st.integers(0, 150), min_size=int(made is None), max_size=70))
         drop = data.draw(st.sets(st.integers(0, 150), max_size=12)) if made is not None else set()
@@ -152,20 +152,20 @@ def test_any_history_is_searched_as_one_map(
         if key not in dead and (among is None or key in among)
     }  # fmt: skip
     query = bits(1, seed + 2)[0]
-    for generation in (made, opened):
-        assert generation.keys.tolist() == sorted(frames)
-        assert (len(generation), generation.manifest.frames) == (len(frames), len(frames))
+    for version in (made, opened):
+        assert version.keys.tolist() == sorted(frames)
+        assert (len(version), version.manifest.frames) == (len(frames), len(frames))
         asked = np.arange(-3, 210)
-        assert generation.has(asked).tolist() == [int(key) in frames for key in asked]
+        assert version.has(asked).tolist() == [int(key) in frames for key in asked]
         for size, exact in ((1, True), (10, flat == 0), (300, flat == 0)):
             hits = search(
-                query, generation, tail, size, metric="l2", dead=dead, among=given_keys, exact=exact
+                query, version, tail, size, metric="l2", dead=dead, among=given_keys, exact=exact
             )
             assert (hits.keys.tolist(), hits.distances.tolist()) == nearest(query, allowed, size)
             assert (hits.exact, hits.compared) == (True, len(allowed))
         held = np.array(list(everything), np.int64)
         np.testing.assert_array_equal(
-            signatures_of(held, generation, tail),
+            signatures_of(held, version, tail),
             np.reshape([everything[key] for key in held.tolist()], (-1, LENGTH)),
         )
 
@@ -256,8 +256,8 @@ def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_p
     empty, kept = Tail.empty(length), {"one": 0.0, "several": 0.0}
     for query in queries:
         right = search(query, one, empty, 10, metric="l2", exact=True)
-        for name, generation in (("one", one), ("several", made)):
-            found = search(query, generation, empty, 10, metric="l2")
+        for name, version in (("one", one), ("several", made)):
+            found = search(query, version, empty, 10, metric="l2")
             kept[name] += np.isin(right.keys, found.keys).mean() / len(queries)
     assert kept["several"] >= kept["one"] - 0.005
     assert kept["several"] >= 0.97
@@ -265,7 +265,7 @@ def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_p
 
 @pytest.fixture
 def worn(walk: Walk, published: Publish, tmp_path: Path) -> tuple[Path, Path]:
-    """Two generations of one segment, of which a frame is gone in the second; and what says so."""
+    """Two versions of one segment, of which a frame is gone in the second; and what says so."""
     signatures = walk(40, LENGTH)
     first = published(np.arange(40), signatures)
     published(*NONE, first, drop=frozenset([7]))

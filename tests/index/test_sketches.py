@@ -11,28 +11,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sceneprint.index import Generation, Tail, newest, search, sketches
+from sceneprint.index import IndexVersion, Tail, newest, search, sketches
 from sceneprint.index.segment import Segment
 from sceneprint.index.sketches import LEAST_SELECTED, Sketches, draw, make_sketches, neighbours
 from sceneprint.types import Bytes
 
 Walk = Callable[..., Bytes]
-Publish = Callable[..., Generation]
+Publish = Callable[..., IndexVersion]
 Nearest = Callable[..., tuple[list[int], list[int]]]
 LENGTH = 64
 EMPTY = Tail.empty(LENGTH)
 search_l2 = partial(search, metric="l2")
 
 
-def only(generation: Generation | None) -> Segment:
-    """The segment of a generation that has one."""
-    assert generation is not None
-    (found,) = generation.segments
+def only(version: IndexVersion | None) -> Segment:
+    """The segment of a version that has one."""
+    assert version is not None
+    (found,) = version.segments
     return found
 
 
-def sketches_of(generation: Generation | None) -> Sketches:
-    found = only(generation).sketches
+def sketches_of(version: IndexVersion | None) -> Sketches:
+    found = only(version).sketches
     assert found is not None
     return found
 
@@ -61,17 +61,17 @@ def test_a_map_that_is_large_has_sketches(
     assert opened is not None
     frames = dict(zip(keys.tolist(), signatures, strict=True))
     query = walk(31, LENGTH, seed=8)[30]
-    for generation in (made, opened):
-        own = sketches_of(generation)
-        assert (len(own), own.probes) == (3000, generation.manifest.recall.probes)
+    for version in (made, opened):
+        own = sketches_of(version)
+        assert (len(own), own.probes) == (3000, version.manifest.recall.probes)
         np.testing.assert_array_equal(own.means, signatures.mean(axis=0).astype(np.uint8))
         bits = differing_bits(query, signatures, own.means)
         assert [bits[row] for row in own.nearest(query, 400)] == sorted(bits)[:400]
-        hits = search_l2(query, generation, EMPTY, 10)
+        hits = search_l2(query, version, EMPTY, 10)
         assert not hits.exact
         assert LEAST_SELECTED <= hits.compared < 1500
         assert (hits.keys.tolist(), hits.distances.tolist()) == nearest(query, frames, 10)
-        whole = search_l2(query, generation, EMPTY, 10, exact=True)
+        whole = search_l2(query, version, EMPTY, 10, exact=True)
         assert (whole.keys.tolist(), whole.distances.tolist()) == nearest(query, frames, 10)
         assert (whole.exact, whole.compared) == (True, 3000)
 
@@ -98,13 +98,13 @@ def test_recall_is_what_searches_find(
     for name, value in (("LEAST_SELECTED", 10), ("TIMES_WANTED", 1), ("ENOUGH", 0.5)):
         monkeypatch.setattr(sketches, name, value)  # so that some are missed
     signatures = walk(4000, LENGTH, walks=30)
-    generation = published(np.arange(4000), signatures, flat_bytes=0)
-    recall, found = generation.manifest.recall, 0
+    version = published(np.arange(4000), signatures, flat_bytes=0)
+    recall, found = version.manifest.recall, 0
     assert (recall.near, recall.sample, recall.frames) == (10, sketches.MOST, 4000)
     for row in draw(4000, recall.sample, 0).tolist():
         itself = frozenset([row])
-        right = search_l2(signatures[row], generation, EMPTY, 10, dead=itself, exact=True)
-        hits = search_l2(signatures[row], generation, EMPTY, 10, dead=itself)
+        right = search_l2(signatures[row], version, EMPTY, 10, dead=itself, exact=True)
+        hits = search_l2(signatures[row], version, EMPTY, 10, dead=itself)
         found += int((hits.distances <= right.distances[-1]).sum())
     assert recall.share == pytest.approx(found / (10 * recall.sample))
     assert 0.5 <= recall.share < 1
@@ -113,12 +113,12 @@ def test_recall_is_what_searches_find(
 def test_what_queries_from_elsewhere_find(walk: Walk, published: Publish) -> None:
     """Places of the map with other noise: recall of the ten nearest."""
     signatures = walk(6000, LENGTH, walks=12)
-    generation = published(np.arange(6000), signatures, flat_bytes=0)
+    version = published(np.arange(6000), signatures, flat_bytes=0)
     noise = np.random.default_rng(7).normal(0, 4, (60, LENGTH))
     kept = []
     for query in np.clip(signatures[70::100][:60] + noise, 0, 255).astype(np.uint8):
-        right = search_l2(query, generation, EMPTY, 10, exact=True)
-        found = search_l2(query, generation, EMPTY, 10)
+        right = search_l2(query, version, EMPTY, 10, exact=True)
+        found = search_l2(query, version, EMPTY, 10)
         kept.append(np.isin(right.keys, found.keys).mean())
     assert np.mean(kept) >= 0.97
 
@@ -126,17 +126,17 @@ def test_what_queries_from_elsewhere_find(walk: Walk, published: Publish) -> Non
 def test_as_many_come_back_as_there_are(walk: Walk, published: Publish, nearest: Nearest) -> None:
     """Sketches of frames that may not be found take no place of others."""
     signatures, keys = walk(2000, LENGTH, walks=10), np.arange(2000)
-    generation = published(keys, signatures, flat_bytes=0)
+    version = published(keys, signatures, flat_bytes=0)
     query = signatures[1234]
-    near = search_l2(query, generation, EMPTY, 900, exact=True).keys
+    near = search_l2(query, version, EMPTY, 900, exact=True).keys
     dead = frozenset(near.tolist())
-    hits = search_l2(query, generation, EMPTY, 300, dead=dead)
+    hits = search_l2(query, version, EMPTY, 300, dead=dead)
     assert len(hits) == 300
     assert not dead & set(hits.keys.tolist())
-    assert len(search_l2(query, generation, EMPTY, 5000, dead=dead)) == 1100
+    assert len(search_l2(query, version, EMPTY, 5000, dead=dead)) == 1100
     # few among many are compared one by one
     among = np.sort(near[-100:])
-    few = search_l2(query, generation, EMPTY, 10, among=among)
+    few = search_l2(query, version, EMPTY, 10, among=among)
     assert (few.exact, few.compared) == (True, 100)
     frames = {int(k): signatures[k] for k in among}
     assert (few.keys.tolist(), few.distances.tolist()) == nearest(query, frames, 10)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, event
 
 from sceneprint import atomic_files
-from sceneprint.index import Generation, generation, newest, publish
-from sceneprint.index.index_manifest import GenerationManifest
+from sceneprint.index import IndexVersion, index_version, newest, publish
+from sceneprint.index.index_manifest import IndexManifest
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
 from sceneprint.types import Bytes
@@ -179,7 +179,7 @@ def signatures_at(keys: NDArray[np.int64]) -> Bytes:
     return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
 
 
-#: Keys that each generation adds, those it drops, and bytes up to which it has no sketches:
+#: Keys that each version adds, those it drops, and bytes up to which it has no sketches:
 #: a first, an appended, one with sketches, one of deletions with sketches, one without.
 STEPS = (
     (range(20), frozenset[int](), 1 << 30),
@@ -191,14 +191,14 @@ STEPS = (
 
 
 def expected(number: int) -> list[int]:
-    """Keys of a generation, by hand."""
+    """Keys of a version, by hand."""
     keys: list[int] = []
     for new, dropped, _ in STEPS[:number]:
         keys = [key for key in [*keys, *new] if key not in dropped]
     return keys
 
 
-def publish_step(folder: Path, number: int, previous: Generation | None) -> Generation:
+def publish_step(folder: Path, number: int, previous: IndexVersion | None) -> IndexVersion:
     new, dropped, flat_bytes = STEPS[number - 1]
     keys = np.array(new)
     made = publish(
@@ -209,8 +209,8 @@ def publish_step(folder: Path, number: int, previous: Generation | None) -> Gene
     return made
 
 
-def read(folder: Path) -> Generation | None:
-    """The newest generation, which holds just what it should."""
+def read(folder: Path) -> IndexVersion | None:
+    """The newest version, which holds just what it should."""
     found = newest(folder, "model", LENGTH)
     if found is not None:
         number = found.revision // 10
@@ -222,15 +222,15 @@ def read(folder: Path) -> Generation | None:
 
 
 @pytest.fixture
-def lost_generations(
+def lost_versions(
     recorded: Recorded, after_crash: AfterCrash, tmp_path: Path
 ) -> Callable[..., set[str]]:
-    """Publish five generations, and say which promises a loss of power breaks."""
+    """Publish five versions, and say which promises a loss of power breaks."""
 
     def run(deaf: str = "", steps: int = len(STEPS)) -> set[str]:
         root = tmp_path / f"index-{deaf}"
         root.mkdir()
-        done: list[int] = [0]  # the state after which each generation was published
+        done: list[int] = [0]  # the state after which each version was published
         with recorded(root, deaf) as disk:
             previous = None
             for number in range(1, steps + 1):
@@ -260,32 +260,32 @@ def lost_generations(
     return run
 
 
-def test_a_generation_that_was_published_survives(
-    lost_generations: Callable[..., set[str]],
+def test_a_version_that_was_published_survives(
+    lost_versions: Callable[..., set[str]],
 ) -> None:
-    assert lost_generations() == set()
+    assert lost_versions() == set()
 
 
 @pytest.mark.parametrize("deaf", ["files", "folders"])
 def test_who_does_not_sync_an_index_is_found_out(
-    deaf: str, lost_generations: Callable[..., set[str]]
+    deaf: str, lost_versions: Callable[..., set[str]]
 ) -> None:
-    broken = lost_generations(deaf, steps=2)
+    broken = lost_versions(deaf, steps=2)
     assert {one.partition(" (")[0] for one in broken} >= {"none after 1"}
 
 
-def test_old_generations_removed_too_early_are_found_out(
-    lost_generations: Callable[..., set[str]], monkeypatch: pytest.MonkeyPatch
+def test_old_versions_removed_too_early_are_found_out(
+    lost_versions: Callable[..., set[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = generation.write_manifest
+    write = index_version.write_manifest
 
-    def remove_first(folder: Path, manifest: GenerationManifest) -> Path:
+    def remove_first(folder: Path, manifest: IndexManifest) -> Path:
         for path in folder.glob("*.json"):
             path.unlink()
         return write(folder, manifest)
 
-    monkeypatch.setattr(generation, "write_manifest", remove_first)
-    assert any(one.startswith("none after 1") for one in lost_generations(steps=2))
+    monkeypatch.setattr(index_version, "write_manifest", remove_first)
+    assert any(one.startswith("none after 1") for one in lost_versions(steps=2))
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ def meta_of(shot: Any) -> FrameMeta:
 
 @pytest.fixture(scope="module")
 def stored(small_shots, tmp_path_factory) -> Path:
-    """A folder whose map has two generations, of three and of six frames, and three frames more."""
+    """A folder whose map has two versions, of three and of six frames, and three frames more."""
     folder = tmp_path_factory.mktemp("stored") / "data"
     with opened(folder, tail_frames=2) as engine:
         engine.create_map(NewMap(name="hall", model="depth"))

@@ -109,7 +109,7 @@ def test_an_answer_is_seen_by_who_may_read_all_of_it(begin):
     def answered(engine: Engine, maps: list[str], home: str | None = None) -> str:
         answer = Answer(
             query_id=uuid.uuid4().hex, status="not_found", matches=[], location=None, seed=0,
-            model="m", index_generation=0, exact=True, counts=counts, milliseconds={}, maps=maps,
+            model="m", index_version=0, exact=True, counts=counts, milliseconds={}, maps=maps,
             frame=None if home is None else FrameName(map=home, frame_id="f"),
         )  # fmt: skip
         sent = SentQuery(maps, Query(), frame=answer.frame)

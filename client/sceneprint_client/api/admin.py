@@ -145,12 +145,12 @@ class IndexState(ApiRecord):
     """State of a map's search index; queries compare newer frames themselves."""
 
     map: str
-    generation: int | None = Field(
+    version: int | None = Field(
         description="Null: the map has none, and a query compares every frame. Small maps need "
         "none, and models that store psi have none."
     )
     tail: int = Field(
-        description="Indexed frames that the generation lacks. Above the setting `tail_frames`, "
+        description="Indexed frames that the version lacks. Above the setting `tail_frames`, "
         "and not going down: see that workers run."
     )
     recall: IndexRecall | None = Field(

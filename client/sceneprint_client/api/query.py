@@ -628,7 +628,7 @@ class Counts(ApiRecord):
 class OfMap(ApiRecord):
     """The result of a query in one of several maps."""
 
-    index_generation: int = Field(
+    index_version: int = Field(
         description="0 where it was searched without an index of this node."
     )
     counts: Counts
@@ -662,7 +662,7 @@ class Answer(ApiRecord):
     )
     seed: int
     model: str
-    index_generation: int = Field(
+    index_version: int = Field(
         description="0 where the map was searched without an index of this node: a small one, "
         "one that PostgreSQL searched, or one whose model stores psi. Of several maps the least."
     )

@@ -25,7 +25,7 @@ from sceneprint.engine.context import Context
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
 from sceneprint.engine.serializers import when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
-from sceneprint.index.index_manifest import GenerationManifest, manifests, read_manifest
+from sceneprint.index.index_manifest import IndexManifest, manifests, read_manifest
 from sceneprint.process import merged, quantile
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, Database, FolderBlobs, Store, frame_queries, store_counts
@@ -66,9 +66,9 @@ def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexStat
         if manifest is not None and row.pruned_revision <= manifest.revision <= row.revision:
             tail = count_indexed(connection, row.number, manifest.revision)
             recall = IndexRecall(**manifest.recall.model_dump())
-            return IndexState(map=row.name, generation=manifest.number, tail=tail, recall=recall)
+            return IndexState(map=row.name, version=manifest.number, tail=tail, recall=recall)
     tail = count_indexed(connection, row.number, 0)
-    return IndexState(map=row.name, generation=None, tail=tail, recall=None)
+    return IndexState(map=row.name, version=None, tail=tail, recall=None)
 
 
 def index_states(connection: Connection, indexes: Path) -> list[IndexState]:
@@ -88,7 +88,7 @@ def anchors(indexes: Path) -> frozenset[int]:
     return frozenset(number for number in numbers if number is not None)
 
 
-def _read(path: Path) -> GenerationManifest | None:
+def _read(path: Path) -> IndexManifest | None:
     try:
         return read_manifest(path)
     except DamagedIndex:

@@ -37,7 +37,7 @@ from sceneprint.engine.serializers import (
 )
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
-from sceneprint.index import Generation
+from sceneprint.index import IndexVersion
 from sceneprint.models import PRESETS, Model, parse_model, read_model, write_model
 from sceneprint.store import Database, Store, signatures
 from sceneprint.store import reencoding_rows as stored
@@ -378,17 +378,17 @@ class Reencodings:
             if not stored.is_complete(connection, row):
                 return False  # jobs that broke down: somebody must say what is to become of them
         try:
-            generation = self._upkeep.ahead(row)
+            version = self._upkeep.ahead(row)
         except errors.BusyIndex:
             return False  # next time
-        return self._switch(row, generation)
+        return self._switch(row, version)
 
-    def _switch(self, row: MapRow, generation: Generation | None) -> bool:
+    def _switch(self, row: MapRow, version: IndexVersion | None) -> bool:
         with self._store.database.write() as connection:
             now = find_map(connection, row.name)
             if not _still(now, row) or not stored.is_complete(connection, now):
                 return False  # a frame was indexed meanwhile, or somebody was first
-            found = trusted(connection, now, generation)
+            found = trusted(connection, now, version)
             if found is not None:
                 # what was signed after the index was published, and had a revision before it
                 signed = stored.frames_signed_by(connection, now, found.revision)

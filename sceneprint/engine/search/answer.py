@@ -299,7 +299,7 @@ def _answer(
         alternatives=others,
         seed=query.seed,
         model=model.label,
-        index_generation=min(map(_generation, places)),
+        index_version=min(map(_version, places)),
         exact=searched.exact,
         counts=total,
         milliseconds=clock.spent,
@@ -364,7 +364,7 @@ def _selections(
 
 def _per_map(places: Sequence[SearchedMap], counts: Sequence[Counts]) -> dict[str, OfMap]:
     return {
-        place.row.name: OfMap(index_generation=_generation(place), counts=own)
+        place.row.name: OfMap(index_version=_version(place), counts=own)
         for place, own in zip(places, counts, strict=True)
     }
 
@@ -399,7 +399,7 @@ def _sum(counts: Sequence[Counts]) -> Counts:
                      for name in Counts.model_fields})  # fmt: skip
 
 
-def _generation(place: SearchedMap) -> int:
+def _version(place: SearchedMap) -> int:
     return place.view.number
 
 

@@ -31,10 +31,10 @@ import numpy as np
 from sceneprint.atomic_files import PRIVATE_FILE, folder_turn
 from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
-from sceneprint.index import Generation, clear, manifests
-from sceneprint.index.generation import keep_only, remove_unneeded
+from sceneprint.index import IndexVersion, clear, manifests
+from sceneprint.index.index_version import keep_only, remove_unneeded
 from sceneprint.index.index_manifest import (
-    GenerationManifest,
+    IndexManifest,
     decode_manifest,
     manifest_number,
     read_manifest,
@@ -104,7 +104,7 @@ class IndexPlace:
 
     # the newest index, for whoever builds the next one
 
-    def head(self, row: MapRow) -> GenerationManifest | None:
+    def head(self, row: MapRow) -> IndexManifest | None:
         """Return the newest manifest of a map; None where there is none, or it was withdrawn."""
         if self._store is not None:
             numbered = _numbered(self._list(row))
@@ -119,7 +119,7 @@ class IndexPlace:
         numbered = _numbered(self._list(row))
         return _number(numbered[-1]) or 0 if numbered else 0
 
-    def stale_keys(self, row: MapRow, manifest: GenerationManifest) -> frozenset[str]:
+    def stale_keys(self, row: MapRow, manifest: IndexManifest) -> frozenset[str]:
         """Return the names of the keys of segments that hold frames that are gone."""
         if manifest.revision < row.pruned_revision:  # no row says any more which frames are gone
             return frozenset(manifest.keys)
@@ -153,7 +153,7 @@ class IndexPlace:
         with index_turn(self._database, row.number) as mine:
             yield mine
 
-    def share(self, row: MapRow, manifest: GenerationManifest) -> bool:
+    def share(self, row: MapRow, manifest: IndexManifest) -> bool:
         """Put an index into the store, if there is one; False where another has its number."""
         if self._store is None:
             return True
@@ -194,7 +194,7 @@ class IndexPlace:
             self._store.put(f"{self._prefix(row)}{number:010d}.json", b"")
             self.prune(row, clean=True)
 
-    def remove_all_but(self, row: MapRow, head: GenerationManifest | None) -> bool:
+    def remove_all_but(self, row: MapRow, head: IndexManifest | None) -> bool:
         """Leave one index of a map, or none; False where somebody else is building there."""
         with self.turn(row) as mine:
             if mine is None:
@@ -254,16 +254,16 @@ class IndexPlace:
 
     # the folder as a cache of the store
 
-    def want(self, row: MapRow, generation: Generation | None) -> None:
+    def want(self, row: MapRow, version: IndexVersion | None) -> None:
         """Look for a newer index of a map that is queried, in the background, if it is time.
 
         Parameters
         ----------
         row : of the map
-        generation : that is used here
+        version : that is used here
         """
         folder = self.folder(row)
-        since = 0 if generation is None else generation.revision
+        since = 0 if version is None else version.revision
         with self._lock:
             if time.monotonic() - self._looked.get(folder.name, -LOOK_S) < LOOK_S:
                 return
@@ -288,7 +288,7 @@ class IndexPlace:
             except (OSError, SceneprintError, ValueError) as error:  # queries go on without it
                 log.warning("index not fetched", extra={"map": row.name, "error": str(error)})
 
-    def sync(self, row: MapRow, *, needed: bool = True) -> GenerationManifest | None:
+    def sync(self, row: MapRow, *, needed: bool = True) -> IndexManifest | None:
         """Fetch the newest index of a map into the folder, if it is not there.
 
         Parameters
@@ -405,7 +405,7 @@ class IndexPlace:
         self._claim(self._store)
         return list(self._store.list(self._prefix(row)))
 
-    def _read(self, listed: ListedObject) -> GenerationManifest | None:
+    def _read(self, listed: ListedObject) -> IndexManifest | None:
         if self._store is None or listed.size == 0:
             return None
         try:

@@ -1,6 +1,6 @@
 """What queries search: each map's signatures, caught up with the database before every query.
 
-A `Reader` holds one map: the newest generation of its index, and the tail of frames indexed after
+A `Reader` holds one map: the newest version of its index, and the tail of frames indexed after
 it. What it hands out is an `IndexView`, which never changes; catching up makes a new one beside it.
 A map without an index on this node is all tail: its signatures are read from the database once, and
 compared exactly until a worker has published its index. Signatures compared by L1 never have one.
@@ -28,7 +28,7 @@ from sceneprint.atomic_files import make_folder
 from sceneprint.errors import UnusableStore
 from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index import (
-    Generation,
+    IndexVersion,
     SearchHits,
     Tail,
     newest,
@@ -36,7 +36,7 @@ from sceneprint.index import (
     search,
     signatures_of,
 )
-from sceneprint.index.index_manifest import SCHEMA_VERSION, GenerationManifest
+from sceneprint.index.index_manifest import SCHEMA_VERSION, IndexManifest
 from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.store.events import holds_anchor
@@ -59,7 +59,7 @@ class IndexView:
     size : frames that can be found
     dead : frames that it holds and that are deleted
     damaged : frames that were passed over, as their signature is damaged
-    generation : of its index, or None
+    version : of its index, or None
     tail : frames newer than it
     """
 
@@ -69,13 +69,13 @@ class IndexView:
     size: int
     dead: frozenset[int]
     damaged: frozenset[int]
-    generation: Generation | None
+    version: IndexVersion | None
     tail: Tail
 
     @property
     def number(self) -> int:
-        """Number of the generation of the index; 0 where none is used."""
-        return 0 if self.generation is None else self.generation.number
+        """Number of the version of the index; 0 where none is used."""
+        return 0 if self.version is None else self.version.number
 
     def search(
         self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
@@ -83,7 +83,7 @@ class IndexView:
     ) -> SearchHits:  # fmt: skip
         """Return the nearest frames by exact distance; see `index.search`."""
         return search(
-            query, self.generation, self.tail, size, metric=self.metric, dead=dead, among=among,
+            query, self.version, self.tail, size, metric=self.metric, dead=dead, among=among,
             exact=exact,
         )  # fmt: skip
 
@@ -98,13 +98,13 @@ class IndexView:
 
     def signatures(self, keys: Keys) -> Bytes:
         """Return the signatures (r, D) of frames that it has; see `index.signatures_of`."""
-        return signatures_of(keys, self.generation, self.tail)
+        return signatures_of(keys, self.version, self.tail)
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
         """Return which frames (n,) can be found."""
         known = self.tail.places.of(keys) >= 0
-        if self.generation is not None:
-            known |= self.generation.has(keys)
+        if self.version is not None:
+            known |= self.version.has(keys)
         alive: NDArray[np.bool_] = known & ~np.isin(keys, list(self.dead))
         return alive
 
@@ -219,7 +219,7 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
 
 #: Frames that a reader may be behind before it begins again with a newer index, if there is one.
 READ_MOST = 20_000
-#: Seconds between two looks for a newer generation, and until one that is damaged, or out of reach
+#: Seconds between two looks for a newer version, and until one that is damaged, or out of reach
 #: for a moment, is read again.
 _LOOK_S, _AGAIN_S = 1.0, 60.0
 
@@ -245,12 +245,12 @@ def is_index_folder(name: str) -> bool:
     return _FOLDER_NAME.fullmatch(name) is not None
 
 
-#: A generation, or its manifest alone.
-Published = TypeVar("Published", Generation, GenerationManifest)
+#: A version, or its manifest alone.
+Published = TypeVar("Published", IndexVersion, IndexManifest)
 
 
 def trusted(connection: Connection, row: MapRow, found: Published | None) -> Published | None:
-    """A generation, unless the database was put back to a state before it, and went on; or rows of
+    """A version, unless the database was put back to a state before it, and went on; or rows of
     frames that were deleted since are gone, so that nobody can tell which.
     """
     if found is None or found.revision < row.pruned_revision:
@@ -274,21 +274,21 @@ class Reader:
         self._folder, self._model = folder, model
         self._looked = self._asked = time.monotonic()
         self._lock = threading.Lock()
-        self._unsound = 0, 0.0  # number of a generation that cannot be used, until the next try
+        self._unsound = 0, 0.0  # number of a version that cannot be used, until the next try
         self._begin(connection, row)
 
     def _begin(self, connection: Connection, row: MapRow) -> None:
-        """Hold the newest generation, and nothing else."""
+        """Hold the newest version, and nothing else."""
         self._tail = AppendBuffer(self._model.signature_bytes, self._folder.parent)
-        self._dead: dict[int, int] = {}  # what was deleted after the generation, and when
+        self._dead: dict[int, int] = {}  # what was deleted after the version, and when
         self._damaged: set[int] = set()
         found = self._newest(connection, row, None)
         self._publish(found, 0 if found is None else found.revision)
 
     @property
-    def generation(self) -> Generation | None:
+    def version(self) -> IndexVersion | None:
         """That is used."""
-        return self._view.generation
+        return self._view.version
 
     @property
     def bytes_held(self) -> int:
@@ -312,7 +312,7 @@ class Reader:
         """The map as of the row's revision, or later."""
         self._asked = time.monotonic()
         behind = self._view.revision < row.revision
-        # who only looks for a newer generation waits for nobody
+        # who only looks for a newer version waits for nobody
         if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
             try:
                 if self._view.revision < row.revision:
@@ -332,7 +332,7 @@ class Reader:
             gone = {number for number in self._dead if self._tail.revision_of(number)}
             if gone:
                 self._tail = self._tail.copy(0, without=gone)
-                self._publish(self._view.generation, self._view.revision)
+                self._publish(self._view.version, self._view.revision)
 
     def _is_time(self) -> bool:
         return time.monotonic() - self._looked >= _LOOK_S
@@ -346,12 +346,12 @@ class Reader:
         for block in changes_since(connection, row, view.revision):
             for change in block:
                 self._take(change)
-        self._publish(view.generation, row.revision)
+        self._publish(view.version, row.revision)
 
     def _take(self, change: SignatureChange) -> None:
         self._damaged.discard(change.number)
         if change.deleted:
-            self._dead[change.number] = change.revision  # a newer generation may hold it
+            self._dead[change.number] = change.revision  # a newer version may hold it
         elif change.vector is None:
             # one frame must not cost the others; a worker's log says it too
             log.error("damaged signature skipped", extra={"frame_id": change.frame_id})
@@ -364,13 +364,13 @@ class Reader:
             self._dead.pop(change.number, None)  # rejected by a model, and tried again by another
 
     def _swap(self, connection: Connection, row: MapRow) -> None:
-        """Take another generation, if a worker has published one, and keep the rest as tail."""
+        """Take another version, if a worker has published one, and keep the rest as tail."""
         self._looked = time.monotonic()
         view = self._view
         if not self.is_outdated():
             return
-        found = self._newest(connection, row, view.generation)
-        since = 0 if view.generation is None else view.generation.revision
+        found = self._newest(connection, row, view.version)
+        since = 0 if view.version is None else view.version.revision
         # one of the same revision stands for one that was found damaged
         if (
             found is None or found.number == view.number
@@ -387,8 +387,8 @@ class Reader:
         return newest_number(self._folder) if self._model.metric == "l2" else None
 
     def _newest(
-        self, connection: Connection, row: MapRow, known: Generation | None
-    ) -> Generation | None:
+        self, connection: Connection, row: MapRow, known: IndexVersion | None
+    ) -> IndexVersion | None:
         number = self._newest_number()
         if number is None:
             return None
@@ -398,16 +398,16 @@ class Reader:
             self._unsound = number, time.monotonic() + _AGAIN_S
         return trusted(connection, row, found)
 
-    def _publish(self, generation: Generation | None, revision: int) -> None:
+    def _publish(self, version: IndexVersion | None, revision: int) -> None:
         tail, both = self._tail.tail(), 0
         deleted = np.fromiter(self._dead, np.int64, len(self._dead))
         held = np.isin(deleted, tail.keys)
-        if generation is not None:
-            held |= generation.has(deleted)
-            both = int(generation.has(tail.keys).sum())  # signed anew since
+        if version is not None:
+            held |= version.has(deleted)
+            both = int(version.has(tail.keys).sum())  # signed anew since
         dead = frozenset(deleted[held].tolist())
-        size = len(generation or ()) + len(tail) - both - len(dead)
+        size = len(version or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)
         self._view = IndexView(
-            model.id, model.metric, revision, size, dead, damaged, generation, tail
+            model.id, model.metric, revision, size, dead, damaged, version, tail
         )

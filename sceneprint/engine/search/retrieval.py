@@ -83,7 +83,7 @@ class Readers:
                 _, (_, oldest) = self._open.popitem(last=False)
                 held_bytes -= oldest.bytes_held
         if self._place.is_shared and self._signers(row.model_id).model.metric == "l2":
-            self._place.want(row, reader.generation)
+            self._place.want(row, reader.version)
         return reader
 
     def forget(self, name: str) -> None:

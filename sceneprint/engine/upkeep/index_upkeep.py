@@ -30,8 +30,8 @@ from sceneprint.errors import (
     UnusableStore,
 )
 from sceneprint.geometry.retrieval.ranking import Metric
-from sceneprint.index import Generation, newest, newest_number, publish, scrub
-from sceneprint.index.index_manifest import GenerationManifest
+from sceneprint.index import IndexVersion, newest, newest_number, publish, scrub
+from sceneprint.index.index_manifest import IndexManifest
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import Store
@@ -164,7 +164,7 @@ class Upkeep:
                 published += self._tried(row, anyway=True)
         return published
 
-    def rebuild(self, row: MapRow) -> Generation:
+    def rebuild(self, row: MapRow) -> IndexVersion:
         """Publish the index of a map from nothing.
 
         Raises
@@ -180,14 +180,14 @@ class Upkeep:
                 "vectors, and queries compare all of them. If the map is too large for that, "
                 "switch its model with `sceneprint reencode`."
             )
-        generation = self._publish(row, anyway=True, anew=True)
-        if generation is None:
+        version = self._publish(row, anyway=True, anew=True)
+        if version is None:
             raise BusyIndex(
                 f"The index of map {row.name!r} is being built by another process. Try again later."
             )
-        return generation
+        return version
 
-    def ahead(self, row: MapRow) -> Generation | None:
+    def ahead(self, row: MapRow) -> IndexVersion | None:
         """Publish the index of the model that a map is about to switch to, where that is due.
 
         Where it cannot be written, that is logged, and the map has to do without.
@@ -335,7 +335,7 @@ class Upkeep:
 
     def _publish(
         self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False
-    ) -> Generation | None:
+    ) -> IndexVersion | None:
         """Publish the index of a map where it is due, or anyway; None where it is not published."""
         if not anyway and self._is_up_to_date(row):
             return None
@@ -346,7 +346,7 @@ class Upkeep:
             if not anew:
                 self._place.sync(row)
 
-            def share(manifest: GenerationManifest) -> bool:
+            def share(manifest: IndexManifest) -> bool:
                 require()
                 return self._place.share(row, manifest)
 
@@ -358,14 +358,14 @@ class Upkeep:
         self._verified[row.number, row.model_id] = made.inodes
         log.info(
             "index published",
-            extra={"map": row.name, "generation": made.number, "frames": len(made)},
+            extra={"map": row.name, "version": made.number, "frames": len(made)},
         )
         return made
 
     def _build(
-        self, row: MapRow, share: Callable[[GenerationManifest], bool], *, anyway: bool,
+        self, row: MapRow, share: Callable[[IndexManifest], bool], *, anyway: bool,
         anew: bool, clean: bool,
-    ) -> Generation | None:  # fmt: skip
+    ) -> IndexVersion | None:  # fmt: skip
         model = self._signers(row.model_id).model  # before a connection is held: it takes one
         after, damaged = self._place.last_number(row), list[int]()
         with self._store.database.read() as connection:
@@ -411,7 +411,7 @@ class Upkeep:
                 self._published[row.number, row.model_id] = found.number, since
             return not self._is_long(connection, now, since)
 
-    def _newest(self, row: MapRow, model: Model) -> Generation | None:
+    def _newest(self, row: MapRow, model: Model) -> IndexVersion | None:
         """Return the newest sound index here; what this process has verified is not read again."""
         sound = self._verified.get((row.number, row.model_id))
         found = newest(self._place.folder(row), row.model_id, model.signature_bytes, sound=sound)

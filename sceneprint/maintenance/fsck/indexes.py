@@ -11,7 +11,7 @@ from sqlalchemy import select
 
 from sceneprint.engine.search.local_index import index_folder, trusted
 from sceneprint.errors import StoreError
-from sceneprint.index import Generation, clear, newest, newest_number
+from sceneprint.index import IndexVersion, clear, newest, newest_number
 from sceneprint.maintenance.fsck.findings import BLOCK, Finding, Folder
 from sceneprint.store.maps import list_maps
 from sceneprint.store.signatures import stored_signatures
@@ -52,17 +52,17 @@ def _remove(place: Path) -> str:
     return "the index is removed"
 
 
-def _differing_frames(folder: Folder, row: MapRow, index: Generation) -> Iterator[str]:
+def _differing_frames(folder: Folder, row: MapRow, index: IndexVersion) -> Iterator[str]:
     """Yield the ids of frames whose signature is missing or different in the index."""
     with folder.store.database.read() as connection:
-        generation = trusted(connection, row, index)
-    if generation is None:  # queries ignore an index of another history, such as after a restore
+        version = trusted(connection, row, index)
+    if version is None:  # queries ignore an index of another history, such as after a restore
         return
     after = 0
     here = (
         (frames.c.map_number == row.number)
         & (frames.c.state == FrameState.INDEXED)
-        & (frames.c.revision <= generation.revision)
+        & (frames.c.revision <= version.revision)
     )
     while True:
         wanted = select(frames.c.number, frames.c.id).where(here, frames.c.number > after)
@@ -73,8 +73,8 @@ def _differing_frames(folder: Folder, row: MapRow, index: Generation) -> Iterato
             return
         after = block[-1].number
         keys = np.array([each.number for each in block], np.int64)
-        held = generation.has(keys)
-        rows = generation.vectors_of(keys[held])
+        held = version.has(keys)
+        rows = version.vectors_of(keys[held])
         indexed = {key: one.tobytes() for key, one in zip(keys[held].tolist(), rows, strict=True)}
         for number, frame_id in block:
             # damage in the database is another finding

@@ -79,7 +79,7 @@ class House:
         return self.data / "blobs" / digest[:2] / digest
 
     def index_files(self, kind: str) -> list[Path]:
-        """The files of a kind of the newest generation of `hall`, or its manifest."""
+        """The files of a kind of the newest version of `hall`, or its manifest."""
         manifest = max((self.data / "index").glob("hall*/*.json"))
         if kind == "json":
             return [manifest]
@@ -139,7 +139,7 @@ def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]
 def master(
     uploads: list[Upload], small_whitened: Model, tmp_path_factory: pytest.TempPathFactory
 ) -> House:
-    """`hall` with two generations of its index; `attic` with a signed frame, a deleted, one that
+    """`hall` with two versions of its index; `attic` with a signed frame, a deleted, one that
     waits. Not to be changed.
     """
     house = House(tmp_path_factory.mktemp("master"))

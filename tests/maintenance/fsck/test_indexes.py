@@ -27,7 +27,7 @@ def test_a_damaged_index_is_removed_and_made_again(
         engine.publish_due()
         ask = Query(stages=("retrieve",))
         answer = engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, ask)
-    assert answer.index_generation > 0
+    assert answer.index_version > 0
     assert house.look() == []
     assert house.answers(uploads[:12]) == truth
 
@@ -49,5 +49,5 @@ def test_an_index_that_differs_from_the_database_is_made_again(house: Any, uploa
         query = Query(stages=("retrieve",), k=2)
         answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, query)
     assert [match.distance for match in answer.matches] == [0, 0]
-    assert answer.index_generation == 1
+    assert answer.index_version == 1
     assert house.look() == []

@@ -122,10 +122,10 @@ function progress({ model, done, left, failed, dead }) {
 
 /** How far the index is behind; a map may do without one. */
 function lag(index, indexed) {
-  if (!index || index.generation === null) {
+  if (!index || index.version === null) {
     return indexed ? h("span", { title: "A query compares every frame of this map." }, "none needed") : "–";
   }
-  return `generation ${count(index.generation)}, ${index.tail ? `${count(index.tail)} behind` : "up to date"}`;
+  return `version ${count(index.version)}, ${index.tail ? `${count(index.tail)} behind` : "up to date"}`;
 }
 
 /** How an empty map comes by its first frames. */

@@ -5,7 +5,7 @@ import { link } from "../lib/router.js";
 import { rows } from "./poll.js";
 
 /**
- * Search indexes: generation, tail, and the share of the nearest frames that a query finds.
+ * Search indexes: version, tail, and the share of the nearest frames that a query finds.
  * @returns {{element: HTMLElement, update: (stats: Object<string, any>) => void}}
  */
 export function indexes() {
@@ -13,17 +13,17 @@ export function indexes() {
   const none = h("p", { class: "muted" }, "No maps yet.");
   const show = rows(body, (one) => one.map, (one) => h("tr", {},
     h("th", { scope: "row" }, h("a", { href: link("maps", one.map), dataset: { part: "map" } }, one.map)),
-    h("td", { class: "number" }, one.generation === null ? "none" : count(one.generation)),
+    h("td", { class: "number" }, one.version === null ? "none" : count(one.version)),
     h("td", { class: "number" }, count(one.tail)),
     h("td", { class: "number" }, recall(one))));
   const table = h("table", { class: "table" }, h("thead", {}, h("tr", {},
-    h("th", { scope: "col" }, "Map"), h("th", { scope: "col", class: "number" }, "Generation"),
-    h("th", { scope: "col", class: "number", title: "Indexed frames that are not in this generation yet; queries compare them one by one" }, "Tail"),
+    h("th", { scope: "col" }, "Map"), h("th", { scope: "col", class: "number" }, "Version"),
+    h("th", { scope: "col", class: "number", title: "Indexed frames that are not in this version yet; queries compare them one by one" }, "Tail"),
     h("th", { scope: "col", class: "number", title: "Share of the 10 nearest frames that a query finds" }, "Recall@10"))), body);
   return {
     element: h("section", { class: "card", "aria-labelledby": "indexes" }, h("h2", { id: "indexes" }, "Search indexes"), none,
       h("div", { class: "scroll" }, table),
-      h("p", { class: "note muted" }, "A query compares every frame, except in large maps. For these, recall is measured when a generation is published, on a sample of its frames.")),
+      h("p", { class: "note muted" }, "A query compares every frame, except in large maps. For these, recall is measured when a version is published, on a sample of its frames.")),
     update({ indexes: found }) {
       none.hidden = found.length > 0;
       table.hidden = found.length === 0;

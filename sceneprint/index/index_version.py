@@ -22,7 +22,7 @@ from sceneprint.atomic_files import folder_turn
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.index.index_manifest import (
-    GenerationManifest,
+    IndexManifest,
     SegmentFiles,
     manifests,
     newest_number,
@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Generation:
+class IndexVersion:
     """One published state of an index: immutable, and usable by any number of threads.
 
     It stays usable after its parts have been removed: they are mapped, and processes share them.
@@ -58,7 +58,7 @@ class Generation:
     inodes : of the parts by their names: another file may have taken a name since
     """
 
-    manifest: GenerationManifest
+    manifest: IndexManifest
     segments: tuple[Segment, ...]
     inodes: Mapping[str, int]
 
@@ -117,9 +117,9 @@ def newest(
     model_id: str,
     dimension: int,
     *,
-    known: Generation | None = None,
+    known: IndexVersion | None = None,
     sound: Mapping[str, int] | None = None,
-) -> Generation | None:
+) -> IndexVersion | None:
     """Open the newest sound index of a folder; None where there is none.
 
     Every part is read and verified before it is used. An index with a damaged one is skipped with a
@@ -139,7 +139,7 @@ def newest(
             try:
                 manifest = read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    found = open_generation(folder, manifest, known, sound)
+                    found = open_version(folder, manifest, known, sound)
                     break
             except DamagedIndex as error:
                 errors.append(error)
@@ -150,10 +150,10 @@ def newest(
             return found
 
 
-def open_generation(
-    folder: Path, manifest: GenerationManifest, known: Generation | None = None,
+def open_version(
+    folder: Path, manifest: IndexManifest, known: IndexVersion | None = None,
     sound: Mapping[str, int] | None = None,
-) -> Generation:  # fmt: skip
+) -> IndexVersion:  # fmt: skip
     """Open the parts that a manifest names; DamagedIndex where one is missing or damaged.
 
     Parameters
@@ -179,7 +179,7 @@ def open_generation(
         else open_segment(folder, record, manifest.dimension)
         for record in manifest.segments
     )
-    return Generation(manifest, segments, inodes)
+    return IndexVersion(manifest, segments, inodes)
 
 
 def _inode(path: Path) -> int:
@@ -239,30 +239,30 @@ class Tail:
         return np.flatnonzero(free)
 
 
-def signatures_of(keys: Keys, generation: Generation | None, tail: Tail) -> Bytes:
+def signatures_of(keys: Keys, version: IndexVersion | None, tail: Tail) -> Bytes:
     """Return the signatures (r, D) of frames (r,), in their order; the tail's where it has one.
 
     Raises
     ------
     ValueError : a frame is in neither, or the lengths of signatures differ.
     """
-    check_lengths(tail.signatures.shape[1], generation, tail)
+    check_lengths(tail.signatures.shape[1], version, tail)
     in_tail = tail.places.of(keys)
     result = np.empty((len(keys), tail.signatures.shape[1]), np.uint8)
     result[in_tail >= 0] = tail.signatures[in_tail[in_tail >= 0]]
     others = keys[in_tail < 0]
-    if len(others) and generation is None:
+    if len(others) and version is None:
         raise ValueError(f"no frames {others[:5].tolist()} in this index")
-    if len(others) and generation is not None:
-        result[in_tail < 0] = generation.vectors_of(others)
+    if len(others) and version is not None:
+        result[in_tail < 0] = version.vectors_of(others)
     return result
 
 
-def check_lengths(dimension: int, generation: Generation | None, tail: Tail) -> None:
+def check_lengths(dimension: int, version: IndexVersion | None, tail: Tail) -> None:
     """Raise ValueError where signatures of the index or the tail have not that many bytes."""
     found = {tail.signatures.shape[1]}
-    if generation is not None:
-        found.add(generation.manifest.dimension)
+    if version is not None:
+        found.add(version.manifest.dimension)
     if found != {dimension}:
         raise ValueError(f"signatures of {sorted(found)} bytes where {dimension} were expected")
 
@@ -288,7 +288,7 @@ class SearchHits:
 
 def search(
     query: Bytes,
-    generation: Generation | None,
+    version: IndexVersion | None,
     tail: Tail,
     size: int,
     *,
@@ -302,7 +302,7 @@ def search(
     Parameters
     ----------
     query : (D,) uint8, a signature of the model of the map
-    generation : the index; None where there is none
+    version : the index; None where there is none
     tail : frames newer than that; where a frame is in both, this one counts
     size : of the answer; all frames where there are fewer
     metric : of the model of the map
@@ -316,15 +316,15 @@ def search(
     """
     if query.ndim != 1 or query.dtype != np.uint8 or size < 0:
         raise ValueError(f"{size} for a query {query.dtype} {query.shape}")
-    check_lengths(len(query), generation, tail)
+    check_lengths(len(query), version, tail)
     gone = np.sort(np.fromiter(dead, np.int64, len(dead)))
     among = None if among is None else np.sort(among)
     alive = tail.rows_among(gone, among)
     keys, whole, compared = [tail.keys[alive]], True, len(alive)
     found = [distances(query, tail.signatures, metric, alive)]
-    if generation is not None and len(generation):
+    if version is not None and len(version):
         gone = np.sort(np.concatenate([gone, tail.keys]))
-        for one in generation.segments:
+        for one in version.segments:
             (own, distant), all_of_it, count = one.nearest(
                 query, size, gone, among, metric=metric, exact=exact
             )
@@ -353,14 +353,14 @@ def publish(
     model_id: str,
     revision: int,
     blocks: Iterable[Block],
-    previous: Generation | None,
+    previous: IndexVersion | None,
     drop: frozenset[int] = frozenset(),
     anchor: Callable[[], str] = str,
     clean: bool = False,
     flat_bytes: int = FLAT_BYTES,
     after: int = 0,
-    share: Callable[[GenerationManifest], bool] = lambda _: True,
-) -> Generation | None:
+    share: Callable[[IndexManifest], bool] = lambda _: True,
+) -> IndexVersion | None:
     """Publish the index that follows `previous`.
 
     One process builds in a folder at a time. The two newest indexes are kept, and parts that only
@@ -403,7 +403,7 @@ def publish(
             return None
         last = newest_number(folder) or 0
         records, dimension = _write_segments(folder, previous, blocks, drop, clean, flat_bytes)
-        manifest = GenerationManifest(
+        manifest = IndexManifest(
             number=max(after, last) + 1,
             revision=revision,
             model_id=model_id,
@@ -420,11 +420,11 @@ def publish(
         keep_only(folder, {manifest.number} if clean else {manifest.number, before})
         known = {} if previous is None else previous.inodes
         written = {name: _inode(folder / name) for name, _ in manifest.files if name not in known}
-        return open_generation(folder, manifest, previous, written)
+        return open_version(folder, manifest, previous, written)
 
 
 def _write_segments(
-    folder: Path, previous: Generation | None, blocks: Iterable[Block], drop: frozenset[int],
+    folder: Path, previous: IndexVersion | None, blocks: Iterable[Block], drop: frozenset[int],
     clean: bool, flat_bytes: int,
 ) -> tuple[tuple[SegmentFiles, ...], int]:  # fmt: skip
     """Write what is new and what it is merged with; all segments, and bytes of a signature."""
@@ -443,7 +443,7 @@ def _write_segments(
     return records, dimension or stored.shape[1]
 
 
-def _is_overtaken(folder: Path, previous: Generation) -> bool:
+def _is_overtaken(folder: Path, previous: IndexVersion) -> bool:
     """Return whether another was published, or the folder emptied, since `previous` was opened."""
     found = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
     return found is None or found.number != previous.number
