@@ -89,7 +89,9 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
             if len(keys):
                 yield keys, signatures(keys, length)
 
-    def published(folder: Path, previous: IndexVersion | None, first: int, last: int) -> IndexVersion:
+    def published(
+        folder: Path, previous: IndexVersion | None, first: int, last: int
+    ) -> IndexVersion:
         version = publish(
             folder, model_id="bench", revision=last, blocks=blocks(first, last), previous=previous,
             flat_bytes=flat_bytes,

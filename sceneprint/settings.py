@@ -82,7 +82,7 @@ class Settings(BaseSettings):
         shown="none: each host builds its own",
         default=None,
     )
-    index_bytes: int = _setting(
+    index_cache_bytes: int = _setting(
         "Maximum size of this machine's copies of shared indexes, bytes. The least recently used "
         "are removed; none that was used within ten minutes is.",
         "For smaller disks or larger maps.",
@@ -130,7 +130,7 @@ class Settings(BaseSettings):
         "For a dashboard on another host.",
         default=(),
     )
-    concurrency: int = _setting(
+    concurrent_requests: int = _setting(
         "Number of uploads, and of queries, that run at once.",
         "Rarely: more does not add processors.",
         shown="number of processors, at least 2",
@@ -143,7 +143,7 @@ class Settings(BaseSettings):
         shown="number of processors",
         default_factory=lambda: os.cpu_count() or 1, ge=1, le=256,
     )  # fmt: skip
-    geometry_bytes: int = _setting(
+    geometry_cache_bytes: int = _setting(
         "Memory of each process for the geometry of recently compared frames, bytes; 0.8 MB a "
         "frame; 0 disables it. Further queries in the same place are answered sooner.",
         "Less if many services share a machine; more for large maps.",
@@ -151,43 +151,43 @@ class Settings(BaseSettings):
     )  # fmt: skip
 
     # Limits of requests
-    waiting: int = _setting(
+    queued_requests: int = _setting(
         "Number of uploads, and of queries, that may wait; the next one gets 503.",
         "Higher if many robots send at once.",
         default=64, ge=0, le=10_000,
     )  # fmt: skip
-    wait_s: float = _setting(
+    queue_timeout_s: float = _setting(
         "Maximum wait of an upload or query before it starts, seconds; then it gets 503.",
         "Lower if a late answer is of no use.",
         default=5.0, gt=0, le=3600,
     )  # fmt: skip
-    upload_bytes: int = _setting(
+    max_upload_bytes: int = _setting(
         "Maximum size of a request's body, bytes: a cloud of 6 million points of three float32.",
         "Higher for larger files of points; lower if only small sensors send.",
         default=72 << 20, ge=1024, le=512 << 20,
     )  # fmt: skip
-    import_bytes: int = _setting(
+    max_import_bytes: int = _setting(
         "Maximum size of an imported archive, bytes. Its content may be four times as large.",
         "According to your recordings.",
         default=4 << 30, ge=1024,
     )  # fmt: skip
-    body_s: float = _setting(
+    body_timeout_s: float = _setting(
         "Time in which a small body must arrive, seconds; each MiB adds 4 s.",
         "Longer for very poor links.",
         default=30.0, ge=1, le=3600,
     )  # fmt: skip
-    requests_per_s: float = _setting(
+    tenant_requests_per_s: float = _setting(
         "Rate of each tenant's requests at each service process, averaged over five seconds; 0 for "
         "no limit. A query counts as 5, a page as 1 and 1 more for each 50 rows.",
         "According to the size of the fleet.",
         default=200.0, ge=0, le=1e6,
     )  # fmt: skip
-    failed_keys_per_minute: float = _setting(
+    wrong_keys_per_minute: float = _setting(
         "Rate of wrong keys from each address; 0 for no limit.",
         "Rarely.",
         default=60.0, ge=0, le=1e6,
     )  # fmt: skip
-    event_streams: int = _setting(
+    max_event_streams: int = _setting(
         "Number of event streams that a service process keeps open; the next gets 503. A tenant "
         "has three quarters of them at most, and then gets 429.",
         "According to the number of dashboards.",
@@ -202,18 +202,18 @@ class Settings(BaseSettings):
         shown="number of processors",
         default_factory=lambda: os.cpu_count() or 1, ge=0, le=256,
     )  # fmt: skip
-    worker_bytes: int = _setting(
+    worker_memory_bytes: int = _setting(
         "Memory that a worker may allocate beyond what it has when it is ready, bytes; 0 for no "
         "limit. A job that needs more fails, and no other process is affected.",
         "Lower on small machines; higher for very large maps.",
         default=2 << 30, ge=0,
     )  # fmt: skip
-    lease_s: float = _setting(
+    job_lease_s: float = _setting(
         "Time after which a silent worker loses its job, seconds.",
         "Longer on machines that are suspended.",
         default=60.0, ge=0.1, le=3600,
     )  # fmt: skip
-    job_s: float = _setting(
+    job_timeout_s: float = _setting(
         "Maximum time of a job, or of one slice of a long job, seconds. A worker that takes longer "
         "is ended.",
         "Longer on very slow machines.",
@@ -227,55 +227,55 @@ class Settings(BaseSettings):
         shown="number of processors, from 2 to 8",
         default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256,
     )  # fmt: skip
-    decoder_bytes: int = _setting(
+    decoder_memory_bytes: int = _setting(
         "Memory that a decoder may allocate for one upload, bytes; 0 for no limit.",
         "Lower on small machines.",
         default=2 << 30, ge=0,
     )  # fmt: skip
-    decoder_s: float = _setting(
+    decoder_timeout_s: float = _setting(
         "Time for which a decoder may compute, or hang, with one upload, seconds.",
         "Longer on very slow machines.",
         default=30.0, ge=0.1, le=3600,
     )  # fmt: skip
 
     # Upkeep
-    tail_frames: int = _setting(
+    unindexed_frames: int = _setting(
         "Number of frames or deletions newer than the index at which a worker publishes the next "
         "index.",
         "Rarely: queries read these frames from memory.",
         default=1000, ge=1, le=100_000,
     )  # fmt: skip
-    scrub_s: float = _setting(
+    index_check_interval_s: float = _setting(
         "Interval at which workers verify all index files, seconds.",
         "Longer for indexes of many gigabytes.",
         default=3600.0, ge=1, le=31_536_000,
     )  # fmt: skip
-    scrub_mb_per_s: float = _setting(
+    blob_check_mb_per_s: float = _setting(
         "Rate at which workers verify stored blobs, MB per second; 0 disables it.",
         "Higher for more than 86 GB, which takes a day; 0 if an object store charges for reading "
         "and verifies its bytes itself.",
         default=1.0, ge=0, le=10_000,
     )  # fmt: skip
-    surfaces: Literal["auto", "asked"] = _setting(
-        "Whether workers build the surface of each map (`auto`), or only on request (`asked`). "
-        "Deleted frames are always removed from a surface that exists.",
+    build_surfaces: Literal["auto", "on_request"] = _setting(
+        "Whether workers build the surface of each map (`auto`), or only on request "
+        "(`on_request`). Deleted frames are always removed from a surface that exists.",
         "If nobody looks at surfaces, to spare workers and disk.",
         default="auto",
     )
-    joins: Literal["auto", "asked"] = _setting(
+    join_sessions: Literal["auto", "on_request"] = _setting(
         "Whether workers associate sessions of different parent frames (`auto`), or only on "
-        "request (`asked`). Only a strong join moves poses.",
+        "request (`on_request`). Only a strong join moves poses.",
         "If parent frames are to stay apart, or to spare workers.",
         default="auto",
     )
 
     # Retention
-    undo_s: float = _setting(
+    undo_window_s: float = _setting(
         "Time for which a deletion can be undone, seconds; 0 makes it final at once.",
         "0 if a deletion must be final; longer for people who notice late.",
         default=600.0, ge=0, le=31_536_000,
     )  # fmt: skip
-    purge_s: float = _setting(
+    purge_deadline_s: float = _setting(
         "Maximum time until no byte of a deleted frame is left on this node, seconds, counted from "
         "when the deletion can no longer be undone.",
         "According to what you promised the people in the frames.",
@@ -287,24 +287,24 @@ class Settings(BaseSettings):
         "Longer than any host is ever off: an older index is built again from the database.",
         default=7.0, ge=1, le=36_500,
     )  # fmt: skip
-    answer_days: float = _setting(
+    query_log_days: float = _setting(
         "Time for which queries are listed with their answers, days. 0 stores none, and no event "
         "reports a query.",
         "According to what you promised the operators of the robots.",
         default=30.0, ge=0, le=36_500,
     )  # fmt: skip
-    answer_bytes: int = _setting(
+    query_log_bytes: int = _setting(
         "Maximum size of all stored answers, bytes, 200 kB each. The oldest are removed first; 0 "
         "stores none.",
         "According to the rate of queries.",
         default=256 << 20, ge=0,
     )  # fmt: skip
-    events_kept: int = _setting(
+    events_per_map: int = _setting(
         "Number of events of each map that are kept, 200 bytes each.",
         "According to how long a robot may be away.",
         default=1_000_000, ge=1000,
     )  # fmt: skip
-    audit_kept_days: float = _setting(
+    audit_log_days: float = _setting(
         "Time for which entries of the audit log are kept, days. A tenant has at most 200,000 "
         "changes and as many refusals.",
         "According to your auditors.",

@@ -45,11 +45,12 @@ def embedded_settings(path: Path) -> Settings:
     """
     settings = Settings(
         data_dir=path.absolute(), database_url=None, index_dir=None,
-        host="127.0.0.1", require_keys=False, cors_origins=(), requests_per_s=0,
-        waiting=_MOST_WAITING, wait_s=_LONGEST_WAIT_S, event_streams=_MOST_STREAMS, decoders=0,
+        host="127.0.0.1", require_keys=False, cors_origins=(), tenant_requests_per_s=0,
+        queued_requests=_MOST_WAITING, queue_timeout_s=_LONGEST_WAIT_S,
+        max_event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip
     # more than may be set: that is what a decoder takes
-    return settings.model_copy(update={"upload_bytes": _MOST_BYTES})
+    return settings.model_copy(update={"max_upload_bytes": _MOST_BYTES})
 
 
 class LocalService(httpx.BaseTransport):

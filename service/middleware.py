@@ -67,8 +67,8 @@ class RequestMiddleware:
         self, app: ASGIApp, settings: Settings, origins: Origins, metrics: Metrics
     ) -> None:
         self._app, self._origins, self._metrics = app, origins, metrics
-        self._most, self._body_s = settings.upload_bytes, settings.body_s
-        self._most_of_import = settings.import_bytes
+        self._most, self._body_s = settings.max_upload_bytes, settings.body_timeout_s
+        self._most_of_import = settings.max_import_bytes
         self._alone = not settings.asks_for_keys
         self._delays = RefusalDelays()
         self._at_once = 0

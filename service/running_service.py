@@ -81,22 +81,22 @@ class Service:
         self.reconstructions = Reconstructions(context)
         self.surfaces = MapSurfaces(store, context.bell)
         self.outputs, self.copies = FrameFiles(store, context.signers), MapCopies(store)
-        self.tombstones = Tombstones(store, settings.undo_s, context.bell.ring)
-        self.audit = Audit(store, settings.audit_kept_days)
+        self.tombstones = Tombstones(store, settings.undo_window_s, context.bell.ring)
+        self.audit = Audit(store, settings.audit_log_days)
         self.events, self.statistics = Events(store, settings), Statistics(context)
         self.catalogue, self.key_uses = Catalogue(store.database), KeyUses()
 
-        self.wait_s = settings.wait_s
-        self.gate = Gate(settings.concurrency, settings.waiting, self.wait_s)
+        self.wait_s = settings.queue_timeout_s
+        self.gate = Gate(settings.concurrent_requests, settings.queued_requests, self.wait_s)
         # they mostly wait for the disk: the store bounds how many are decoded at once
         self.upload_gate = Gate(
-            max(UPLOADS, settings.concurrency), settings.waiting, self.wait_s,
-            max(settings.concurrency // 2, 1), rests=True,
+            max(UPLOADS, settings.concurrent_requests), settings.queued_requests, self.wait_s,
+            max(settings.concurrent_requests // 2, 1), rests=True,
         )  # fmt: skip
         self.keys = settings.asks_for_keys
-        self.feed = Feed(store.database, settings.event_streams, settings.events_kept)
-        self.limits = RateLimits(settings.requests_per_s, settings.failed_keys_per_minute)
-        self.places = settings.concurrency + settings.waiting
+        self.feed = Feed(store.database, settings.max_event_streams, settings.events_per_map)
+        self.limits = RateLimits(settings.tenant_requests_per_s, settings.wrong_keys_per_minute)
+        self.places = settings.concurrent_requests + settings.queued_requests
         self.requests, self.spool = Holdings(), BodySpool()
         self.reads = Turns(READS, READS_BESIDE, rests=True)
         self.lookups, self.looks = CapacityLimiter(LOOKUPS), SharedLooks(READY_S)

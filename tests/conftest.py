@@ -99,8 +99,8 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 def pytest_configure(config: pytest.Config) -> None:
     """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
     # of processes that tests begin, too: a job that nobody asked for would be counted
-    os.environ.setdefault("SCENEPRINT_SURFACES", "asked")
-    os.environ.setdefault("SCENEPRINT_JOINS", "asked")
+    os.environ.setdefault("SCENEPRINT_BUILD_SURFACES", "on_request")
+    os.environ.setdefault("SCENEPRINT_JOIN_SESSIONS", "on_request")
     # a second of processor time each; tests of decoders and the service's say otherwise
     os.environ.setdefault("SCENEPRINT_DECODERS", "0")
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")

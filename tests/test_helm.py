@@ -33,7 +33,7 @@ ALL = REQUIRED | {
     "serviceAccountName": "robots",
     "imagePullSecrets": [{"name": "registry"}],
     "image": {"digest": "sha256:" + "a" * 64},
-    "env": {"AWS_REGION": "eu-central-1", "SCENEPRINT_UNDO_S": 60},
+    "env": {"AWS_REGION": "eu-central-1", "SCENEPRINT_UNDO_WINDOW_S": 60},
     "api": {"autoscaling": {"enabled": True}, "nodeSelector": {"disk": "ssd"}},
     "worker": {
         "autoscaling": {"enabled": True, "targetSeconds": 20},
@@ -176,7 +176,7 @@ def test_pods_run_our_commands_with_our_settings(tmp_path: Path) -> None:
         mounts = {mount["mountPath"] for mount in container["volumeMounts"]}
         assert mounts == {"/data", "/var/cache/sceneprint", "/tmp"}
     assert environment(parts["serve"]["spec"]["template"]["spec"]["containers"][0]).items() >= {
-        ("SCENEPRINT_WORKERS", "0"), ("SCENEPRINT_UNDO_S", "60"),
+        ("SCENEPRINT_WORKERS", "0"), ("SCENEPRINT_UNDO_WINDOW_S", "60"),
     }  # fmt: skip
 
 

@@ -77,10 +77,10 @@ def test_the_page_of_settings_is_written_from_their_fields() -> None:
     assert list(listed) == [name.upper() for name in Settings.model_fields]
     assert all(len(cells) == 4 and all(cells) for cells in listed.values())
     assert listed["PORT"][:2] == ["whole number, at least 0, at most 65,535", "`8008`"]
-    assert listed["UPLOAD_BYTES"][1] == f"`{72 << 20}` (72 MiB)"
+    assert listed["MAX_UPLOAD_BYTES"][1] == f"`{72 << 20}` (72 MiB)"
     assert listed["WORKERS"][1] == "number of processors"
     assert listed["DATABASE_URL"][:2] == ["text", "SQLite in the data folder"]
-    assert listed["SURFACES"][0] == "`auto` or `asked`"
+    assert listed["BUILD_SURFACES"][0] == "`auto` or `on_request`"
 
 
 def test_every_state_is_told():

@@ -20,10 +20,10 @@ PAGE = Path(__file__).resolve().parents[1] / "docs/settings.md"
 SECTIONS = {
     "data_dir": "Places",
     "host": "Service",
-    "waiting": "Limits of requests",
+    "queued_requests": "Limits of requests",
     "workers": "Workers and decoders",
-    "tail_frames": "Upkeep",
-    "undo_s": "Retention",
+    "unindexed_frames": "Upkeep",
+    "undo_window_s": "Retention",
 }
 _BOUNDS = {Ge: ("ge", "at least {:,}"), Gt: ("gt", "above {:,}"), Le: ("le", "at most {:,}")}
 

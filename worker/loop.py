@@ -69,7 +69,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
             return
         listener = stack.enter_context(context.bell.listen())
         context.signers.warm()
-        limit_memory(settings.worker_bytes)
+        limit_memory(settings.worker_memory_bytes)
         worker = Worker(context, listener, trace, stop)
         record_start(context.store, worker.name)
         log.info("worker ready", extra={"worker": worker.name})
@@ -87,7 +87,7 @@ class Worker:
     def __init__(
         self, context: Context, listener: Listening, trace: Trace, stop: StopSignal
     ) -> None:
-        self._job_s = context.settings.job_s
+        self._job_s = context.settings.job_timeout_s
         self._jobs, self._housekeeping = JobRunner(context), Housekeeping(context)
         self._scrub = Scrub(context.settings, context.store)
         self._listener, self._trace, self._stop = listener, trace, stop
@@ -144,7 +144,7 @@ class Worker:
             self._housekeeping.run()
             self._scrub.run(is_quiet)
         except MemoryError:  # the next process would have no more
-            log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_BYTES")
+            log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_MEMORY_BYTES")
             self._upkeep_at = time.monotonic() + POOR_S
         return rung
 

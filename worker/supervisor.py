@@ -124,7 +124,7 @@ class Supervisor:
         """Take the job that a dead worker was at, rather than wait for its lease."""
         if left.job_id is None:
             return
-        error = _cause(code, left, self._settings.job_s)
+        error = _cause(code, left, self._settings.job_timeout_s)
         counts = -code not in _FROM_OUTSIDE
         text = left.text or "It left no traceback."
         try:

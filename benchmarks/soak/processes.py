@@ -27,8 +27,8 @@ from sceneprint.store import Store, open_store
 #: Settings of every process. Another worker soon takes what a killed one held, and indexes are
 #: published early.
 SETTINGS = {
-    "SCENEPRINT_REQUIRE_KEYS": "1", "SCENEPRINT_LEASE_S": "5", "SCENEPRINT_TAIL_FRAMES": "100",
-    "SCENEPRINT_REQUESTS_PER_S": "0",
+    "SCENEPRINT_REQUIRE_KEYS": "1", "SCENEPRINT_JOB_LEASE_S": "5",
+    "SCENEPRINT_UNINDEXED_FRAMES": "100", "SCENEPRINT_TENANT_REQUESTS_PER_S": "0",
 }  # fmt: skip
 #: Seconds that a message to the database takes, and one to the object store, in a slow network.
 DATABASE_S, STORE_S = 0.0005, 0.01
@@ -135,7 +135,7 @@ class Fleet:
         self._objects = ObjectServer() if plan.objects else None
         self._shared = dict(SETTINGS)
         if plan.is_crowd:
-            self._shared["SCENEPRINT_SURFACES"] = "asked"
+            self._shared["SCENEPRINT_BUILD_SURFACES"] = "on_request"
 
     def __enter__(self) -> Self:
         return self

@@ -571,7 +571,7 @@ class SurfaceMethods(ServiceConnection):
     def begin_surface(self, map_name: str) -> MapSurface:
         """Build the surface of a map now, or add new frames to it.
 
-        Workers do this by themselves, unless `SCENEPRINT_SURFACES` is `asked`.
+        Workers do this by themselves, unless `SCENEPRINT_BUILD_SURFACES` is `on_request`.
 
         Raises
         ------

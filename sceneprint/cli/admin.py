@@ -227,7 +227,7 @@ def run_audit(options: argparse.Namespace) -> int:
     wanted = AuditFilter(options.actor, options.map, options.action, since)
     settings = existing_store(options)
     with open_command_store(settings) as store:
-        audit = Audit(store, settings.audit_kept_days)
+        audit = Audit(store, settings.audit_log_days)
         if options.format is None:
             for one in _newest(audit, wanted, options.limit):
                 print(_audit_line(one))

@@ -228,7 +228,7 @@ def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
     apart = seconds_apart(before, there, after)
     text = f"the server's clock differs from this host's by {apart:.1f} s"
     if apart > APART_S:
-        verdict: Verdict = "WRONG" if apart > settings.lease_s else "note"
+        verdict: Verdict = "WRONG" if apart > settings.job_lease_s else "note"
         yield Check(verdict, "clock", f"{text}. Synchronize both with a time server.")
     else:
         yield Check("ok", "clock", text)
@@ -264,7 +264,11 @@ def _connections(values: Mapping[str, object], settings: Settings) -> Check:
     most, taken = int(str(values["connections"])), int(str(values["taken"]))
     # a worker takes one for its work, one for its lease, one to be woken, and three that last for
     # locks of blobs and indexes; a service as many as it answers at once, and those that last
-    wanted = 6 * settings.workers + min(settings.concurrency + settings.waiting, MOST) + 3
+    wanted = (
+        6 * settings.workers
+        + min(settings.concurrent_requests + settings.queued_requests, MOST)
+        + 3
+    )
     text = (
         f"{most} connections allowed (max_connections), {taken} in use; a service and "
         f"{settings.workers} workers may use {wanted}"
@@ -337,7 +341,7 @@ def _decoders(settings: Settings) -> Check:
         return Check("note", "decoders", text)
     from sceneprint.decoders.pool import DecoderPool
 
-    pool = DecoderPool(1, settings.decoder_bytes, settings.decoder_s)
+    pool = DecoderPool(1, settings.decoder_memory_bytes, settings.decoder_timeout_s)
     try:
         pool.start()
         found = pool.protections

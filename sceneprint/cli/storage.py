@@ -99,7 +99,7 @@ def add_fsck(command: argparse.ArgumentParser) -> None:
     how.add_argument(
         "--purge", action="store_true",
         help="check nothing, but erase every byte of deleted frames on this node now, without "
-        "waiting for SCENEPRINT_PURGE_S; their deletion cannot be undone afterwards",
+        "waiting for SCENEPRINT_PURGE_DEADLINE_S; their deletion cannot be undone afterwards",
     )  # fmt: skip
     command.add_argument(
         "--grace", type=whole_number, metavar="SECONDS",
@@ -145,7 +145,7 @@ def run_fsck(options: argparse.Namespace) -> int:
             tqdm.write(_line(finding))
     repaired = sum(each.done is not None for each in findings)
     if repaired:
-        kept_days = settings_of(options).audit_kept_days
+        kept_days = settings_of(options).audit_log_days
         with acting_as(COMMAND), open_command_store(settings_of(options)) as store:
             Audit(store, kept_days).record("store.repaired", options.map, repaired=repaired)
     if options.json is not None:

@@ -79,13 +79,18 @@ def require_writable(settings: Settings) -> None:
 
 
 def _enter(stack: ExitStack, settings: Settings) -> Context:
-    decoders: Decoders = LocalDecoders(settings.concurrency)
+    decoders: Decoders = LocalDecoders(settings.concurrent_requests)
     if settings.decoders > 0:  # the processes start with the first upload
         decoders = DecoderPool(
-            settings.decoders, settings.decoder_bytes, settings.decoder_s, current_tenant
+            settings.decoders,
+            settings.decoder_memory_bytes,
+            settings.decoder_timeout_s,
+            current_tenant,
         )
     with ExitStack() as opened:  # closed if a later step fails
-        store = open_store(settings.database, settings.blobs, settings.geometry_bytes, decoders)
+        store = open_store(
+            settings.database, settings.blobs, settings.geometry_cache_bytes, decoders
+        )
         opened.callback(store.close)
         server = not store.database.is_sqlite
         bell = Notices(store.database) if server else Wakeup(settings.bell_dir)

@@ -10,6 +10,7 @@ well, which select the frames that are compared. The database is the truth: dele
 loses nothing but the time to publish it again.
 """
 
+from sceneprint.index.index_manifest import manifests, newest_number, scrub
 from sceneprint.index.index_version import (
     IndexVersion,
     SearchHits,
@@ -20,7 +21,6 @@ from sceneprint.index.index_version import (
     search,
     signatures_of,
 )
-from sceneprint.index.index_manifest import manifests, newest_number, scrub
 
 __all__ = [
     "IndexVersion",

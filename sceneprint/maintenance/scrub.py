@@ -50,7 +50,7 @@ class Scrub:
 
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings, self._store = settings, store
-        self._budget = int(settings.scrub_mb_per_s * 1e6 * SLICE_S)
+        self._budget = int(settings.blob_check_mb_per_s * 1e6 * SLICE_S)
         self._next = time.monotonic() + BEGIN_S
 
     def run(

@@ -206,7 +206,7 @@ def list_changes(
 ) -> Page[AuditLine]:
     """List who changed what, and which requests were refused (401, 403), the newest first.
 
-    Lines are kept for `SCENEPRINT_AUDIT_KEPT_DAYS`, and at most a million of each tenant.
+    Lines are kept for `SCENEPRINT_AUDIT_LOG_DAYS`, and at most a million of each tenant.
     """
     return here.audit.page(AuditFilter(actor, map_name, action), cursor, limit)
 

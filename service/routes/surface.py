@@ -51,9 +51,9 @@ def get_surface(map_name: str, here: Here) -> MapSurface:
 def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
     """Build the surface of a map, or add what came since, now.
 
-    Workers do so by themselves as frames come, unless `SCENEPRINT_SURFACES` is `asked`. Ask under
-    `Location` until `state` is `ready`; the tiles that are there can be read meanwhile. It takes
-    the scope `write`.
+    Workers do so when frames arrive, unless `SCENEPRINT_BUILD_SURFACES` is `on_request`. Poll
+    `Location` until `state` is `ready`; existing tiles can be read meanwhile. It takes the scope
+    `write`.
     """
     surface, begun = here.surfaces.begin(map_name)
     response.headers["Location"] = f"/v1/maps/{map_name}/surface"

@@ -32,7 +32,7 @@ SIGNED = 4
 
 def settings_of(folder: Path) -> Settings:
     """Settings of a data folder, whatever the environment says; deletions are for good at once."""
-    return Settings(data_dir=folder, database_url=None, index_dir=None, undo_s=0)
+    return Settings(data_dir=folder, database_url=None, index_dir=None, undo_window_s=0)
 
 
 @pytest.fixture(scope="session")

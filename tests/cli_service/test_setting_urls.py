@@ -60,8 +60,10 @@ def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch: pytest.MonkeyPatch
 
 
 def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SCENEPRINT_UPLOAD_BYTES", str(SHARED_BYTES))
-    assert settings_of(argparse.Namespace()).upload_bytes == 536870912  # as the docs say
-    monkeypatch.setenv("SCENEPRINT_UPLOAD_BYTES", str(SHARED_BYTES + 1))
-    with pytest.raises(InvalidRequest, match=r"less than or equal to 536870912.*UPLOAD_BYTES\.$"):
+    monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(SHARED_BYTES))
+    assert settings_of(argparse.Namespace()).max_upload_bytes == 536870912  # as the docs say
+    monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(SHARED_BYTES + 1))
+    with pytest.raises(
+        InvalidRequest, match=r"less than or equal to 536870912.*MAX_UPLOAD_BYTES\.$"
+    ):
         settings_of(argparse.Namespace())

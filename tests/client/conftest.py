@@ -48,7 +48,7 @@ def _serving(data: Path) -> Iterator[str]:
         arguments = ["serve", "--port", "0", "--data", str(data), "--workers", "1"]
         process = subprocess.Popen(
             [sys.executable, "-m", "sceneprint", *arguments],
-            env={**os.environ, "SCENEPRINT_UPLOAD_BYTES": str(UPLOAD_BYTES)},  # its alone
+            env={**os.environ, "SCENEPRINT_MAX_UPLOAD_BYTES": str(UPLOAD_BYTES)},  # its alone
             stdout=subprocess.PIPE,
             stderr=log,
         )

@@ -62,8 +62,8 @@ def test_no_key_and_no_limit_whatever_the_environment_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in (
-        ("REQUIRE_KEYS", "1"), ("HOST", "0.0.0.0"), ("REQUESTS_PER_S", "0.1"), ("WAITING", "0"),
-        ("CORS_ORIGINS", "*"), ("UPLOAD_BYTES", "1024"),
+        ("REQUIRE_KEYS", "1"), ("HOST", "0.0.0.0"), ("TENANT_REQUESTS_PER_S", "0.1"),
+        ("QUEUED_REQUESTS", "0"), ("CORS_ORIGINS", "*"), ("MAX_UPLOAD_BYTES", "1024"),
     ):  # fmt: skip
         monkeypatch.setenv(f"SCENEPRINT_{name}", value)
     with Client.embedded(tmp_path) as client:
@@ -72,7 +72,7 @@ def test_no_key_and_no_limit_whatever_the_environment_says(
         assert client.me().name is None
         with pytest.raises(errors.UnreadableCloud):
             client.upload("m", b"ply\n" + bytes(4096))
-    assert embedded_settings(tmp_path).upload_bytes == 2 << 30  # more than a service may be given
+    assert embedded_settings(tmp_path).max_upload_bytes == 2 << 30  # more than a service may be given
 
 
 def test_closing_ends_streams_and_threads(tmp_path: Path) -> None:

@@ -122,7 +122,8 @@ def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
             [sys.executable, "-m", "sceneprint", "serve", "--port", str(port),
              "--data", str(data), "--workers", str(workers)],
             stdout=subprocess.PIPE, stderr=log, text=True,
-            env={**os.environ, "SCENEPRINT_SURFACES": "asked", "SCENEPRINT_JOINS": "asked"},
+            env={**os.environ, "SCENEPRINT_BUILD_SURFACES": "on_request",
+                 "SCENEPRINT_JOIN_SESSIONS": "on_request"},
         )  # fmt: skip
     assert process.stdout is not None
     try:

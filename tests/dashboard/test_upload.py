@@ -220,7 +220,7 @@ def test_five_hundred_files_and_a_service_that_asks_to_wait(
     open_page: Callable[..., Page], serve: Callable[..., Any], settle: Callable[[Page], None],
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any],
 ) -> None:  # fmt: skip
-    monkeypatch.setenv("SCENEPRINT_REQUESTS_PER_S", "2")  # of a key, and ten at once
+    monkeypatch.setenv("SCENEPRINT_TENANT_REQUESTS_PER_S", "2")  # of a key, and ten at once
     page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
     page.allowed.append("429")  # type: ignore[attr-defined]
     refused: list[str] = []

@@ -131,7 +131,7 @@ def test_parent_frames_are_associated_unasked(
     def look(*, auto: bool = True) -> list[NewAssociation]:
         """What a process asks for that looks for the first time."""
         before = {one.job_id for one in engine.associations.list_all("hall").items}
-        joins = {"joins": "auto" if auto else "asked"}
+        joins = {"join_sessions": "auto" if auto else "on_request"}
         settings = engine.settings.model_copy(update=joins)
         Housekeeping(replace(engine.context, settings=settings)).run()
         after = engine.associations.list_all("hall").items

@@ -138,7 +138,7 @@ def test_a_redundant_frame_goes_and_is_judged_anew_when_it_comes_again(
 def test_a_reader_that_missed_deletions_begins_anew(
     data: Path, make_engine: Make, uploads: Any, ids: Ids, tail_frames: int
 ) -> None:
-    reader, builder = (make_engine(data, tail_frames=tail_frames) for _ in range(2))
+    reader, builder = (make_engine(data, unindexed_frames=tail_frames) for _ in range(2))
     assert builder.publish_due() == (tail_frames == 3)
     names = ids(builder)
     assert found(reader, uploads) == sorted(names)
@@ -147,7 +147,7 @@ def test_a_reader_that_missed_deletions_begins_anew(
         builder.delete_frame("hall", name)
     assert after(builder, DAYS + 1) == 2
     left = sorted(set(names) - set(names[4:6]))
-    for engine in (reader, make_engine(data, tail_frames=tail_frames)):
+    for engine in (reader, make_engine(data, unindexed_frames=tail_frames)):
         assert found(engine, uploads) == left
         assert engine.view("hall")[2].size == 10
 
@@ -156,7 +156,7 @@ def test_an_index_is_published_before_it_would_be_too_old(
     data: Path, make_engine: Make, uploads: Any, ids: Ids
 ) -> None:
     """Of ten thousand frames, one deletion would else be no reason for a year."""
-    engine = make_engine(data, tail_frames=5, deleted_rows_days=DAYS)
+    engine = make_engine(data, unindexed_frames=5, deleted_rows_days=DAYS)
     assert engine.publish_due() == 1
     engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
     names = ids(engine)
@@ -166,11 +166,11 @@ def test_an_index_is_published_before_it_would_be_too_old(
         aged = frames.c.state == "deleted"
         old = time.time() - DAY_S * DAYS / 2 - 60
         connection.execute(update(frames).where(aged).values(ended_at=old))
-    late = make_engine(data, tail_frames=5, deleted_rows_days=DAYS)
+    late = make_engine(data, unindexed_frames=5, deleted_rows_days=DAYS)
     assert late.publish_due() == 1
     assert late.publish_due() == 0
     assert after(late, DAYS) == 1
-    version = make_engine(data, tail_frames=5).view("hall")[2].version
+    version = make_engine(data, unindexed_frames=5).view("hall")[2].version
     assert version is not None
     assert version.revision == pruned(late)
     assert found(late, uploads) == sorted(set(names) - {names[4]})
@@ -180,7 +180,7 @@ def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(
     data: Path, make_engine: Make, ids: Ids
 ) -> None:
     """On a node that was off meanwhile: its index is built anew, as nobody knows what went."""
-    engine = make_engine(data, tail_frames=11)
+    engine = make_engine(data, unindexed_frames=11)
     assert engine.publish_due() == 1
     engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
     for name in ids(engine)[:6]:

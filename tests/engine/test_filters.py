@@ -158,7 +158,7 @@ def ask(engine: Engine, own: Known, wanted: Filter, *, exact: bool = False) -> A
 @pytest.mark.parametrize("published", [False, True])
 def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: bool) -> None:
     """With a tail alone and with a version; frames come and go; another map is beside it."""
-    engine = make_engine(tail_frames=50)
+    engine = make_engine(unindexed_frames=50)
     for name in ("hall", "other"):
         engine.create_map(NewMap(name=name, model="depth"))
     frames = fill(engine, 120, 1)

@@ -49,14 +49,14 @@ def flip(path: Path, position: int) -> None:
 def test_a_flipped_byte_of_an_index_is_found_and_healed(
     data: Path, make_engine: Make, uploads: Any, kind: str
 ) -> None:
-    builder = make_engine(data, tail_frames=1, scrub_s=1)
+    builder = make_engine(data, unindexed_frames=1, index_check_interval_s=1)
     served = make_engine(data)  # holds the index open all the time
     wanted, _ = ask(make_engine(data), uploads)
     assert builder.publish_due() == 1
     assert ask(served, uploads) == (wanted, 1)
     (path,) = data.glob(f"index/hall-*/*.{kind}")
     flip(path, random.Random(kind).randrange(path.stat().st_size))
-    again = make_engine(data, tail_frames=1, scrub_s=1)
+    again = make_engine(data, unindexed_frames=1, index_check_interval_s=1)
     (data / "index" / ".scrubbed").unlink(missing_ok=True)  # it is time
     assert until_healed(again) == 1
     assert until_healed(again) == 0
@@ -71,19 +71,21 @@ def test_a_flipped_byte_of_an_index_is_found_and_healed(
 def test_who_scrubs_leaves_a_mark_and_nobody_else_does_for_a_while(
     data: Path, make_engine: Make
 ) -> None:
-    engine = make_engine(data, tail_frames=1, scrub_s=3600)  # which holds it open
+    engine = make_engine(
+        data, unindexed_frames=1, index_check_interval_s=3600
+    )  # which holds it open
     assert engine.publish_due() == 1
     (path,) = data.glob("index/hall-*/*.faiss")
     flip(path, path.stat().st_size - 5 * LENGTH)
     assert until_healed(engine) == 0
     (data / "index" / ".scrubbed").unlink()
-    assert until_healed(make_engine(data, tail_frames=1, scrub_s=3600)) == 1
+    assert until_healed(make_engine(data, unindexed_frames=1, index_check_interval_s=3600)) == 1
 
 
 def test_rebuilding_makes_the_same_index_from_nothing(
     data: Path, make_engine: Make, uploads: Any
 ) -> None:
-    engine = make_engine(data, tail_frames=1)
+    engine = make_engine(data, unindexed_frames=1)
     wanted, _ = ask(engine, uploads)
     assert engine.publish_due() == 1
     names = {path.name for path in data.glob("index/hall-*/*.faiss")}
@@ -130,7 +132,7 @@ def test_a_tail_in_a_file_is_as_one_in_memory(
 def test_a_damaged_index_is_read_once_and_not_with_every_query(
     data: Path, make_engine: Make, uploads: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert make_engine(data, tail_frames=1).publish_due() == 1
+    assert make_engine(data, unindexed_frames=1).publish_due() == 1
     (path,) = data.glob("index/hall-*/*.faiss")
     flip(path, path.stat().st_size - 5 * LENGTH)
     engine = make_engine(data)
@@ -147,7 +149,7 @@ def test_a_damaged_index_is_read_once_and_not_with_every_query(
 def test_what_is_out_of_reach_for_a_moment_is_not_removed(
     data: Path, make_engine: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert make_engine(data, tail_frames=1).publish_due() == 1
+    assert make_engine(data, unindexed_frames=1).publish_due() == 1
     (folder,) = data.glob("index/hall-*")
     before = sorted(path.name for path in folder.iterdir())
     real = Path.open

@@ -53,7 +53,7 @@ def pull():
         pull_map(client, store, "hall")
 
 def work():
-    given = {"database_url": None, "data_dir": folder, "undo_s": 0, "tail_frames": 1}
+    given = {"database_url": None, "data_dir": folder, "undo_window_s": 0, "unindexed_frames": 1}
     with Engine(Settings.model_validate(given)) as engine:
         ids = [one.frame_id for one in engine.list_frames("hall").items]
         say("begun")
@@ -118,7 +118,7 @@ def children(kind: str, folder: Path, service: Path, seed: int) -> Iterator[Chil
 
 
 def settings_of(folder: Path) -> Settings:
-    given = {"database_url": None, "data_dir": folder, "undo_s": 0, "tail_frames": 1}
+    given = {"database_url": None, "data_dir": folder, "undo_window_s": 0, "unindexed_frames": 1}
     return Settings.model_validate(given)
 
 

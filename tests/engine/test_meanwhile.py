@@ -93,7 +93,7 @@ def test_queries_beside_deletions_and_publishing_see_one_state(
 ) -> None:  # fmt: skip
     """Frames go one by one, from the last: every answer has the first n, rightly ranked."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-    engine, builder = make_engine(tail_frames=1), make_engine(tail_frames=1)
+    engine, builder = make_engine(unindexed_frames=1), make_engine(unindexed_frames=1)
     names = ids(full)
     whole = [(m.frame_id, m.distance) for m in full.query_frame("hall", names[0], R).matches]
     over, raised, sizes = threading.Event(), [], [[] for _ in range(4)]
@@ -140,7 +140,7 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
 ) -> None:  # fmt: skip
     """The version holds it, and readers have heard of its end but never of its beginning."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-    reader, builder = make_engine(tail_frames=5), make_engine(tail_frames=5)
+    reader, builder = make_engine(unindexed_frames=5), make_engine(unindexed_frames=5)
     names, publish = ids(full), index_upkeep.publish
     assert full.get_map("hall").revision == 12
     reader.query_frame("hall", names[0], R)
@@ -158,7 +158,7 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
     monkeypatch.setattr(index_upkeep, "publish", slowly)
     assert builder.publish_due() == 1
     full.delete_frame("hall", names[11])
-    for engine in (reader, make_engine(tail_frames=5)):
+    for engine in (reader, make_engine(unindexed_frames=5)):
         answer = engine.query_frame("hall", names[0], R)
         assert answer.index_version == 1
         assert answer.counts.map == answer.counts.ranked == len(answer.matches) == 10

@@ -33,7 +33,7 @@ def node(store_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
     def engine(name: str) -> Engine:
         values = {
             "data_dir": tmp_path / "data", "index_dir": tmp_path / name, "database_url": store_url,
-            "tail_frames": 10, "decoders": 0,
+            "unindexed_frames": 10, "decoders": 0,
         }  # fmt: skip
         (tmp_path / "data" / "blobs").mkdir(parents=True, exist_ok=True)
         opened.append(Engine(Settings.model_validate(values)))

@@ -252,7 +252,7 @@ def test_requests_are_remembered_for_a_day_and_their_keys_then_removed(make_engi
 
 
 def test_events_that_are_not_kept_go_and_no_index_is_doubted(data, make_engine):
-    engine = make_engine(data, events_kept=1000)
+    engine = make_engine(data, events_per_map=1000)
     engine.rebuild_index("hall")
     (anchor,) = anchors(engine.settings.indexes)
     seals = engine.store.seals

@@ -78,7 +78,7 @@ def places(engine: Engine, folder: Path, wanted: list[bytes]) -> set[str]:
 def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
     """A map whose index was published twice."""
     (tmp_path / "data" / "blobs").mkdir(parents=True)  # of a database that is there nobody makes it
-    given = {"database_url": store_url, "tail_frames": 2}
+    given = {"database_url": store_url, "unindexed_frames": 2}
     engine = make_engine(tmp_path / "data", **given)
     engine.create_map(NewMap(name="hall", model="depth"))
     for one in uploads[:6]:
@@ -243,7 +243,9 @@ def test_an_index_is_made_anew_by_one_process_and_then_rests(
 
     monkeypatch.setattr(index_upkeep, "publish", slow)
     monkeypatch.setattr(purge, "PAUSE", 1e4)
-    second = make_engine(tmp_path / "data", database_url=store_url, tail_frames=2, purge_s=1)
+    second = make_engine(
+        tmp_path / "data", database_url=store_url, unindexed_frames=2, purge_deadline_s=1
+    )
     workers = [
         Purging(
             one.store, one.upkeep, one.query_log, one.tombstones,

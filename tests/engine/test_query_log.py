@@ -358,12 +358,12 @@ def test_damaged_bytes_are_no_answer(engine):
 
 
 def test_nothing_is_stored_where_there_is_no_room_or_time(engine):
-    silent = log_of(engine, answer_days=0)
+    silent = log_of(engine, query_log_days=0)
     silent.note(row(1), stored())
-    roomless = log_of(engine, answer_bytes=0)
+    roomless = log_of(engine, query_log_bytes=0)
     roomless.note(row(2), stored())
     roomless.note(row(3, listed=False), stored())
-    small = log_of(engine, answer_bytes=1000)
+    small = log_of(engine, query_log_bytes=1000)
     small.note(row(4), stored(1000))  # would push out all, and not fit
     for one in (silent, roomless, small):
         assert one.flush(60)
@@ -372,7 +372,7 @@ def test_nothing_is_stored_where_there_is_no_room_or_time(engine):
 
 
 def test_the_oldest_answers_go_where_room_is_needed(engine):
-    log = log_of(engine, answer_bytes=30_000)
+    log = log_of(engine, query_log_bytes=30_000)
     names = [log_answer(engine, 1000, log, listed=i % 2 == 0) for i in range(40)]
     kept = names[39]
     log.keep(kept, None)
@@ -395,7 +395,7 @@ def test_the_oldest_answers_go_where_room_is_needed(engine):
 
 
 def test_room_is_made_while_answers_are_written(engine):
-    log = log_of(engine, answer_bytes=30_000)
+    log = log_of(engine, query_log_bytes=30_000)
     for _ in range(60):
         log_answer(engine, 1000, log)
     log.close()
@@ -507,13 +507,13 @@ def test_so_many_answers_are_kept(engine, monkeypatch):
     ids = [log_answer(engine) for _ in range(2)]
     monkeypatch.setattr(query_log, "MOST_KEPT", 1)
     engine.query_log.keep(ids[0], None)
-    with pytest.raises(QuotaExceeded, match="SCENEPRINT_ANSWER_BYTES"):
+    with pytest.raises(QuotaExceeded, match="SCENEPRINT_QUERY_LOG_BYTES"):
         engine.query_log.keep(ids[1], None)
     engine.query_log.keep(ids[0], "again")
     engine.query_log.release(ids[0])
     assert engine.query_log.keep(ids[1], None).kept_at is not None
     monkeypatch.setattr(query_log, "MOST_KEPT", 9)
-    small = log_of(engine, answer_bytes=3000)  # of which kept ones take half
+    small = log_of(engine, query_log_bytes=3000)  # of which kept ones take half
     with pytest.raises(QuotaExceeded):
         small.keep(ids[0], None)
 

@@ -51,7 +51,7 @@ def ask(engine: Engine, uploads: Any, which: int = 2, query: Query = ALL) -> Ans
 
 def truth(make: Make, uploads: Any, folder: Path, tmp_path: Path) -> list[tuple[str, int]]:
     """What an engine says that has no index and has held nothing before."""
-    fresh = make(folder, index_dir=tmp_path / "none", tail_frames=100_000)
+    fresh = make(folder, index_dir=tmp_path / "none", unindexed_frames=100_000)
     answer = ask(fresh, uploads)
     assert answer.index_version == 0
     return found(answer)
@@ -60,13 +60,13 @@ def truth(make: Make, uploads: Any, folder: Path, tmp_path: Path) -> list[tuple[
 def test_publishing_changes_no_answer(
     data: Path, make_engine: Make, uploads: Any, more: Any, ids: Ids
 ) -> None:
-    reader, builder = make_engine(data, tail_frames=5), make_engine(data, tail_frames=5)
+    reader, builder = make_engine(data, unindexed_frames=5), make_engine(data, unindexed_frames=5)
     for query in (ALL, Query()):
         ask(reader, uploads, query=query)
     before = [ask(reader, uploads, query=query) for query in (ALL, Query())]
     assert builder.publish_due() == 1
     assert builder.publish_due() == 0
-    fresh = make_engine(data, tail_frames=5)
+    fresh = make_engine(data, unindexed_frames=5)
     for engine in (reader, fresh):
         for query, old in zip((ALL, Query()), before, strict=True):
             new = ask(engine, uploads, query=query)
@@ -76,20 +76,20 @@ def test_publishing_changes_no_answer(
     gone = ids(reader)[3]
     builder.delete_frame("hall", gone)
     left = [pair for pair in found(before[0]) if pair[0] != gone]
-    for engine in (reader, fresh, make_engine(data, tail_frames=5)):
+    for engine in (reader, fresh, make_engine(data, unindexed_frames=5)):
         assert found(ask(engine, uploads)) == left  # at once, and whoever deleted it
     shutil.rmtree(data / "index")
-    for engine in (reader, fresh, make_engine(data, tail_frames=5)):
+    for engine in (reader, fresh, make_engine(data, unindexed_frames=5)):
         assert found(ask(engine, uploads)) == left
     assert builder.publish_due() == 1  # it sees that what it published is gone
-    assert make_engine(data, tail_frames=5).publish_due() == 0
+    assert make_engine(data, unindexed_frames=5).publish_due() == 0
 
 
 @pytest.mark.parametrize(("tail_frames", "published"), [(13, 0), (12, 0), (11, 1)])
 def test_an_index_is_due_beyond_so_many_frames(
     data: Path, make_engine: Make, tail_frames: int, published: int
 ) -> None:
-    assert make_engine(data, tail_frames=tail_frames).publish_due() == published
+    assert make_engine(data, unindexed_frames=tail_frames).publish_due() == published
 
 
 @pytest.mark.parametrize(("pause_s", "version"), [(1e9, 0), (0.0, 1)])
@@ -100,7 +100,7 @@ def test_a_newer_index_is_looked_for_from_time_to_time(
     monkeypatch.setattr(local_index, "_LOOK_S", pause_s)
     reader = make_engine(data)
     assert len(found(ask(reader, uploads))) == 12
-    assert make_engine(data, tail_frames=1).publish_due() == 1
+    assert make_engine(data, unindexed_frames=1).publish_due() == 1
     answer = ask(reader, uploads)
     assert len(found(answer)) == 12
     assert answer.index_version == version
@@ -109,10 +109,10 @@ def test_a_newer_index_is_looked_for_from_time_to_time(
 def test_readers_follow_a_map_through_versions(
     data: Path, make_engine: Make, uploads: Any, more: Any, ids: Ids, tmp_path: Path
 ) -> None:
-    first, builder = make_engine(data, tail_frames=3), make_engine(data, tail_frames=3)
+    first, builder = make_engine(data, unindexed_frames=3), make_engine(data, unindexed_frames=3)
     ask(first, uploads)
     assert builder.publish_due() == 1
-    late = make_engine(data, tail_frames=3)
+    late = make_engine(data, unindexed_frames=3)
     ask(late, uploads)
     for step in range(3):
         new = more(builder, 2)
@@ -120,7 +120,7 @@ def test_readers_follow_a_map_through_versions(
         builder.delete_frame("hall", new[0])  # before any index has it
         wanted = truth(make_engine, uploads, data, tmp_path)
         assert len(wanted) == 12  # two came, two went
-        for engine in (first, late, make_engine(data, tail_frames=3)):
+        for engine in (first, late, make_engine(data, unindexed_frames=3)):
             assert found(ask(engine, uploads)) == wanted
     assert builder.publish_due() == 1  # six deletions; of frames alone three were left to index
     new = more(builder, 3)
@@ -130,7 +130,7 @@ def test_readers_follow_a_map_through_versions(
     more(builder, 1)  # newer than the version: it stays in the tail
     builder.delete_frame("hall", new[0])  # in the version
     wanted = truth(make_engine, uploads, data, tmp_path)
-    for engine in (first, late, make_engine(data, tail_frames=3)):
+    for engine in (first, late, make_engine(data, unindexed_frames=3)):
         answer = ask(engine, uploads)
         assert (found(answer), answer.index_version) == (wanted, 3)
     more(builder, 3)
@@ -142,16 +142,16 @@ def test_readers_follow_a_map_through_versions(
 def test_a_map_made_anew_has_none_of_the_old_frames(
     data: Path, make_engine: Make, uploads: Any, work_off: WorkOff
 ) -> None:
-    reader, other = make_engine(data, tail_frames=5), make_engine(data, tail_frames=5)
+    reader, other = make_engine(data, unindexed_frames=5), make_engine(data, unindexed_frames=5)
     assert len(found(ask(reader, uploads))) == len(found(ask(other, uploads))) == 12
     assert other.publish_due() == 1
     other.delete_map("hall")
     other.create_map(NewMap(name="hall", model="depth"))
-    for engine in (reader, other, make_engine(data, tail_frames=5)):
+    for engine in (reader, other, make_engine(data, unindexed_frames=5)):
         assert found(ask(engine, uploads)) == []
     added, _ = other.add_frame("hall", uploads[7].data, uploads[7].meta)
     assert work_off(other) == [JobState.SUCCEEDED]
-    for engine in (reader, other, make_engine(data, tail_frames=5)):
+    for engine in (reader, other, make_engine(data, unindexed_frames=5)):
         answer = ask(engine, uploads, 7)
         assert found(answer) == [(added.frame_id, 0)]
         assert answer.index_version == 0

@@ -93,7 +93,7 @@ def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
     make_engine: Make, paper_folder: Path, uploads: Any, work_off: WorkOff, tmp_path: Path
 ) -> None:
     shutil.copytree(paper_folder, tmp_path / "old")
-    engine = make_engine(tmp_path / "old", tail_frames=1)
+    engine = make_engine(tmp_path / "old", unindexed_frames=1)
 
     def ranked(metric: Metric) -> list[tuple[str, int]]:
         """What a naive scan of the rows says of the fifth frame."""

@@ -233,7 +233,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-    engine, names = make_engine(full.settings.data_dir, tail_frames=5), ids(full)
+    engine, names = make_engine(full.settings.data_dir, unindexed_frames=5), ids(full)
     assert engine.publish_due() == 1
     before = index_folder(engine.settings.indexes, engine.row("hall"))
     engine.reencode("hall", small_file)
@@ -258,7 +258,7 @@ def test_an_index_that_cannot_be_written_does_not_hold_the_switch_up(
 ) -> None:  # fmt: skip
     (tmp_path / "file").write_text("in the way")
     nowhere = tmp_path / "file" / "index"
-    engine = make_engine(full.settings.data_dir, tail_frames=5, index_dir=nowhere)
+    engine = make_engine(full.settings.data_dir, unindexed_frames=5, index_dir=nowhere)
     switch(engine, small_file, work_off)
     answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
     assert (answer.index_version, answer.counts.map) == (0, 12)
@@ -270,7 +270,7 @@ def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """A frame that could not be signed when the index was published, and was before the switch."""
-    engine, names = make_engine(full.settings.data_dir, tail_frames=5), ids(full)
+    engine, names = make_engine(full.settings.data_dir, unindexed_frames=5), ids(full)
     engine.reencode("hall", small_file)
     blind = engine.claim("w")
     assert blind is not None
@@ -415,7 +415,7 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
     answer = full.queries.upload(["hall"], uploads[7].data, uploads[7].meta, R)
     assert found(answer) == right(names, by_model, label, 7)
     due_now(full)
-    other = make_engine(full.settings.data_dir, tail_frames=5)
+    other = make_engine(full.settings.data_dir, unindexed_frames=5)
     work_off(other)
     for _ in range(2):
         other.publish_due()

@@ -170,7 +170,7 @@ def test_who_passes_a_damaged_signature_over_has_it_made_again(
     # now by whoever publishes an index
     other = ids(full)[4]
     damage_signature(full, other)
-    assert make_engine(tail_frames=1).publish_due() == 1
+    assert make_engine(unindexed_frames=1).publish_due() == 1
     assert [job.frame_number for job in waiting(full)] == [number_of(full, other)]
     assert work_off(full) == [JobState.SUCCEEDED]
     answer = make_engine().queries.upload(["hall"], uploads[4].data, uploads[4].meta, ask)

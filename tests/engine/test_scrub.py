@@ -29,7 +29,7 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _scrub(engine: Engine, rate: float = 1.0) -> Scrub:
-    settings = engine.settings.model_copy(update={"scrub_mb_per_s": rate})
+    settings = engine.settings.model_copy(update={"blob_check_mb_per_s": rate})
     return Scrub(settings, engine.store)
 
 
@@ -166,7 +166,7 @@ def test_two_workers_do_not_read_the_same_slice(full: Engine) -> None:
 def test_none_is_read_where_it_is_switched_off(full: Engine) -> None:
     assert _scrub(full, 0.0).run(now=True) is None
     assert _row(full) is None
-    assert Settings.model_fields["scrub_mb_per_s"].default == 1.0
+    assert Settings.model_fields["blob_check_mb_per_s"].default == 1.0
 
 
 @pytest.mark.parametrize(

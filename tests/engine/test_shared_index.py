@@ -61,7 +61,7 @@ def host(make_engine: Make, store_url: str, place: str, tmp_path: Path) -> Calla
     def make(name: str, **more: object) -> Engine:
         given = {
             "database_url": store_url, "blob_url": f"file://{tmp_path}/common",
-            "index_url": place, "tail_frames": 2, "undo_s": 0,
+            "index_url": place, "unindexed_frames": 2, "undo_window_s": 0,
         }  # fmt: skip
         return make_engine(tmp_path / name, **{**given, **more})
 
@@ -163,7 +163,9 @@ def test_a_host_goes_on_from_what_another_built(
 def append(place: str) -> Callable[..., IndexVersion]:
     """Publish and share signatures that no frame has, as the next version of map "hall"."""
 
-    def run(engine: Engine, n: int, drop: frozenset[int] = frozenset(), **more: Any) -> IndexVersion:
+    def run(
+        engine: Engine, n: int, drop: frozenset[int] = frozenset(), **more: Any
+    ) -> IndexVersion:
         row, folder = row_of(engine), folder_of(engine)
         previous = newest(folder, row.model_id, 448)
         first = 0 if previous is None else int(previous.keys[-1]) + 1
@@ -264,7 +266,7 @@ def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
     host: Callable[..., Engine], append: Any
 ) -> None:
     """The version is another each time, and the segment the same."""
-    one, service = host("one"), host("two", purge_s=1)
+    one, service = host("one"), host("two", purge_deadline_s=1)
     one.create_map(NewMap(name="hall", model="depth"))
     append(one, 100)
     left = []
@@ -332,7 +334,7 @@ def test_a_restored_database_is_not_given_what_came_after(
     make_engine: Make, tmp_path: Path, fill: Any, uploads: Any, put_back: Any
 ) -> None:
     """Put back to two frames, the database gives the numbers of the next three out again."""
-    given: dict[str, Any] = {"index_url": f"file://{tmp_path}/shared", "tail_frames": 2}
+    given: dict[str, Any] = {"index_url": f"file://{tmp_path}/shared", "unindexed_frames": 2}
     data, kept = tmp_path / "data", tmp_path / "kept"
     engine = make_engine(data, **given)
     engine.create_map(NewMap(name="hall", model="depth"))
@@ -371,7 +373,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
     built: Engine, host: Callable[..., Engine], uploads: Any, ids: Any, place: str, tmp_path: Path
 ) -> None:
     """In the store, on the host that publishes, on one with workers, and on one without."""
-    other, service = host("two"), host("three", purge_s=1)
+    other, service = host("two"), host("three", purge_deadline_s=1)
     for engine in (other, service):
         ask(engine, uploads)
         shared(engine).finish()
@@ -403,7 +405,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
 def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(
     built: Engine, host: Callable[..., Engine], uploads: Any, ids: Any
 ) -> None:
-    service = host("two", purge_s=1)
+    service = host("two", purge_deadline_s=1)
     ask(service, uploads)
     shared(service).finish()
     built.delete_frame("hall", ids(built)[0])
@@ -433,7 +435,7 @@ def test_a_number_of_an_index_that_was_emptied_is_not_used_again(
 def test_nothing_is_shared_of_maps_that_are_gone(
     built: Engine, fill: Any, place: str, host: Callable[..., Engine], uploads: Any
 ) -> None:
-    service = host("two", purge_s=1)
+    service = host("two", purge_deadline_s=1)
     built.create_map(NewMap(name="other", model="depth"))
     fill(built, range(4, 8), "other")
     assert built.publish_due() == 1
@@ -486,7 +488,8 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
 ) -> None:  # fmt: skip
     (tmp_path / "common" / "blobs").mkdir(parents=True)
     given: dict[str, Any] = {
-        "database_url": postgres_url, "blob_url": f"file://{tmp_path}/common", "tail_frames": 2,
+        "database_url": postgres_url, "blob_url": f"file://{tmp_path}/common",
+        "unindexed_frames": 2,
     }  # fmt: skip
     with monkeypatch.context() as away:
         away.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # where nobody listens
@@ -512,7 +515,7 @@ def test_room_is_made_of_indexes_that_nobody_uses(
     fill(built, range(4), "other")
     assert built.publish_due() == 1
     one = sum(path.stat().st_size for path in folder_of(built).glob("*.*"))
-    node = host("two", index_bytes=one + one // 2)
+    node = host("two", index_cache_bytes=one + one // 2)
     ask(node, uploads)
     shared(node).finish()
     ago = time.time() - idle_s

@@ -281,7 +281,7 @@ def test_without_time_to_undo_a_deletion_is_for_good(
     full: Engine, make_engine: Callable[..., Engine]
 ) -> None:
     names, blobs = list(frames(full)), len(list(full.store.blobs.digests()))
-    never = make_engine(undo_s=0)
+    never = make_engine(undo_window_s=0)
     done = delete(never, names[:1])
     assert (done.frames, done.deletion) == (1, None)
     assert len(list(full.store.blobs.digests())) == blobs - 2

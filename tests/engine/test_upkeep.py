@@ -36,25 +36,25 @@ def test_an_index_of_a_history_that_was_undone_is_not_believed(
 ) -> None:
     """Put back to two frames, the database gives the numbers of the next three out again."""
     data, kept = tmp_path / "data", tmp_path / "kept"
-    engine = make_engine(data, tail_frames=2)
+    engine = make_engine(data, unindexed_frames=2)
     engine.create_map(NewMap(name="hall", model="depth"))
     fill(engine, uploads, work_off, range(2))
     engine.close()
     shutil.copytree(data, kept)
     make_engine(kept).close()
-    engine = make_engine(data, tail_frames=2)
+    engine = make_engine(data, unindexed_frames=2)
     fill(engine, uploads, work_off, range(2, 5))
     assert engine.publish_due() == 1
     engine.close()
     put_back(kept, data)
-    engine = make_engine(data, tail_frames=2)
+    engine = make_engine(data, unindexed_frames=2)
     names = fill(engine, uploads, work_off, range(5, 8))
     for name, i in zip(names, range(5, 8), strict=True):
         answer = engine.queries.upload(["hall"], uploads[i].data, uploads[i].meta, ALL)
         assert (answer.index_version, answer.counts.map) == (0, 5)
         assert (answer.matches[0].frame_id, answer.matches[0].distance) == (name, 0)
     assert engine.publish_due() == 1  # anew, from nothing
-    for fresh in (engine, make_engine(data, tail_frames=2)):
+    for fresh in (engine, make_engine(data, unindexed_frames=2)):
         answer = fresh.queries.upload(["hall"], uploads[5].data, uploads[5].meta, ALL)
         assert (answer.matches[0].frame_id, answer.matches[0].distance) == (names[0], 0)
         assert answer.counts.map == 5
@@ -65,7 +65,7 @@ def test_an_index_that_cannot_be_written_costs_no_frame(
     make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path, caplog: Any
 ) -> None:
     (tmp_path / "file").write_text("in the way")
-    engine = make_engine(index_dir=tmp_path / "file" / "index", tail_frames=1)
+    engine = make_engine(index_dir=tmp_path / "file" / "index", unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="depth"))
     names = fill(engine, uploads, work_off, range(3))
     assert engine.publish_due() == 0
@@ -79,7 +79,7 @@ def test_an_index_that_cannot_be_written_costs_no_frame(
 def test_indexes_of_deleted_maps_are_removed_and_nothing_else(
     make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path
 ) -> None:
-    engine = make_engine(tail_frames=1)
+    engine = make_engine(unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="depth"))
     fill(engine, uploads, work_off, range(3))
     assert engine.publish_due() == 1
@@ -139,13 +139,13 @@ def test_an_index_is_published_by_what_it_lacks_however_large(
     data: Path, make_engine: Make, uploads: Any, work_off: Any
 ) -> None:
     """Twelve frames, and deletions one after the other: each second one is published."""
-    engine = make_engine(data, tail_frames=1)
+    engine = make_engine(data, unindexed_frames=1)
     assert engine.publish_due() == 1
     names = [one.frame_id for one in engine.list_frames("hall").items]
     due = []
     for name in names[:4]:
         engine.delete_frame("hall", name)
-        other = make_engine(data, tail_frames=1)  # who knows nothing of the index
+        other = make_engine(data, unindexed_frames=1)  # who knows nothing of the index
         due.append((engine.publish_due(), other.publish_due()))
     assert due == [(0, 0), (1, 0), (0, 0), (1, 0)]
     answer = engine.queries.upload(["hall"], uploads[11].data, uploads[11].meta, ALL)
@@ -156,7 +156,7 @@ def test_a_worker_reads_a_file_of_an_index_once(
     make_engine: Make, uploads: Any, work_off: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To read a large index for each of many small publications would cost more than to write."""
-    engine, read = make_engine(tail_frames=1), list[str]()
+    engine, read = make_engine(unindexed_frames=1), list[str]()
     engine.create_map(NewMap(name="hall", model="depth"))
 
     def noted(folder: Path, name: str, size: int) -> Iterator[None]:
@@ -171,7 +171,7 @@ def test_a_worker_reads_a_file_of_an_index_once(
     fill(engine, uploads, work_off, range(6, 8))
     assert engine.publish_due() == 1
     assert read == []
-    other = make_engine(tail_frames=1)
+    other = make_engine(unindexed_frames=1)
     fill(other, uploads, work_off, range(8, 11))
     assert other.publish_due() == 1
     assert sorted(name.rpartition(".")[2] for name in read) == ["faiss", "faiss", "keys", "keys"]
@@ -182,7 +182,7 @@ def test_a_worker_reads_a_file_of_an_index_once(
 def test_purging_removes_what_a_publication_had_only_marked(
     make_engine: Make, uploads: Any, work_off: Any
 ) -> None:
-    engine = make_engine(tail_frames=1, undo_s=0)
+    engine = make_engine(unindexed_frames=1, undo_window_s=0)
     engine.create_map(NewMap(name="hall", model="depth"))
     names = fill(engine, uploads, work_off, range(12))
     assert engine.publish_due() == 1
@@ -199,7 +199,7 @@ def test_purging_removes_what_a_publication_had_only_marked(
     assert engine.purging.now().indexes == 1
     assert all(row not in one.read_bytes() for one in folder.iterdir())
     assert engine.purging.now().indexes == 0
-    fresh = make_engine(tail_frames=1)
+    fresh = make_engine(unindexed_frames=1)
     answer = fresh.queries.upload(["hall"], uploads[5].data, uploads[5].meta, ALL)
     assert (answer.counts.map, answer.index_version) == (10, 3)
 
@@ -208,7 +208,7 @@ def test_purging_writes_an_index_again_whose_keys_are_damaged(
     make_engine: Make, uploads: Any, work_off: Any
 ) -> None:
     """Nobody knows any more whether it holds the frame."""
-    engine = make_engine(tail_frames=1, undo_s=0)
+    engine = make_engine(unindexed_frames=1, undo_window_s=0)
     engine.create_map(NewMap(name="hall", model="depth"))
     names = fill(engine, uploads, work_off, range(4))
     assert engine.publish_due() == 1
@@ -228,7 +228,7 @@ def test_purging_writes_an_index_again_whose_keys_are_damaged(
 def test_maps_of_whole_fisher_vectors_have_no_index(
     make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path
 ) -> None:
-    engine = make_engine(tail_frames=1)
+    engine = make_engine(unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="paper"))
     names = fill(engine, uploads, work_off, range(3))
     assert engine.publish_due() == 0
@@ -243,13 +243,13 @@ def test_a_model_of_another_version_keeps_its_index(
     make_engine: Make, uploads: Any, work_off: Any
 ) -> None:
     """Who made it looks after it."""
-    engine = make_engine(tail_frames=1)
+    engine = make_engine(unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="depth"))
     fill(engine, uploads, work_off, range(3))
     assert engine.publish_due() == 1
     (folder,) = engine.settings.indexes.glob("hall*")
     with engine.store.database.write() as connection:
         connection.execute(update(models).values(content=b"of another version"))
-    other = make_engine(tail_frames=1)
+    other = make_engine(unindexed_frames=1)
     assert other.publish_due() == 0
     assert len(list(folder.glob("*.json"))) == 1

@@ -13,7 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.index import IndexVersion, Tail, newest, newest_number, publish, search, signatures_of
+from sceneprint.index import (
+    IndexVersion,
+    Tail,
+    newest,
+    newest_number,
+    publish,
+    search,
+    signatures_of,
+)
 from sceneprint.types import Bytes
 
 LENGTH, STEP = 512, 25

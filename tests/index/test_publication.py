@@ -272,9 +272,7 @@ def test_an_emptied_folder_is_noticed(walk: Walk, published: Publish, tmp_path: 
     assert holds(first, frames_of(np.arange(10), signatures[:10]))
 
 
-def test_mistakes_leave_the_version_before(
-    walk: Walk, published: Publish, tmp_path: Path
-) -> None:
+def test_mistakes_leave_the_version_before(walk: Walk, published: Publish, tmp_path: Path) -> None:
     folder, signatures = tmp_path / "map", walk(20)
     first = published(np.arange(10), signatures[:10])
     before = files(folder)

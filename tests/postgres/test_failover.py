@@ -62,7 +62,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -
     hosts = f"host=127.0.0.1:{primary.port}&host=127.0.0.1:{standby.port}"
     url = f"postgresql+psycopg://postgres@/fleet?{hosts}&target_session_attrs=read-write"
     settings = {"DATABASE_URL": url, "DATA_DIR": str(folder / "data"), "PORT": "0", "WORKERS": "1",
-                "LEASE_S": "4"}  # fmt: skip
+                "JOB_LEASE_S": "4"}  # fmt: skip
     errors = folder / "errors"
     with errors.open("wb") as log:
         process = subprocess.Popen(

@@ -71,7 +71,7 @@ def primary(place: Path) -> Iterator[Server]:
 
 
 def settings_of(url: str, data: Path) -> Settings:
-    given = {"database_url": url, "data_dir": data, "undo_s": 0, "tail_frames": 1}
+    given = {"database_url": url, "data_dir": data, "undo_window_s": 0, "unindexed_frames": 1}
     return Settings.model_validate(given)
 
 

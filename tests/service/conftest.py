@@ -325,7 +325,7 @@ def walled(starter: Callable[..., Server], folder_stack: ExitStack) -> Walled:
         "admin": {"alpha": "admin"}, "writer": {"alpha": "write"}, "reader": {"alpha": "read"},
     }  # fmt: skip
     begin = partial(starter, folder_stack)
-    return _walled(begin, keys, requests_per_s=0, failed_keys_per_minute=0)
+    return _walled(begin, keys, tenant_requests_per_s=0, wrong_keys_per_minute=0)
 
 
 @dataclass
@@ -360,7 +360,12 @@ def _opened(
     folder: Path, url: str | None, keys: Mapping[str, Mapping[str, Scope]], **more: object
 ) -> Iterator[House]:
     (folder / "blobs").mkdir()
-    given = {"data_dir": folder, "database_url": url, "require_keys": True, "requests_per_s": 0}
+    given = {
+        "data_dir": folder,
+        "database_url": url,
+        "require_keys": True,
+        "tenant_requests_per_s": 0,
+    }
     app = create_app(Settings.model_validate(given | more))
     with (
         start_blocking_portal() as portal,

@@ -161,7 +161,7 @@ def test_no_kill_separates_a_change_its_event_and_its_line(
 ) -> None:  # fmt: skip
     data, rng = tmp_path / "data", random.Random(kills)
     url = f"sqlite:///{data}/sceneprint.db"
-    settings: dict[str, Any] = {"requests_per_s": 0}
+    settings: dict[str, Any] = {"tenant_requests_per_s": 0}
     if kind == "postgresql":
         url = settings["database_url"] = request.getfixturevalue("postgres_url")
         (data / "blobs").mkdir(parents=True)  # of a database that is there, they should be too

@@ -20,7 +20,7 @@ LIMIT = 100_000
 @pytest.fixture(scope="module")
 def narrow(begin, make_map):
     """A server that takes few bytes, and no worker: what it stores stays as it came."""
-    server = begin("--workers", "0", upload_bytes=LIMIT)
+    server = begin("--workers", "0", max_upload_bytes=LIMIT)
     make_map(server, "hall")
     return server
 

@@ -76,7 +76,7 @@ def opened(monkeypatch, request, certificate) -> Iterator[Callable[..., socket.s
     monkeypatch.setattr(connections, "HEAD_S", 0.8)
     monkeypatch.setattr(connections, "READING_S", 1.0)
     monkeypatch.setattr(limits, "IDLE_S", 0.8)
-    settings = Settings(body_s=1, upload_bytes=1 << 20, cors_origins=())
+    settings = Settings(body_timeout_s=1, max_upload_bytes=1 << 20, cors_origins=())
     made: list[socket.socket] = []
     with running(RequestMiddleware(app, settings, Origins(()), Metrics()), context) as address:
 

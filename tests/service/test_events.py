@@ -22,7 +22,7 @@ STREAM = {"Accept": "text/event-stream"}
 @pytest.fixture(scope="module")
 def guarded(begin):
     """A server that asks for keys and keeps two streams."""
-    server = begin("--host", "0.0.0.0", "--workers", "0", event_streams=2)
+    server = begin("--host", "0.0.0.0", "--workers", "0", max_event_streams=2)
     server.client.base_url = server.url.replace("0.0.0.0", "127.0.0.1")
     return server
 

@@ -101,14 +101,14 @@ MOUNT = "mount -t tmpfs -o size=24m tmpfs $0 && exec $1 serve --port 0 --data $0
 @pytest.fixture(params=[pytest.param(Mounted, marks=pytest.mark.thorough), Limited])
 def narrow(request, begin, tmp_path):
     if request.param is Limited:
-        return Limited(begin(folder=tmp_path / "data", lease_s=3))
+        return Limited(begin(folder=tmp_path / "data", job_lease_s=3))
     how = mountable()
     if how is None:
         pytest.skip("no disk can be mounted here; the other case needs none")
     folder = tmp_path / "disk"
     folder.mkdir()
     script = ("sh", "-c", MOUNT, str(folder), str(BIN / "sceneprint"))
-    return Mounted(begin(folder=folder, command=("unshare", *how, *script), lease_s=3))
+    return Mounted(begin(folder=folder, command=("unshare", *how, *script), job_lease_s=3))
 
 
 def tree(folder: Path) -> set[str]:
@@ -168,7 +168,7 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
 @pytest.fixture(scope="module")
 def kept(begin, make_map, small_shots):
     """A service with three indexed frames, that works on one thing at a time and lets few wait."""
-    server = begin(concurrency=1, waiting=2)
+    server = begin(concurrent_requests=1, queued_requests=2)
     path = make_map(server, "hall")
     for shot in small_shots[:3]:
         sent = server.client.post(f"{path}/frames", **shot.form(), headers=WAIT)

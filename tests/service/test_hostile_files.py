@@ -30,7 +30,7 @@ def meta_of(shot: Any) -> FrameMeta:
 def stored(small_shots, tmp_path_factory) -> Path:
     """A folder whose map has two versions, of three and of six frames, and three frames more."""
     folder = tmp_path_factory.mktemp("stored") / "data"
-    with opened(folder, tail_frames=2) as engine:
+    with opened(folder, unindexed_frames=2) as engine:
         engine.create_map(NewMap(name="hall", model="depth"))
         for number, shot in enumerate(small_shots[:9]):
             engine.add_frame("hall", shot.png, meta_of(shot))
@@ -62,7 +62,7 @@ def nearest(server, frame_id: str) -> dict[str, Any]:
 def test_blobs_that_are_missing_cost_what_needs_them(
     folder, begin, small_shots, refused, rows, monkeypatch
 ):
-    monkeypatch.setenv("SCENEPRINT_GEOMETRY_BYTES", "0")  # of which none is in memory
+    monkeypatch.setenv("SCENEPRINT_GEOMETRY_CACHE_BYTES", "0")  # of which none is in memory
     server = begin("--workers", "0", folder=folder)
     frames = [one["frame_id"] for one in server.client.get(f"{HALL}/frames").json()["items"]]
     asked = "SELECT s.geometry FROM signatures s JOIN frames f ON f.number = s.frame_number"

@@ -100,7 +100,7 @@ def test_what_is_wrong_is_said_at_the_door(served, yard, small_shots, refused) -
 
 
 def test_an_archive_has_a_limit_of_its_own(begin, make_map, small_shots, refused) -> None:
-    server = begin(upload_bytes=20_000, import_bytes=60_000, workers=0)
+    server = begin(max_upload_bytes=20_000, max_import_bytes=60_000, workers=0)
     path = make_map(server, "yard")
     small = zipped(small_shots[:3])
     assert 20_000 < len(small) < 60_000

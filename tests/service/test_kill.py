@@ -85,7 +85,7 @@ def test_no_kill_loses_what_was_acknowledged(
     for moment in moments:
         for _ in range(FRAMES_A_KILL):
             uploader.leave.release()
-        server = begin(folder=tmp_path, wait=moment != "starts", lease_s=1)
+        server = begin(folder=tmp_path, wait=moment != "starts", job_lease_s=1)
         uploader.url = server.url
         if moment == "starts":
             time.sleep(rng.uniform(0.2, 3))
@@ -105,7 +105,7 @@ def test_no_kill_loses_what_was_acknowledged(
         server.gone()
         in_hand += len(rows(tmp_path, "SELECT 1 FROM jobs WHERE state = 'running'"))
 
-    server = begin(folder=tmp_path, lease_s=1)
+    server = begin(folder=tmp_path, job_lease_s=1)
     uploader.url = server.url
     until(lambda: not uploader.is_alive())
     pending = "SELECT 1 FROM jobs WHERE state IN ('queued', 'running') LIMIT 1"

@@ -69,7 +69,7 @@ def test_workers_whose_service_was_killed_leave_by_themselves(begin):
 def test_a_worker_that_dies_is_replaced_and_its_frame_signed(
     begin, make_map, shots, until, signing
 ):
-    server = begin(lease_s=1)
+    server = begin(job_lease_s=1)
     server.ready()
     path = make_map(server, "hall", model="paper")
     sent = server.client.post(f"{path}/frames", **shots[0].form()).json()

@@ -16,7 +16,7 @@ from benchmarks.waiting import PATIENCE_S
 @pytest.fixture(scope="module")
 def busy(begin, make_map, small_shots):
     """A server that works on one thing at a time, lets one wait, and has a map of two frames."""
-    server = begin(concurrency=1, waiting=1, body_s=3)
+    server = begin(concurrent_requests=1, queued_requests=1, body_timeout_s=3)
     path = make_map(server, "hall")
     for shot in small_shots[:2]:
         sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=200"})
@@ -137,7 +137,7 @@ def test_slow_uploads_hold_their_places_for_a_while_and_no_queries(busy, small_s
 
 
 def test_where_none_may_wait_one_is_still_worked_on(begin, make_map, small_shots):
-    server = begin("--workers", "0", concurrency=1, waiting=0)
+    server = begin("--workers", "0", concurrent_requests=1, queued_requests=0)
     path = make_map(server, "hall")
     sent = [server.client.post(f"{path}/frames", **shot.form()) for shot in small_shots[:3]]
     assert [answer.status_code for answer in sent] == [202, 202, 202]

@@ -174,7 +174,7 @@ def test_bodies_that_are_still_read_take_places_among_their_like(inside, kind, o
             after = Asked(app, "/v1/maps/a/queries", JSON, [b'{"frame_id": "a"}'])
             assert (await after.problem())["type"] == "/problems/unknown-map"
 
-    inside(test, concurrency=1, waiting=2)
+    inside(test, concurrent_requests=1, queued_requests=2)
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_where_there_is_no_room_to_read_nothing_is_taken(
             assert (problem["status"], problem["type"]) == (status, f"/problems/{kind}")
             assert "folder" not in problem["detail"]
 
-    inside(test, concurrency=1, waiting=0)
+    inside(test, concurrent_requests=1, queued_requests=0)
     told = [one for one in caplog.records if one.message == "request failed"]
     assert ["no room in /the/folder" in str(vars(one)["error"]) for one in told] == [True] * 3
 

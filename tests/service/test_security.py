@@ -26,7 +26,7 @@ def held(wall):
     """A server that soon has enough of a caller, and lets the pages of one origin ask."""
     return wall(
         {"robot": {"hall": "write"}}, "--workers", "0", "--host", "127.0.0.1", require_keys=True,
-        requests_per_s=0.02, failed_keys_per_minute=2, cors_origins=FLEET,
+        tenant_requests_per_s=0.02, wrong_keys_per_minute=2, cors_origins=FLEET,
     )  # fmt: skip
 
 
@@ -218,8 +218,8 @@ def test_no_body_is_waited_for_of_who_asks_too_often(held):
 
 def test_one_key_does_not_take_every_place(walled, refused, until):
     """It holds back the bodies of as many queries as it may have in hand."""
-    defaults = Settings(concurrency=max(os.cpu_count() or 1, 2))
-    most = 3 * (defaults.concurrency + defaults.waiting) // 4
+    defaults = Settings(concurrent_requests=max(os.cpu_count() or 1, 2))
+    most = 3 * (defaults.concurrent_requests + defaults.queued_requests) // 4
     url = httpx.URL(walled.server.url)
     head = (
         "POST /v1/maps/alpha/queries HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n"

@@ -51,7 +51,9 @@ class Clock:
 @pytest.fixture(scope="module")
 def shared(wall):
     """A service with two keys of one tenant, and one of another."""
-    held = wall({"victim": {"*": "admin"}}, "--workers", "0", event_streams=8, requests_per_s=0)
+    held = wall(
+        {"victim": {"*": "admin"}}, "--workers", "0", max_event_streams=8, tenant_requests_per_s=0
+    )
     with Engine(Settings(data_dir=held.server.folder, database_url=None)) as engine:
         create_tenant(engine.store, "noisy")
         for name in ("one", "two"):

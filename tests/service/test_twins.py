@@ -204,7 +204,7 @@ def both(tmp_path_factory, small_shots, small_model, postgres, open_house) -> li
     with ExitStack() as stack:
         for busy, url in ((False, None), (True, None), (True, server)):
             folder = tmp_path_factory.mktemp("twin")
-            house = stack.enter_context(open_house(folder, url, KEYS, events_kept=1000))
+            house = stack.enter_context(open_house(folder, url, KEYS, events_per_map=1000))
             one = Twin(house, small_shots, busy)
             for name in ("bravo", "alpha"):
                 one.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})

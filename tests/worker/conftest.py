@@ -116,7 +116,7 @@ def hire(tmp_path_factory) -> Callable[..., AbstractContextManager[Crew]]:
 
 @pytest.fixture(scope="module")
 def crew(hire) -> Iterator[Crew]:
-    with hire([f"{Path(sys.executable).parent}/sceneprint", "work"], lease_s=LEASE_S) as crew:
+    with hire([f"{Path(sys.executable).parent}/sceneprint", "work"], job_lease_s=LEASE_S) as crew:
         yield crew
         crew.process.terminate()
         assert crew.process.wait(PATIENCE_S) == 0

@@ -60,7 +60,7 @@ def script(tmp_path_factory) -> list[str]:
 
 @pytest.fixture(scope="module")
 def crew(hire, script) -> Iterator[Any]:
-    with hire(script, job_s=6, worker_bytes=512 << 20) as crew:
+    with hire(script, job_timeout_s=6, worker_memory_bytes=512 << 20) as crew:
         crew.engine.create_map(NewMap(name="hall", model="depth"))
         yield crew
 

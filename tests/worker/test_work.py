@@ -56,7 +56,9 @@ def test_a_job_that_takes_many_leases_is_kept_by_its_worker(crew, slow):
     job = slow("patient", 40)
     holder, job_id = crew.pid(job.added.job_id), job.added.job_id
     (first,) = crew.job(job_id, "leased_until")
-    until(lambda: crew.job(job_id, "leased_until")[0] > first + 4 * crew.engine.settings.lease_s)
+    until(
+        lambda: crew.job(job_id, "leased_until")[0] > first + 4 * crew.engine.settings.job_lease_s
+    )
     assert crew.job(job_id, "state, attempts, token") == ("running", 1, 1)
     job.give()
     crew.settled("patient", 1)

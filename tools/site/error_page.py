@@ -22,8 +22,8 @@ REMEDIES: dict[type[SceneprintError], str] = {
     errors.UnreadableArchive: "Send a ZIP or TAR archive of a folder of frames.",
     errors.NotFound: "Check the name or id. A key sees only what it may read.",
     errors.UnknownQuery: "Repeat the query, or keep answers that you look at later.",
-    errors.UnknownDeletion: "Deletions can be undone for `SCENEPRINT_UNDO_S` seconds. Upload the "
-    "frames again.",
+    errors.UnknownDeletion: "Deletions can be undone for `SCENEPRINT_UNDO_WINDOW_S` seconds. "
+    "Upload the frames again.",
     errors.Conflict: "Read what is stored, and decide which of the two you want.",
     errors.MapExists: "Use the map as it is, or another name.",
     errors.FrameConflict: "Change the metadata of the stored frame with PATCH.",
@@ -35,8 +35,8 @@ REMEDIES: dict[type[SceneprintError], str] = {
     errors.InvalidRequest: "Correct the fields that `errors` lists.",
     errors.MalformedBody: "Send valid JSON, or a form, with the right `Content-Type`.",
     errors.UnsupportedType: "Send a `Content-Type` that the operation lists.",
-    errors.TooLarge: "Send less, or ask the operator to raise `SCENEPRINT_UPLOAD_BYTES` or "
-    "`SCENEPRINT_IMPORT_BYTES`.",
+    errors.TooLarge: "Send less, or ask the operator to raise `SCENEPRINT_MAX_UPLOAD_BYTES` or "
+    "`SCENEPRINT_MAX_IMPORT_BYTES`.",
     errors.SlowBody: "Send the body without pauses, or over a faster network.",
     errors.AmbiguousKey: "Send one `Authorization` header.",
     errors.IdempotencyConflict: "Use a new Idempotency-Key for each different request.",

@@ -150,7 +150,7 @@ class IndexState(ApiRecord):
         "none, and models that store psi have none."
     )
     tail: int = Field(
-        description="Indexed frames that the version lacks. Above the setting `tail_frames`, "
+        description="Indexed frames that the version lacks. Above the setting `UNINDEXED_FRAMES`, "
         "and not going down: see that workers run."
     )
     recall: IndexRecall | None = Field(

@@ -628,9 +628,7 @@ class Counts(ApiRecord):
 class OfMap(ApiRecord):
     """The result of a query in one of several maps."""
 
-    index_version: int = Field(
-        description="0 where it was searched without an index of this node."
-    )
+    index_version: int = Field(description="0 where it was searched without an index of this node.")
     counts: Counts
 
 

@@ -204,7 +204,7 @@ class Events:
 
     def remove_surplus(self) -> int:
         """Remove surplus events in blocks; return their number."""
-        kept, indexes = self._settings.events_kept, Path(self._settings.indexes)
+        kept, indexes = self._settings.events_per_map, Path(self._settings.indexes)
 
         def spent(connection: Connection, limit: int) -> list[int]:
             if not surplus_events(connection, kept, (), 1):

@@ -316,7 +316,7 @@ class Imports:
 
     def __init__(self, context: Context, uploads: Uploads) -> None:
         self._store, self._bell, self._uploads = context.store, context.bell, uploads
-        self._most = context.settings.import_bytes
+        self._most = context.settings.max_import_bytes
         self._tidied = time.monotonic()
 
     @contextmanager

@@ -188,7 +188,7 @@ class MapImporter:
 
     def __init__(self, context: Context, uploads: Uploads, queries: Queries) -> None:
         # processor time: what is left of a job's time is for writing
-        self._limits = SurfaceLimits(seconds=0.75 * context.settings.job_s)
+        self._limits = SurfaceLimits(seconds=0.75 * context.settings.job_timeout_s)
         self._store, self._signers = context.store, context.signers
         self._uploads, self._queries = uploads, queries
         self._phases = {

@@ -47,7 +47,7 @@ class JobRunner:
 
     def claim(self, worker: str) -> Work | LongJob | None:
         """Take the next job, or None if there is none; see `signature_job.claim`."""
-        return signature_job.claim(self._context.store, worker, self._context.settings.lease_s)
+        return signature_job.claim(self._context.store, worker, self._context.settings.job_lease_s)
 
     def due_in_s(self) -> float | None:
         """Return the seconds until the next job that waits can be claimed; None if none waits."""
@@ -59,10 +59,10 @@ class JobRunner:
         context, settings = self._context, self._context.settings
         with work_of(work.job.tenant):  # so are jobs that it queues
             if isinstance(work, LongJob):
-                return self._tasks.run(work, settings.lease_s, settings.job_s, broke)
+                return self._tasks.run(work, settings.job_lease_s, settings.job_timeout_s, broke)
             return signature_job.run(
-                context.store, context.signers, context.readers, work, settings.lease_s,
-                settings.job_s, broke,
+                context.store, context.signers, context.readers, work, settings.job_lease_s,
+                settings.job_timeout_s, broke,
             )  # fmt: skip
 
     def put_back(self, work: Work | LongJob) -> None:

@@ -104,7 +104,7 @@ class QueryLog:
 
     def __init__(self, store: Store, files: AnswerFiles, settings: Settings) -> None:
         self._store, self._files = store, files
-        self._days, self._room = settings.answer_days, settings.answer_bytes
+        self._days, self._room = settings.query_log_days, settings.query_log_bytes
         self._waiting: deque[_Waiting] = deque()
         self._changed = threading.Condition()
         self._writer: threading.Thread | None = None
@@ -354,7 +354,7 @@ class QueryLog:
             f"Map {row.map!r} keeps {count} of at most {MOST_KEPT} answers, and all kept answers "
             f"have {size} of at most {self._room // 2} bytes, so this one was not kept. Release "
             "some with DELETE /v1/queries/{query_id}/keep, or ask the operator to raise "
-            "SCENEPRINT_ANSWER_BYTES."
+            "SCENEPRINT_QUERY_LOG_BYTES."
         )
 
     def release(self, query_id: str) -> None:

@@ -32,7 +32,6 @@ from sceneprint.atomic_files import PRIVATE_FILE, folder_turn
 from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
 from sceneprint.index import IndexVersion, clear, manifests
-from sceneprint.index.index_version import keep_only, remove_unneeded
 from sceneprint.index.index_manifest import (
     IndexManifest,
     decode_manifest,
@@ -40,6 +39,7 @@ from sceneprint.index.index_manifest import (
     read_manifest,
     write_manifest,
 )
+from sceneprint.index.index_version import keep_only, remove_unneeded
 from sceneprint.index.part_files import put
 from sceneprint.sealed_record import seal
 from sceneprint.settings import Settings
@@ -71,8 +71,8 @@ class IndexPlace:
 
     def __init__(self, store: Store, settings: Settings) -> None:
         self._database, self._indexes = store.database, settings.indexes
-        self._most_bytes, self._tail_frames = settings.index_bytes, settings.tail_frames
-        self._purge_s, url = settings.purge_s, settings.index_url
+        self._most_bytes, self._tail_frames = settings.index_cache_bytes, settings.unindexed_frames
+        self._purge_s, url = settings.purge_deadline_s, settings.index_url
         self._store = None if url is None else open_objects(str(url), "SCENEPRINT_INDEX_URL")
         self._claimed = False
         self._lock = threading.Lock()

@@ -408,6 +408,4 @@ class Reader:
         dead = frozenset(deleted[held].tolist())
         size = len(version or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)
-        self._view = IndexView(
-            model.id, model.metric, revision, size, dead, damaged, version, tail
-        )
+        self._view = IndexView(model.id, model.metric, revision, size, dead, damaged, version, tail)

@@ -27,8 +27,10 @@ def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
     settings, store = context.settings, context.store
     upkeep = upkeep or Upkeep(store, context.signers, settings, context.indexes)
     return Purging(
-        store, upkeep, context.query_log, Tombstones(store, settings.undo_s, context.bell.ring),
-        (Reconstructions(context), Differences(context)), settings.purge_s, settings.quarantine_dir,
+        store, upkeep, context.query_log,
+        Tombstones(store, settings.undo_window_s, context.bell.ring),
+        (Reconstructions(context), Differences(context)),
+        settings.purge_deadline_s, settings.quarantine_dir,
     )  # fmt: skip
 
 
@@ -42,10 +44,10 @@ class Housekeeping:
         self.reencodings = Reencodings(store, self.upkeep)
         self.retention = Retention(store, settings.deleted_rows_days)
         self.events = Events(store, settings)
-        self.audit = Audit(store, settings.audit_kept_days)
+        self.audit = Audit(store, settings.audit_log_days)
         self.imports = Imports(context, Uploads(context))
-        self.surfaces = SurfaceUpkeep(store, bell, auto=settings.surfaces == "auto")
-        self.joins = JoinUpkeep(store, bell, auto=settings.joins == "auto")
+        self.surfaces = SurfaceUpkeep(store, bell, auto=settings.build_surfaces == "auto")
+        self.joins = JoinUpkeep(store, bell, auto=settings.join_sessions == "auto")
         self.purging = purging_of(context, self.upkeep)
 
     def run(self) -> int:

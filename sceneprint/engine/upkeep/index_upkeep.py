@@ -130,7 +130,7 @@ class Upkeep:
         self, store: Store, signers: Signers, settings: Settings, place: IndexPlace
     ) -> None:
         self._store, self._signers, self._place = store, signers, place
-        self._tail_frames = settings.tail_frames
+        self._tail_frames = settings.unindexed_frames
         self._elsewhere: dict[int, float] = {}  # by map, when it may be looked at again
         # map and model: number of their index, and revision
         self._published: dict[tuple[int, str], tuple[int, int]] = {}
@@ -138,7 +138,7 @@ class Upkeep:
         # read all of them for each thousand frames would take longer than to write
         self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
         self._metrics: dict[str, Metric | None] = {}
-        self._scrubber = Scrubber(settings.indexes, settings.scrub_s)
+        self._scrubber = Scrubber(settings.indexes, settings.index_check_interval_s)
         self._rows_s = DAY_S * settings.deleted_rows_days
         # map and model: when it is looked next for deletions that the index should know of by now
         self._aged = dict[tuple[int, str], float]()

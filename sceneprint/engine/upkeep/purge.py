@@ -141,7 +141,7 @@ class MemoryPurging:
     """Drops what this process holds of deleted maps and frames."""
 
     def __init__(self, context: Context) -> None:
-        self._context, self._every_s = context, context.settings.purge_s / 2
+        self._context, self._every_s = context, context.settings.purge_deadline_s / 2
         self._purged = time.monotonic()
 
     def run(self) -> None:

@@ -43,7 +43,7 @@ class House:
         self.place, self.data = place, place / "data"
         self.settings = Settings(
             data_dir=self.data, cache_dir=place / "cache", database_url=None, index_dir=None,
-            tail_frames=HALL // 2 - 1,
+            unindexed_frames=HALL // 2 - 1,
         )  # fmt: skip
 
     @property
