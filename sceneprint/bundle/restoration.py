@@ -42,9 +42,10 @@ from sceneprint.store import Blobs, FolderBlobs, open_blobs
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.database import Database, known_revisions, open_database, reach_database
+from sceneprint.store.keys import list_keys, revoke_key
 from sceneprint.store.opaque_ids import OpaqueIds, owner_of
 from sceneprint.store.postgres.connection import allow
-from sceneprint.store.tables import secrets
+from sceneprint.store.tables import keys, secrets
 
 #: The database and the blobs of a data folder, and where they are until both are whole.
 _DATABASE, _BLOBS, _WORK = "sceneprint.db", "blobs", ".restoring"
@@ -122,8 +123,12 @@ class _Restoration:
                 if blob.keep() != digest:
                     raise place.damaged(digest, "is damaged")
 
-    def rows(self, connection: Connection) -> None:
+    def rows(self, connection: Connection, *, keep_keys: bool = True) -> None:
         """Write all rows into an empty database, in a transaction of the caller's.
+
+        Parameters
+        ----------
+        keep_keys : False revokes all keys of the bundle in the same transaction
 
         Raises
         ------
@@ -156,6 +161,15 @@ class _Restoration:
         connection.exec_driver_sql(
             "UPDATE queries SET bytes = 0, shown = NULL WHERE bytes > 0 AND kept_at IS NULL"
         )
+        if not keep_keys:
+            for key in list_keys(connection):
+                revoke_key(connection, key.name)
+
+    def key_names(self) -> list[str]:
+        """Return the names of the keys in the bundle, sorted."""
+        columns = [one.name for one in keys.columns]
+        rows = self._read(keys.name, columns, counts=False)
+        return sorted(str(row[columns.index("name")]) for row in rows)
 
     def secrets(self) -> list[Row]:
         """Return the rows of the secrets, which give a store its name."""
@@ -208,6 +222,20 @@ def check_empty(connection: Connection) -> None:
             )
 
 
+def list_bundle_keys(place: str, name: str | None = None) -> list[str]:
+    """Return the names of the keys in a bundle, which work again once it is restored.
+
+    Parameters
+    ----------
+    place, name : see `verify_bundle`
+
+    Raises
+    ------
+    BundleError, DamagedBundle, NewerSchema : As for `verify_bundle`.
+    """
+    return _Restoration(place, name, None).key_names()
+
+
 def verify_bundle(place: str, name: str | None = None, progress: Progress | None = None) -> Bundle:
     """Read all of a bundle and check it; its rows are written into a temporary database.
 
@@ -229,14 +257,16 @@ def verify_bundle(place: str, name: str | None = None, progress: Progress | None
 
 
 def restore_to_folder(
-    place: str, folder: Path, name: str | None = None, progress: Progress | None = None
-) -> Bundle:
+    place: str, folder: Path, name: str | None = None, progress: Progress | None = None,
+    *, keep_keys: bool = True,
+) -> Bundle:  # fmt: skip
     """Make a data folder of a bundle; a restore that was killed there is gone on with.
 
     Parameters
     ----------
     place, name, progress : see `verify_bundle`
     folder : missing or empty
+    keep_keys : False revokes all keys of the bundle
 
     Raises
     ------
@@ -259,7 +289,7 @@ def restore_to_folder(
         _check_room(folder, reading.manifest, work)
         with closing(FolderBlobs(work / _BLOBS)) as blobs:
             lost = reading.blobs(blobs)
-        _write_file(work / _DATABASE, reading)
+        _write_file(work / _DATABASE, reading, keep_keys=keep_keys)
         _put(work, folder)
     if is_new:
         sync_folder(folder.parent)
@@ -295,13 +325,13 @@ def _check_room(folder: Path, manifest: BundleManifest, work: Path) -> None:
         )
 
 
-def _write_file(path: Path, reading: _Restoration) -> None:
+def _write_file(path: Path, reading: _Restoration, *, keep_keys: bool = True) -> None:
     """Write the rows of a bundle into a new SQLite file, which is durable and alone at the end."""
     for one in path.parent.glob(f"{path.name}*"):
         one.unlink()
     url = URL.create("sqlite", database=str(path)).render_as_string(hide_password=False)
     with closing(open_database(url)) as database, database.write() as connection:
-        reading.rows(connection)
+        reading.rows(connection, keep_keys=keep_keys)
 
 
 def _put(work: Path, folder: Path) -> None:
@@ -321,14 +351,16 @@ def _put(work: Path, folder: Path) -> None:
 
 
 def restore_to_server(
-    place: str, settings: Settings, name: str | None = None, progress: Progress | None = None
-) -> Bundle:
+    place: str, settings: Settings, name: str | None = None, progress: Progress | None = None,
+    *, keep_keys: bool = True,
+) -> Bundle:  # fmt: skip
     """Put all of a bundle into an empty database and where blobs are kept, or no row of it.
 
     Parameters
     ----------
     place, name, progress : see `verify_bundle`
     settings : whose database is PostgreSQL; its schema is made where there is none
+    keep_keys : False revokes all keys of the bundle
 
     Raises
     ------
@@ -358,7 +390,7 @@ def restore_to_server(
             with closing(blobs), blobs.kept():
                 lost = reading.blobs(blobs)
                 with database.write() as connection:
-                    reading.rows(connection)
+                    reading.rows(connection, keep_keys=keep_keys)
     return Bundle(reading.manifest, lost)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -314,6 +315,11 @@ def add_restore(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--list", action="store_true", help="list the bundles of the place, and restore none"
     )
+    command.add_argument(
+        "--keys", choices=("keep", "revoke"),
+        help="keep the keys of the bundle, which revives keys that were revoked since, or revoke "
+        "all of them (default: ask in a terminal, otherwise keep and list them)",
+    )  # fmt: skip
     command.set_defaults(run=run_restore)
 
 
@@ -331,12 +337,14 @@ def run_restore(options: argparse.Namespace) -> int:
         return _list_bundles(options.place)
     place, name = options.place, options.bundle
     task = "verify" if options.verify_only else "restore"
+    keys = [] if options.verify_only else restoration.list_bundle_keys(place, name)
+    keep = _keep_keys(options.keys, keys)
     with ended_by_signals(), progress_bar(task, "record", unit_scale=True) as progress:
         if options.verify_only:
             bundle, done = restoration.verify_bundle(place, name, progress), "is complete"
         elif settings.database_url is not None:
             shown = _server(settings)
-            bundle = restoration.restore_to_server(place, settings, name, progress)
+            bundle = restoration.restore_to_server(place, settings, name, progress, keep_keys=keep)
             done = f"is restored to {shown}"
         else:
             if settings.blob_url is not None:
@@ -345,16 +353,38 @@ def run_restore(options: argparse.Namespace) -> int:
                     "no service would look for them. Unset the variable, or restore into a fleet "
                     "with --database."
                 )
-            bundle = restoration.restore_to_folder(place, settings.data_dir, name, progress)
+            bundle = restoration.restore_to_folder(
+                place, settings.data_dir, name, progress, keep_keys=keep
+            )
             done = f"is restored to {one_line(str(settings.data_dir))}"
     seconds = time.perf_counter() - start
     print(f"{one_line(place)}: bundle {bundle.manifest.name} {done}: {_contents(bundle)} "
           f"in {seconds:.1f} s")  # fmt: skip
+    if keys:
+        print(
+            f"Keys that work again: {_key_list(keys)}. A key that was revoked after the bundle "
+            "was taken is among them: revoke it again with `sceneprint keys --revoke NAME`."
+            if keep
+            else f"Revoked keys: {_key_list(keys)}. Create others with `sceneprint keys --create`."
+        )
     advice = (
         "These blobs were damaged when the bundle was taken. Run `sceneprint fsck` on the restored "
         "store to see whose they are."
     )
     return _report_lost(bundle, advice)
+
+
+def _keep_keys(choice: str | None, keys: list[str]) -> bool:
+    """Return whether restored keys stay valid: as chosen, or as answered in a terminal."""
+    if choice is not None or not keys or not sys.stdin.isatty():
+        return choice != "revoke"
+    print(f"The bundle has keys: {_key_list(keys)}. Keys that were revoked since work again too.")
+    return input("Keep these keys? [y/N] ").strip().lower() in ("y", "yes")
+
+
+def _key_list(keys: list[str]) -> str:
+    more = "" if len(keys) <= 20 else f" and {len(keys) - 20} more"
+    return one_line(", ".join(keys[:20])) + more
 
 
 def _list_bundles(name: str) -> int:

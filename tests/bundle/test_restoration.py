@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import pty
 import shutil
 import signal
 import sqlite3
@@ -95,6 +96,34 @@ def test_what_is_restored_is_what_was_there(
         assert engine.get_map("hall").frames == {"deleted": 1, "indexed": 5}
         assert [key.name for key in list_keys(engine.store).items] == ["robot"]
     assert restored.manifest.n_frames == 5
+
+
+@file_only
+@pytest.mark.parametrize(
+    ("options", "typed", "kept"),
+    [((), None, True), (("--keys", "revoke"), None, False), ((), "y", True), ((), "", False)],
+)
+def test_keys_of_a_bundle_are_listed_and_kept_or_revoked(
+    place, tmp_path, settings, options, typed, kept
+):
+    new = tmp_path / "new"
+    command = [sys.executable, "-m", "sceneprint", "restore", place, "--data", str(new), *options]
+    terminal, stdin = pty.openpty()
+    with os.fdopen(terminal, "wb", buffering=0) as keyboard, os.fdopen(stdin, "rb") as read:
+        if typed is not None:
+            keyboard.write(f"{typed}\n".encode())
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL if typed is None else read, capture_output=True,
+            text=True, timeout=PATIENCE_S,
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert ("Keep these keys?" in done.stdout) == (typed is not None)
+    assert ": robot." in done.stdout.splitlines()[-1]
+    with Engine(settings(new)) as engine:
+        assert [key.name for key in list_keys(engine.store).items] == ["robot"] * kept
+    with closing(sqlite3.connect(new / "sceneprint.db")) as database:
+        revoked = database.execute("SELECT count(*) FROM events WHERE kind = 'key.revoked'")
+        assert revoked.fetchone() == (0 if kept else 1,)
 
 
 @file_only

@@ -72,7 +72,9 @@ def test_no_key_and_no_limit_whatever_the_environment_says(
         assert client.me().name is None
         with pytest.raises(errors.UnreadableCloud):
             client.upload("m", b"ply\n" + bytes(4096))
-    assert embedded_settings(tmp_path).max_upload_bytes == 2 << 30  # more than a service may be given
+    assert (
+        embedded_settings(tmp_path).max_upload_bytes == 2 << 30
+    )  # more than a service may be given
 
 
 def test_closing_ends_streams_and_threads(tmp_path: Path) -> None:
