@@ -171,7 +171,10 @@ class Metrics:
         self._jobs = self._gauge("jobs", "Jobs in each state.", "state")
         self._maps = self._gauge("maps", "Maps.")
         self._oldest = self._gauge(
-            "oldest_waiting_seconds", "Age of the oldest waiting job; 0: none waits."
+            "oldest_waiting_seconds", "Age of the oldest waiting job of each kind.", "kind"
+        )
+        self._oldest_frame = self._gauge(
+            "oldest_unsigned_seconds", "Age of the oldest frame without a signature; 0 for none."
         )
         self._version = self._gauge(
             "index_version", "Newest index; of the maps with the longest tails.", "map"
@@ -243,7 +246,10 @@ class Metrics:
         self._scrubbed.set(0 if stats.scrub is None else stats.scrub.bytes)
         self._damaged.set(0 if stats.scrub is None else stats.scrub.damaged)
         self._maps.set(stats.maps)
-        self._oldest.set(stats.oldest_waiting_s or 0.0)
+        self._oldest.clear()
+        for waiting, age in stats.oldest_waiting_s.items():
+            self._oldest.labels(waiting).set(age)
+        self._oldest_frame.set(stats.oldest_waiting_s.get("sign", 0.0))
         for gauge in (self._version, self._tail):
             gauge.clear()  # maps come and go
         for index in stats.indexes[:MOST_MAPS]:

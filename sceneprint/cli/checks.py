@@ -164,7 +164,7 @@ def worker_check(stats: Stats, *, read_only: bool) -> Check:
         run = "1 worker runs" if len(workers) == 1 else f"{len(workers)} workers run"
         return Check("ok", "workers", f"{run}, {busy} at a job")
     text = "none runs, so frames are stored, but not signed. Start some with `sceneprint work`"
-    if (stats.oldest_waiting_s or 0.0) > LONGEST_S:
+    if max(stats.oldest_waiting_s.values(), default=0.0) > LONGEST_S:
         return Check("WRONG", "workers", f"{text}, and see their log.")
     return Check("note", "workers", f"{text}, or wait if the service has just started.")
 
@@ -173,8 +173,8 @@ def queue_check(stats: Stats) -> Check:
     """Count the jobs that wait and those that failed for good."""
     jobs = "1 job" if stats.waiting == 1 else f"{stats.waiting} jobs"
     text = f"{jobs} waiting, {stats.jobs.get('running', 0)} running"
-    if stats.oldest_waiting_s is not None:
-        text += f", the oldest for {stats.oldest_waiting_s:.0f} s"
+    if stats.oldest_waiting_s:
+        text += f", the oldest for {max(stats.oldest_waiting_s.values()):.0f} s"
     dead = stats.jobs.get("dead", 0)
     if dead:
         text += f"; {dead} failed for good: `sceneprint jobs --state dead` says why"

@@ -41,6 +41,7 @@ from sqlalchemy import (
     Connection,
     Label,
     Row,
+    Select,
     and_,
     delete,
     func,
@@ -97,18 +98,7 @@ def list_jobs(
     state, kind : conditions; None: any
     map_names : names of the only maps; jobs without a map are excluded then
     """
-    later = jobs.alias()
-    last = (
-        select(later.c.id)
-        .where(
-            later.c.frame_number == jobs.c.frame_number, later.c.kind == jobs.c.kind,
-            later.c.model_id.is_not_distinct_from(jobs.c.model_id), later.c.number > jobs.c.number,
-        )
-        .order_by(later.c.number.desc())
-        .limit(1)
-        .correlate(jobs)
-        .scalar_subquery()
-    )  # fmt: skip
+    last = _later_job().scalar_subquery()
     statement = (
         select(
             *JOB_COLUMNS, frames.c.id.label("frame_id"), maps.c.name.label("map_name"),
@@ -129,6 +119,21 @@ def list_jobs(
         statement = statement.where(jobs.c.state == state)
     rows: list[Any] = list(connection.execute(statement))
     return [ListedJob(job_of_columns(row), *row[len(JOB_COLUMNS) :]) for row in rows]
+
+
+def _later_job() -> Select[tuple[str]]:
+    """Select the id of the latest job of the frame, kind and model of a job, if it is another."""
+    later = jobs.alias()
+    return (
+        select(later.c.id)
+        .where(
+            later.c.frame_number == jobs.c.frame_number, later.c.kind == jobs.c.kind,
+            later.c.model_id.is_not_distinct_from(jobs.c.model_id), later.c.number > jobs.c.number,
+        )
+        .order_by(later.c.number.desc())
+        .limit(1)
+        .correlate(jobs)
+    )  # fmt: skip
 
 
 def find_job(connection: Connection, job_id: str) -> JobRow:
@@ -182,14 +187,25 @@ def count_jobs(
     connection: Connection, map_number: int | None = None,
     states: Collection[JobState] | None = None,
 ) -> dict[str, int]:  # fmt: skip
-    """Return the numbers of jobs by state, of one map or of all; requested ones may be 0."""
+    """Return the numbers of jobs by state, of one map or of all; requested ones may be 0.
+
+    A dead job that was retried does not count: its latest retry does.
+    """
     counts = select(jobs.c.state, func.count()).group_by(jobs.c.state)
     if map_number is not None:
         counts = counts.where(jobs.c.map_number == map_number)
     if states is not None:
         counts = counts.where(jobs.c.state.in_(states))
-    zeros = dict.fromkeys(map(str, states or ()), 0)
-    return zeros | {row[0]: row[1] for row in connection.execute(counts)}
+    found = dict.fromkeys(map(str, states or ()), 0)
+    found |= {row[0]: row[1] for row in connection.execute(counts)}
+    if found.get(JobState.DEAD):
+        retried = select(func.count()).where(jobs.c.state == JobState.DEAD, _later_job().exists())
+        if map_number is not None:
+            retried = retried.where(jobs.c.map_number == map_number)
+        found[JobState.DEAD] -= connection.execute(retried).scalar_one()
+        if states is None and not found[JobState.DEAD]:
+            del found[JobState.DEAD]
+    return found
 
 
 def waiting_by_tenant(connection: Connection) -> dict[str, int]:

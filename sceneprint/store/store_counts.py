@@ -19,21 +19,19 @@ def count_maps(connection: Connection) -> int:
     return int(connection.execute(select(func.count()).select_from(maps)).scalar_one())
 
 
-def oldest_waiting(connection: Connection, map_number: int | None = None) -> float | None:
-    """Return the creation time of the oldest queued job, seconds since 1970; None if none is
-    queued.
+def oldest_waiting(connection: Connection, map_number: int | None = None) -> dict[str, float]:
+    """Return the creation time of the oldest queued job of each kind, seconds since 1970.
 
-    It is the job with the least number, which the index of claims contains.
+    The oldest job has the least number. The index of claims contains state, kind and number.
     """
     first = select(func.min(jobs.c.number)).where(jobs.c.state == JobState.QUEUED)
     if map_number is not None:
         first = first.where(jobs.c.map_number == map_number)
-    number = connection.execute(first).scalar()
-    if number is None:
-        return None
-    statement = select(jobs.c.created_at).where(jobs.c.number == number)
-    created_at: float | None = connection.execute(statement).scalar()
-    return created_at
+    numbers = [row[0] for row in connection.execute(first.group_by(jobs.c.kind))]
+    rows = connection.execute(
+        select(jobs.c.kind, jobs.c.created_at).where(jobs.c.number.in_(numbers))
+    )
+    return {row.kind: row.created_at for row in rows}
 
 
 def running_jobs(connection: Connection, now: float) -> dict[str, str]:

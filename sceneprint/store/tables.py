@@ -260,7 +260,7 @@ jobs = Table(
 #: Jobs of a tenant in the order of claims.
 Index(
     "ix_jobs_claimed", jobs.c.state, jobs.c.tenant, jobs.c.priority.desc(), jobs.c.attempts,
-    jobs.c.number,
+    jobs.c.number, jobs.c.kind,
 )  # fmt: skip
 
 #: Results of a long job, appended slice by slice.

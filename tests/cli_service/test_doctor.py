@@ -308,7 +308,9 @@ def test_workers_that_are_missing(waiting: Client) -> None:
     assert found.verdict == "note"
     assert "wait if the service has just started" in found.text
     assert re.fullmatch(r"1 job waiting, 0 running, the oldest for \d+ s", queue_check(stats).text)
-    late = stats.model_copy(update={"oldest_waiting_s": 100.0, "jobs": {"queued": 1, "dead": 2}})
+    late = stats.model_copy(
+        update={"oldest_waiting_s": {"sign": 100.0}, "jobs": {"queued": 1, "dead": 2}}
+    )
     found = worker_check(late, read_only=False)
     assert found.verdict == "WRONG"
     assert "not signed. Start some with `sceneprint work`, and see their log" in found.text

@@ -82,7 +82,7 @@ def test_figures(client: Client, map_name: str, references: tuple[FrameReference
         map_name, 1, {"indexed": 1}, {"succeeded": 1}
     )  # fmt: skip
     assert (own.total.received, own.total.indexed, own.waiting) == (1, 1, 0)
-    assert own.oldest_waiting_s is None
+    assert own.oldest_waiting_s == {}
     assert len(own.minutes) == 2
     every = client.stats(minutes=1)
     assert every.maps == len(client.maps())

@@ -105,10 +105,17 @@ def test_what_waits_and_who_works(make_engine, uploads):
     stats = engine.statistics.tell(1)
     assert (stats.maps, stats.frames, stats.jobs) == (2, {"received": 3}, {"queued": 3})
     assert stats.waiting == 3
-    assert stats.oldest_waiting_s == pytest.approx(100, abs=20)  # that of the least number
+    assert stats.oldest_waiting_s == {"sign": pytest.approx(100, abs=20)}  # the least number
     of_shop = engine.statistics.tell(1, "shop")
     assert (of_shop.frames, of_shop.jobs, of_shop.waiting) == ({"received": 2}, {"queued": 2}, 2)
-    assert of_shop.oldest_waiting_s == pytest.approx(200, abs=20)
+    assert of_shop.oldest_waiting_s == {"sign": pytest.approx(200, abs=20)}
+    with engine.store.database.write() as connection:
+        connection.execute(update(jobs).where(jobs.c.number == 3).values(kind="associate"))
+    assert engine.statistics.tell(1, "shop").oldest_waiting_s == {
+        "associate": pytest.approx(300, abs=60), "sign": pytest.approx(200, abs=60),
+    }  # fmt: skip
+    with engine.store.database.write() as connection:
+        connection.execute(update(jobs).where(jobs.c.number == 3).values(kind="sign"))
     assert stats.workers == []
     work = engine.claim("far:17")
     with engine.bell.listen():

@@ -28,7 +28,7 @@ CHANCE = re.compile(
 )
 TIMES = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)")
 TOOK = re.compile(
-    r'"milliseconds":(?:{[^}]*}|[\d.e-]+)|"oldest_waiting_s":[\d.e-]+|"(minutes|buckets)":\[[^]]*\]'
+    r'"milliseconds":(?:{[^}]*}|[\d.e-]+)|"oldest_waiting_s":{[^}]*}|"(minutes|buckets)":\[[^]]*\]'
 )
 OWN_HEADERS = ("date", "x-request-id", "content-length")
 

@@ -246,8 +246,8 @@ class Stats(ApiRecord):
     frames: dict[str, int] = Field(description="Number of frames in each state.")
     jobs: dict[str, int] = Field(description="Number of jobs in each state.")
     waiting: int = Field(description="Number of jobs that wait for a worker.")
-    oldest_waiting_s: float | None = Field(
-        description="Age of the job that has waited longest, seconds; null if none waits."
+    oldest_waiting_s: dict[str, float] = Field(
+        description="Age of the oldest waiting job of each kind that waits, seconds."
     )
     indexes: list[IndexState] = Field(
         description="Indexes of the recently changed maps, those with the longest tail first; "

@@ -333,7 +333,8 @@ class Statistics:
         return Stats(
             at=when(now), counted_at=when(now if row is not None else counted.at), map=map_name,
             maps=maps, frames=frames, jobs=jobs, waiting=jobs.get(JobState.QUEUED, 0),
-            oldest_waiting_s=None if oldest is None else max(now - oldest, 0.0), indexes=indexes,
+            oldest_waiting_s={kind: max(now - at, 0.0) for kind, at in sorted(oldest.items())},
+            indexes=indexes,
             workers=workers, bytes=used, use=None if row is None else _use(row), scrub=scrub,
             total=Counted(**_recent_counts(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),

@@ -6,7 +6,7 @@ import { sparkline } from "../lib/sparkline.js";
 const REMEMBERED = 60; // polls of the queue that the little line shows
 /** @type {[number, string][]} */
 const FULL = [[0.95, "bad"], [0.85, "warn"]];
-const OLD_S = 300; // a job that waits longer than this asks for a look
+const OLD_S = 300; // a frame that waits longer than this needs attention
 
 /**
  * Tiles for the whole service, or for one map where `whole` is false.
@@ -16,7 +16,7 @@ const OLD_S = 300; // a job that waits longer than this asks for a look
 export function tiles(whole) {
   const waited = [];
   const queue = tile("Waiting jobs", "waiting");
-  const oldest = tile("Oldest waiting job", "oldest");
+  const oldest = tile("Oldest frame not signed", "oldest");
   const frames = tile("Indexed frames", "indexed");
   const workers = tile("Workers", "workers");
   const requests = tile("Requests, last hour", "requests");
@@ -32,8 +32,8 @@ export function tiles(whole) {
       const line = waited.length > 1 && Math.max(...waited) > 0
         && sparkline(waited, { label: `Waiting jobs since this page was opened: now ${stats.waiting}, at most ${Math.max(...waited)}`, width: 88 });
       queue.set(count(stats.waiting), [`${count(stats.jobs.running ?? 0)} running`, line]);
-      const old = stats.oldest_waiting_s;
-      oldest.set(old === null ? "–" : seconds(old), old === null ? "up to date" : "since it was queued", old > OLD_S ? "warn" : null);
+      const old = stats.oldest_waiting_s.sign ?? null;
+      oldest.set(old === null ? "–" : seconds(old), old === null ? "up to date" : "since its upload", old > OLD_S ? "warn" : null);
       frames.set(count(stats.frames.indexed ?? 0), others(stats.frames));
       if (!whole) return;
       const busy = stats.workers.filter((one) => one.job_id !== null).length;
