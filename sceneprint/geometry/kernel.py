@@ -250,7 +250,9 @@ def cached_per_frame(
 
     @wraps(function)
     def cached(frame: F, /, *args: P.args, **kwargs: P.kwargs) -> R:
-        own = results.setdefault(frame, {})
+        own = results.get(frame)
+        if own is None:
+            own = results.setdefault(frame, {})
         key = args, tuple(kwargs.items())
         if key not in own:  # two threads may both compute it, with equal results
             own[key] = function(frame, *args, **kwargs)

@@ -17,9 +17,10 @@ from sceneprint.types import Floats, Ints64
 
 def inverse(T: Floats) -> Floats:
     """Return T_a_b of T_b_a, (4, 4), exactly for a rigid transform."""
-    result = np.eye(4)
-    result[:3, :3] = T[:3, :3].T
-    result[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    result, R = np.zeros((4, 4)), T[:3, :3].T
+    result[:3, :3] = R
+    result[:3, 3] = -R @ T[:3, 3]
+    result[3, 3] = 1.0
     return result
 
 
@@ -49,15 +50,61 @@ def pose_difference(a: Floats, b: Floats) -> tuple[float, float]:
     """Return the metres between the translations of two transforms, and the radians between
     their rotations.
     """
-    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(a[:3, :3] @ b[:3, :3].T)
+    metres, radians = _pose_differences(a[None], b[None])[0, 0].tolist()
+    return metres, radians
+
+
+def _pose_differences(a: Floats, b: Floats) -> Floats:
+    """Return the differences (n, m, 2) of each two of n and m transforms; see `pose_difference`."""
+    apart = np.empty((len(a), len(b), 2))
+    _write_differences(np.array(a, float), np.array(b, float), apart)
+    return apart
+
+
+@kernel
+def _write_differences(a: Floats, b: Floats, apart: Floats) -> None:
+    R = np.empty((3, 3))
+    for i in range(len(a)):
+        for j in range(len(b)):
+            square = 0.0
+            for r in range(3):
+                square += (a[i, r, 3] - b[j, r, 3]) ** 2
+                for c in range(3):
+                    R[r, c] = 0.0
+                    for k in range(3):
+                        R[r, c] += a[i, r, k] * b[j, c, k]
+            x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+            sine = np.sqrt(x * x + y * y + z * z)
+            apart[i, j, 0] = np.sqrt(square)
+            apart[i, j, 1] = math.atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
 
 
 def are_near(transforms: Floats, T: Floats, metres: float, radians: float) -> NDArray[np.bool_]:
     """Return a mask (n,) of the transforms (n, 4, 4) within `metres` and `radians` of T."""
-    apart = np.linalg.norm(transforms[:, :3, 3] - T[:3, 3], axis=1)
-    cosines = (np.einsum("nij,ij->n", transforms[:, :3, :3], T[:3, :3]) - 1.0) / 2.0
-    near: NDArray[np.bool_] = (apart <= metres) & (cosines >= math.cos(radians))
+    near = np.empty(len(transforms), np.bool_)
+    cosine = math.cos(radians)
+    # copies, because a kernel is compiled again for arrays that are read-only
+    _mark_near(np.array(transforms, float), np.array(T, float), metres, cosine, near)
     return near
+
+
+@kernel
+def _is_near(T: Floats, U: Floats, metres: float, cosine: float) -> bool:
+    """Return whether two transforms are within `metres` and an angle of this cosine."""
+    square, trace = 0.0, 0.0
+    for a in range(3):
+        square += (T[a, 3] - U[a, 3]) ** 2
+        for b in range(3):
+            trace += T[a, b] * U[a, b]
+    return np.sqrt(square) <= metres and (trace - 1.0) / 2.0 >= cosine
+
+
+@kernel
+def _mark_near(
+    transforms: Floats, T: Floats, metres: float, cosine: float, near: NDArray[np.bool_]
+) -> None:
+    for i in range(len(transforms)):
+        near[i] = _is_near(transforms[i], T, metres, cosine)
 
 
 def select_distinct(
@@ -87,15 +134,9 @@ def _select(
     for i in order:
         if found == len(chosen):
             break
-        T, distinct = transforms[i], True
+        distinct = True
         for k in range(found):
-            U = transforms[chosen[k]]
-            square, trace = 0.0, 0.0
-            for a in range(3):
-                square += (T[a, 3] - U[a, 3]) ** 2
-                for b in range(3):
-                    trace += T[a, b] * U[a, b]
-            if np.sqrt(square) <= metres and (trace - 1.0) / 2.0 >= cosine:
+            if _is_near(transforms[i], transforms[chosen[k]], metres, cosine):
                 distinct = False
                 break
         if distinct:
@@ -106,9 +147,8 @@ def _select(
 
 def nearest_rotation(M: Floats) -> Floats:
     """Return the rotation (3, 3) nearest to a matrix in the least-squares sense."""
-    u, _, vt = np.linalg.svd(M)
-    fix = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
-    result: Floats = u @ fix @ vt
+    result = np.empty((3, 3))
+    rotation_of_covariance(np.array(M, float), result)
     return result
 
 
@@ -271,7 +311,7 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     p = p or AveragingParameters()
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise ValueError(f"poses of shape {poses.shape}, not (n, 4, 4) with n of 1 or more")
-    apart = np.array([[pose_difference(a, b) for b in poses] for a in poses])
+    apart = _pose_differences(poses, poses)
     # metres and radians in one unit: tolerances
     scaled = np.hypot(apart[..., 0] / p.agree_m, apart[..., 1] / p.agree_rad)
     near = (apart[..., 0] <= p.agree_m) & (apart[..., 1] <= p.agree_rad)
@@ -281,7 +321,7 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     T = np.eye(4)
     T[:3, :3] = nearest_rotation(members[:, :3, :3].sum(axis=0))
     T[:3, 3] = members[:, :3, 3].mean(axis=0)
-    residuals = np.array([pose_difference(T, member) for member in members])
+    residuals = _pose_differences(T[None], members)[0]
     metres, radians = np.sqrt((residuals**2).mean(axis=0)).tolist()
     indices = np.flatnonzero(near[medoid])
     return PoseAverage(T, metres, radians, len(members), len(poses), indices)

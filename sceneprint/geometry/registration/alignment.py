@@ -580,7 +580,7 @@ def align_scans(
     scores = _scores(query, match, hypotheses, p, overlap_p)
     chosen = select_distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
     transforms, index = refine_with_index(a.surface, b.surface, hypotheses[chosen], p.coarse)
-    if not index:
+    if not len(index):
         return None
     is_planned = np.array(chosen)[index] >= len(voted)
     level = are_level(transforms, ups, p.gravity.refined_tilt)

@@ -20,13 +20,14 @@ pixels are correlated: docs/uncertainty.md measures their effective number.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.geometry.registration.overlap import (
-    LookupTarget,
     lookup_target,
     nearest_alike,
     sample_points,
@@ -43,7 +44,7 @@ from sceneprint.geometry.surface.camera import (
     select_inside,
     transpose_points,
 )
-from sceneprint.types import PINHOLE, Floats, Floats32, Ints32, Surface, kind_of
+from sceneprint.types import PINHOLE, Floats, Floats32, Ints32, Ints64, Surface, kind_of
 
 
 @dataclass(frozen=True)
@@ -314,22 +315,21 @@ def _accumulate_near(
 
 
 @kernel
-def refine_in_place(
-    source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
-    heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, information: Floats,
+def _refine_one(
+    source: Floats32, whole: Floats32, few: Floats32, points: Floats32, normals: Floats32,
+    camera: Floats, heads: Ints32, chain: Ints32, T: Floats, numbers: Floats,
+    room: Floats, indices: Ints32, information: Floats,
 ) -> tuple[int, float]:  # fmt: skip
     """Run Gauss-Newton on T; return the number of points in the last step, 0 if it failed, and
     their mean weighted square before it.
+
+    whole, few : points of the last iterations, and of the first, transposed to (6, N)
     """
     iterations, minimum = int(numbers[0]), int(numbers[5])
     thinned = iterations - int(numbers[10])
     A, g, step = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     before, turn = np.zeros((3, 3)), np.zeros((3, 3))
     used, squares = 0, 0.0
-    room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
-    whole = few = transpose_points(source, 1)
-    if int(numbers[9]) > 1 and thinned > 0:
-        few = transpose_points(source, int(numbers[9]))
     for iteration in range(iterations):
         share = iteration / max(iterations - 1, 1)
         gate = numbers[1] * (numbers[2] / numbers[1]) ** share
@@ -371,6 +371,25 @@ def refine_in_place(
     return used, squares / max(used, 1)
 
 
+@kernel
+def refine_in_place(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, transforms: Floats, numbers: Floats,
+    information: Floats, used: Ints64, squares: Floats,
+) -> None:  # fmt: skip
+    """Refine each of n transforms (n, 4, 4), and write the results of `_refine_one`."""
+    room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
+    whole = few = transpose_points(source, 1)
+    if int(numbers[9]) > 1 and int(numbers[0]) > int(numbers[10]):
+        few = transpose_points(source, int(numbers[9]))
+    for k in range(len(transforms)):
+        used[k], squares[k] = _refine_one(
+            source, whole, few, points, normals, camera, heads, chain, transforms[k], numbers,
+            room, indices, information[k],
+        )  # fmt: skip
+
+
+@lru_cache(maxsize=32)
 def kernel_numbers(p: RefinementParameters, kind: int) -> Floats:
     """Return the parameters and the kind of the source's camera as an array for the kernels."""
     return np.array(
@@ -378,11 +397,6 @@ def kernel_numbers(p: RefinementParameters, kind: int) -> Floats:
          p.minimum_points, p.growth, 1.0 / p.weight_depth, kind, p.thinning, p.last_iterations],
         float,
     )  # fmt: skip
-
-
-def icp_target(surface: Surface, p: RefinementParameters) -> LookupTarget:
-    """Return a surface prepared for `refine_in_place`."""
-    return lookup_target(surface, p.nearest, p.reach)
 
 
 def refine(
@@ -402,20 +416,19 @@ def refine(
     -------
     refinement : or None if fewer than `minimum_points` stay within the gates, or a step is singular
     """
-    T, information = np.array(T_target_source, float), np.zeros((6, 6))
-    t = icp_target(target, p)
-    used, mean_square = refine_in_place(
-        source,
-        t.points,
-        t.normals,
-        t.camera,
-        t.heads,
-        t.chain,
-        T,
-        kernel_numbers(p, kind),
-        information,
-    )
-    return Refinement(T, information, used, mean_square) if used else None
+    T, information, used, squares = _refine(source, target, T_target_source[None], p, kind)
+    return Refinement(T[0], information[0], int(used[0]), float(squares[0])) if used[0] else None
+
+
+def _refine(
+    source: Floats32, target: Surface, transforms: Floats, p: RefinementParameters, kind: int
+) -> tuple[Floats, Floats, Ints64, Floats]:
+    """Return refined transforms (n, 4, 4) with their information, points and mean squares."""
+    T, n = np.array(transforms, float), len(transforms)
+    information, used, squares = np.zeros((n, 6, 6)), np.empty(n, np.int64), np.empty(n)
+    t = lookup_target(target, p.nearest, p.reach)
+    refine_in_place(source, *t, T, kernel_numbers(p, kind), information, used, squares)
+    return T, information, used, squares
 
 
 def refine_all(
@@ -427,20 +440,12 @@ def refine_all(
 
 def refine_with_index(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
-) -> tuple[Floats, list[int]]:
+) -> tuple[Floats, NDArray[np.intp]]:
     """Refine hypotheses as `refine_all`; return the indices of the successful ones too."""
-    points, t = sample_points(source, p.stride), icp_target(target, p)
-    numbers, information = kernel_numbers(p, kind_of(source.camera)), np.zeros((6, 6))
-    refined, index = [], []
-    for k, hypothesis in enumerate(hypotheses):
-        T = hypothesis.copy()
-        used, _ = refine_in_place(
-            points, t.points, t.normals, t.camera, t.heads, t.chain, T, numbers, information
-        )
-        if used:
-            refined.append(T)
-            index.append(k)
-    return np.array(refined).reshape(-1, 4, 4), index
+    points = sample_points(source, p.stride)
+    T, _, used, _ = _refine(points, target, hypotheses, p, kind_of(source.camera))
+    index = np.flatnonzero(used)
+    return T[index], index
 
 
 Method = Literal["information-scaled", "votes-and-spread"]
@@ -449,7 +454,7 @@ PAIR_METHOD: Method = "information-scaled"
 PLACE_METHOD: Method = "votes-and-spread"
 
 #: Reorders rotation, translation (as in a refinement) to translation, rotation.
-_SHIFT_FIRST = [3, 4, 5, 0, 1, 2]
+_SHIFT_FIRST = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 
 
 @dataclass(frozen=True)
@@ -536,7 +541,7 @@ def pair_covariance(
     ):  # fmt: skip
         if refinement is not None:
             A = adjoint(R, lever)
-            ordered = refinement.information[np.ix_(_SHIFT_FIRST, _SHIFT_FIRST)]
+            ordered = refinement.information[_SHIFT_FIRST]
             information.append(A.T @ ordered @ A)
             squares.append(refinement.mean_square)
     if not information:

@@ -20,6 +20,8 @@ from __future__ import annotations
 import math
 import secrets
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,9 +57,8 @@ from sceneprint.types import (
 FINENESS = 5.0
 
 
-@dataclass(frozen=True, eq=False)
-class LookupTarget:
-    """A surface prepared for look-ups by kernels.
+class LookupTarget(NamedTuple):
+    """A surface prepared for look-ups: arguments of kernels.
 
     Parameters
     ----------
@@ -465,6 +466,7 @@ def _weigh_all(
         out[k, 1] = violations
 
 
+@lru_cache(maxsize=32)
 def tolerances(p: OverlapParameters) -> Floats:
     """Return the parameters as an array for the kernels."""
     return np.array(
@@ -499,10 +501,7 @@ def agreements(
     out = np.zeros((len(transforms), 2))
     w = np.ones(len(source), np.float32) if weights is None else weights
     t = overlap_target(target, p)
-    _weigh_all(
-        source, w, t.points, t.normals, t.camera, t.heads, t.chain,
-        np.ascontiguousarray(transforms), tolerances(p), out,
-    )  # fmt: skip
+    _weigh_all(source, w, *t, np.ascontiguousarray(transforms), tolerances(p), out)
     return out
 
 
@@ -518,11 +517,23 @@ def look_up(
     tolerances : result of `tolerances`
     """
     said = np.empty(len(source), np.uint8)
-    _look_up(
-        source, target.points, target.normals, target.camera, target.heads, target.chain,
-        np.ascontiguousarray(T_target_source), tolerances, said,
-    )  # fmt: skip
+    _look_up(source, *target, np.ascontiguousarray(T_target_source), tolerances, said)
     return said
+
+
+@kernel
+def count_verdicts(
+    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
+    chain: Ints32, T: Floats, tolerances: Floats, agree: Ints32, violate: Ints32,
+) -> int:  # fmt: skip
+    """Count the verdicts of one more target on points (N, 6); return how many points agree."""
+    said, agreeing = np.empty(len(source), np.uint8), 0
+    _look_up(source, points, normals, camera, heads, chain, T, tolerances, said)
+    for i in range(len(source)):
+        agree[i] += said[i] == AGREES
+        violate[i] += said[i] == VIOLATES
+        agreeing += said[i] == AGREES
+    return agreeing
 
 
 def overlap_counts(

@@ -80,8 +80,7 @@ def point_verdicts(
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
     _judge(
-        source, t.points, t.normals, t.camera, t.heads, t.chain,
-        np.ascontiguousarray(T_target_source), tolerances(p), out,
+        source, *t, np.ascontiguousarray(T_target_source), tolerances(p), out,
     )  # fmt: skip
     return out
 
@@ -132,8 +131,7 @@ def residuals(
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
     _measure(
-        source, t.points, t.normals, t.camera, t.heads, t.chain,
-        np.ascontiguousarray(T_target_source), tolerances(p), out,
+        source, *t, np.ascontiguousarray(T_target_source), tolerances(p), out,
     )  # fmt: skip
     return out
 

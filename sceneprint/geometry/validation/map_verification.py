@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 
 from sceneprint.geometry.registration.icp import COARSE, RefinementParameters
 from sceneprint.geometry.registration.overlap import (
-    AGREES,
-    VIOLATES,
     LookupTarget,
     OverlapParameters,
     PlaneParameters,
     PlaneView,
-    look_up,
+    count_verdicts,
     overlap_target,
     plane_view,
     tolerances,
+    weigh_overlap,
 )
 from sceneprint.geometry.rigid import are_near, average_poses, inverse, select_distinct
 from sceneprint.geometry.validation.validation import refine_transform
@@ -239,24 +238,24 @@ def score_pose(
     total = agreeing = violating = seen = through = 0.0
     shared: list[tuple[int, int, int]] = []
     for number, frame in enumerate(frames):
-        points, weights = frame.planes.points, frame.planes.weights
-        agree, violate = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+        points, weights, own = frame.planes.points, frame.planes.weights, frame.target
+        agree, violate = np.zeros((2, len(points)), np.int32)
         T_parent_sensor = T @ frame.T
         for i in views.near(T_parent_sensor, looks_ahead(frame.geometry), among):
             view = views[i]
             if view is None:
                 continue
             T_view_sensor = view.inverse_pose @ T_parent_sensor
-            verdicts = look_up(points, view.target, T_view_sensor, limits)
-            count = int(np.count_nonzero(verdicts == AGREES))
-            agree += verdicts == AGREES
-            violate += verdicts == VIOLATES
+            count = count_verdicts(points, *view.target, T_view_sensor, limits, agree, violate)
             if count < p.least_agreeing * len(points):
                 continue
             shared.append((-count, number, i))
-            back = look_up(view.planes.points, frame.target, inverse(T_view_sensor), limits)
-            seen += float(view.planes.weights[back == AGREES].sum(dtype=float))
-            through += float(view.planes.weights[back == VIOLATES].sum(dtype=float))
+            back = inverse(T_view_sensor)
+            inliers, violations = weigh_overlap(
+                view.planes.points, view.planes.weights, *own, back, limits
+            )
+            seen += inliers
+            through += violations
         total += float(weights.sum(dtype=float))
         agreeing += float(weights[agree > violate].sum(dtype=float))
         violating += float(weights[violate > agree].sum(dtype=float))
