@@ -82,25 +82,6 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
     assert itself.distance == told[first.frame_id].distance
 
 
-def test_a_cloud_of_many_views_says_so_on_its_way(
-    client: Client, map_name: str, seen: list[Floats], room_frames: tuple[DepthFrame, ...]
-) -> None:
-    client.create_map(map_name, model="depth")
-    T = room_frames[0].pose
-    assert T is not None
-    placed = write_ply(seen[0] @ T[:3, :3].T + T[:3, 3])
-    fused = FrameMeta(viewpoint=None)
-    [one] = client.upload_batch(map_name, [placed], [fused])
-    assert one.frame is not None
-    put = client.put_frame(map_name, "own", placed, fused, wait_s=PATIENCE_S)
-    assert put.state == "indexed", put.reason
-    for frame in (client.frame(map_name, one.frame.frame_id), client.frame(map_name, "own")):
-        assert (frame.viewpoint, frame.base_frame, frame.kind) == (None, None, "cloud")
-    answer = client.query(map_name, placed, fused, k=1)
-    assert answer.matches[0].validation.free_space_violations is None
-    assert answer.matches[0].validation.strength != "strong"
-
-
 def test_what_is_none_is_refused_alike(client: Client, map_name: str, seen: list[Floats]) -> None:
     client.create_map(map_name, model="depth")
     with pytest.raises(UnreadableCloud, match="PLY"):

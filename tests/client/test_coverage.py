@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from sceneprint.errors import InvalidRequest, JobOver, NotIndexed, UnknownMap
+from sceneprint.errors import InvalidRequest, UnknownMap
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
-from sceneprint_client.api.coverage import MapCoverage, NewMapCoverage
+from sceneprint_client.api.coverage import MapCoverage
 
 MAP = "covered"
 
@@ -75,17 +75,3 @@ def test_refusals(covered: Client, whole: MapCoverage) -> None:
     ):  # fmt: skip
         refused = covered._http.get(f"/v1/maps/{MAP}/coverage/{whole.job_id}/{path}", params=more)
         assert refused.status_code == 422
-
-
-def test_a_request_without_a_body_takes_the_defaults(covered: Client) -> None:
-    begun = covered._http.post(f"/v1/maps/{MAP}/coverage")
-    assert begun.json()["request"] == NewMapCoverage().model_dump(mode="json")
-    for _ in range(20):
-        queued = covered.compute(MapCoverage, MAP, timeout_s=0)
-        try:
-            covered.cancel_job(queued.job_id)
-            break
-        except JobOver:  # the worker was faster
-            covered.delete_product(MapCoverage, MAP, queued.job_id)
-    with pytest.raises(NotIndexed, match="is cancelled"):
-        covered.coverage_changes(MAP, queued.job_id, queued.job_id)

@@ -80,58 +80,6 @@ def test_options_are_the_same_however_they_come(served, maps, shots):
     assert by_json["frame"] == {"map": "ask-a", "frame_id": own}
 
 
-def test_a_robot_is_localized(served, maps, shots):
-    answer = told(served.client.post("/v1/maps/ask-a/queries", **shots[0].form()))
-    there = told(served.client.post("/v1/maps/ask-a/localize", **shots[0].form()))
-    assert (there["status"], there["map"]) == ("found", "ask-a")
-    assert there["pose"] == answer["location"]["pose"]
-    assert there["best"] == answer["matches"][0]
-    assert there["best"]["frame_id"] == maps["ask-a"][0] == there["matches"][0]
-    lost = told(served.client.post("/v1/maps/ask-a/localize", **shots[2].form()))
-    assert (lost["status"], lost["pose"], lost["best"]) == ("not_found", None, None)
-    stored = served.client.post("/v1/maps/ask-a/localize", json={"frame_id": maps["ask-a"][0]})
-    assert told(stored)["pose"] is None or told(stored)["best"]["frame_id"] == maps["ask-a"][1]
-
-
-def test_maps_are_asked_together(served, maps, shots):
-    body = {"frame": {"map": "ask-b", "frame_id": maps["ask-b"][0]}, "maps": ["ask-a", "ask-b"]}
-    answer = told(served.client.post("/v1/queries", json=body))
-    best = answer["matches"][0]
-    assert (best["map"], best["frame_id"], best["distance"]) == ("ask-a", maps["ask-a"][0], 0)
-    assert answer["location"]["map"] == "ask-a"
-    assert {n: one["counts"]["map"] for n, one in answer["per_map"].items()} == {
-        "ask-a": 4, "ask-b": 1,
-    }  # fmt: skip
-    alone = told(served.client.post("/v1/queries", json={**body, "maps": "ask-b"}))
-    assert (alone["per_map"], alone["maps"]) == (None, ["ask-b"])
-
-
-def test_two_frames_are_compared(served, maps, shots):
-    names = [{"map": "ask-a", "frame_id": one} for one in maps["ask-a"]]
-    pair = {"frame_a": names[0], "frame_b": names[1], "seed": 2}
-    stored = told(served.client.post("/v1/similarity", json=pair))
-    form = {"a": ("a.png", shots[0].png), "b": ("b.png", shots[1].png)}
-    meta = {f"meta_{name}": json.dumps({"intrinsics": shots[0].camera}) for name in "ab"}
-    both = served.client.post(
-        "/v1/similarity", files=form, data=meta | {"model": "depth", "seed": "2"}
-    )
-    mixed = served.client.post(
-        "/v1/similarity",
-        files={"b": form["b"]},
-        data={"meta_b": meta["meta_b"], "frame_a": json.dumps(names[0]), "seed": "2"},
-    )
-    found = [stored, told(both), told(mixed)]
-    for field in ("distance", "similarity", "validation", "model", "seed"):
-        assert found[0][field] == found[1][field] == found[2][field]
-    assert [one["a"] for one in found] == [names[0], None, names[0]]
-    frames = [one["transform"] and one["transform"]["child_frame"] for one in found]
-    assert frames in ([None] * 3, [f"{maps['ask-a'][1]}.optical", "b.optical", "b.optical"])
-    itself = told(served.client.post("/v1/similarity", json={**pair, "frame_b": names[0]}))
-    assert (itself["distance"], itself["similarity"]) == (0, 1.0)
-    bare = told(served.client.post("/v1/similarity", json={**pair, "validate": False}))
-    assert (bare["validation"], bare["transform"]) == (None, None)
-
-
 def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map):
     make_map(served, "ask-paper", "paper")
     named = {"map": "ask-a", "frame_id": maps["ask-a"][0]}

@@ -5,12 +5,10 @@ from __future__ import annotations
 import io
 import json
 import struct
-import zipfile
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sceneprint.formats.export import write_ply
 from sceneprint.types import DepthFrame, Floats
@@ -84,15 +82,6 @@ def found(answer: Any, status: str = "found") -> dict[str, Any]:
     return told
 
 
-def found_by_the_map(answer: Any) -> dict[str, Any]:
-    """Return an answer whose only match is weak, and which the map's frames confirm."""
-    told = found(answer)
-    assert told["location"]["verified_by"] == "map"
-    assert told["matches"][0]["validation"]["strength"] == "weak"
-    assert told["location"]["strength"] == "weak"
-    return told
-
-
 def test_what_is_told_of_a_cloud(served, hall, clouds):
     path, ids = hall
     image, ply, other = (served.client.get(f"{path}/frames/{one}").json() for one in ids)
@@ -106,39 +95,6 @@ def test_what_is_told_of_a_cloud(served, hall, clouds):
     # the coordinates as they came take the place of the robot's base
     assert (other["base_frame"], other["T_base_sensor"]["translation"]) \
         == ("cloud", other["viewpoint"])  # fmt: skip
-
-
-def test_a_cloud_finds_the_image_of_its_place_and_an_image_the_cloud(served, hall, shots, clouds):
-    path, ids = hall
-    http = served.client
-    by_cloud = found_by_the_map(http.post(f"{path}/queries", **form(write_ply(clouds[0]))))
-    first = by_cloud["matches"][0]
-    assert (by_cloud["kind"], first["frame_id"]) == ("cloud", ids[0])
-    assert first["validation"]["free_space_violations"] is not None
-    T = first["transform"]
-    assert (T["parent_frame"], T["child_frame"]) == (f"{ids[0]}.optical", "query.sensor")
-    assert np.allclose(T["matrix"], np.eye(4), atol=0.02)
-    assert np.allclose(by_cloud["location"]["pose"]["matrix"], shots[0].pose, atol=0.02)
-
-    by_image = found(http.post(f"{path}/queries", **shots[1].form()))
-    first = by_image["matches"][0]
-    assert (by_image["kind"], first["frame_id"]) == ("depth", ids[1])
-    T = first["transform"]
-    assert (T["parent_frame"], T["child_frame"]) == (f"{ids[1]}.sensor", "query.optical")
-    assert np.allclose(T["matrix"], np.eye(4), atol=0.02)
-    details = http.get(f"/v1/queries/{by_image['query_id']}/matches/{ids[1]}").json()
-    assert details["transform"] == T
-
-    # asked by its own coordinates, half a turn of the sensor and a shift away from those
-    turned = clouds[1] * (-1, 1, -1) + (5.0, 0.0, 1.0)
-    asked = raw(npy(turned), viewpoint="5,0,1")
-    there = found(http.post(f"{path}/localize", **asked))
-    expected = np.array(shots[1].pose) @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    assert np.allclose(there["pose"]["matrix"], expected, atol=0.02)
-    back = np.eye(4)
-    back[:3, 3] = (-5.0, 0.0, -1.0)  # T_sensor_cloud
-    assert there["base"]["child_frame"] == "cloud"
-    assert np.allclose(there["base"]["matrix"], expected @ back, atol=0.1)
 
 
 def pointcloud2(ros: Any, points: Floats, *, little: bool = True) -> bytes:
@@ -172,16 +128,6 @@ def test_a_pointcloud2_is_the_cloud_of_its_points(served, hall, shots, clouds, r
     assert http.delete(f"{path}/frames/{new.json()['frame_id']}").status_code == 204
 
 
-def test_two_uploads_are_compared_whatever_they_are(served, shots, clouds):
-    files = {"a": ("a", shots[0].png), "b": ("b", write_ply(clouds[0]))}
-    metas = {"meta_a": json.dumps({"intrinsics": shots[0].camera}), "meta_b": "{}"}
-    said = {**metas, "model": "depth"}
-    told = served.client.post("/v1/similarity", files=files, data=said).json()
-    assert told["validation"]["status"] == "accepted", told
-    assert (told["transform"]["parent_frame"], told["transform"]["child_frame"]) \
-        == ("a.optical", "b.sensor")  # fmt: skip
-
-
 def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
     path, ids = hall
     http = served.client
@@ -209,39 +155,6 @@ def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
         assert http.delete(f"{path}/frames/{one.json()['frame_id']}").status_code == 204
 
 
-def test_what_a_cloud_is_made_of(served, hall, clouds):
-    path, ids = hall
-    http, frame = served.client, f"{path}/frames/{ids[2]}"
-    sent = http.get(f"{frame}/upload")
-    assert sent.content == pcd(clouds[2], VIEWPOINT)
-    assert sent.headers["content-type"] == "application/octet-stream"
-    assert f'"{ids[2]}.pcd"' in sent.headers["content-disposition"]
-    assert http.get(f"{path}/frames/{ids[1]}/upload").headers["content-type"] == "application/ply"
-    for view in ("depth", "normals", "patches"):
-        answer = http.get(f"{frame}/preview.png", params={"view": view})
-        picture = Image.open(io.BytesIO(answer.content))
-        assert picture.width == 320
-        assert picture.text["frame"] == f"{ids[2]}.sensor"
-        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
-        assert view != "depth" or picture.text["Description"].startswith("range: yellow ")
-    own, base = (
-        read_points(http.get(f"{frame}/cloud.ply", params={"frame": one}).content)
-        for one in ("optical", "base")
-    )
-    assert np.allclose(base, own + VIEWPOINT, atol=1e-5)
-    near, far = np.percentile(np.linalg.norm(own, axis=1), (5, 95))
-    ranges = np.linalg.norm(clouds[2], axis=1)
-    assert np.allclose((near, far), np.percentile(ranges, (5, 95)), rtol=0.2)
-    assert http.get(f"{frame}/patches").json()["frame"] == f"{ids[2]}.sensor"
-    assert len(http.get(f"{frame}/signature").json()["n_patches"]) == 1
-
-
-def read_points(ply: bytes) -> Floats:
-    head, _, body = ply.partition(b"end_header\n")
-    assert b"property float nz" in head
-    return np.frombuffer(body, "<f4").reshape(-1, 6)[:, :3].astype(float)
-
-
 def test_a_viewpoint_is_content_and_a_base_can_be_edited(served, hall, refused):
     path, ids = hall
     http, frame = served.client, f"{path}/frames/{ids[2]}"
@@ -252,31 +165,6 @@ def test_a_viewpoint_is_content_and_a_base_can_be_edited(served, hall, refused):
     told = http.patch(frame, json={"T_base_sensor": None})
     assert told.json()["base_frame"] == "cloud"
     assert [told.json()["T_base_sensor"]["translation"][x] for x in "xyz"] == [*VIEWPOINT]
-
-
-@pytest.mark.usefixtures("with_open3d")
-def test_a_reconstruction_leaves_clouds_out_and_says_so(served, hall, shots, clouds, until):
-    path, ids = hall
-    http = served.client
-    asked = form(write_ply(clouds[0]))
-    answer = found_by_the_map(http.post(f"{path}/queries", **asked))
-    begun = http.post(f"/v1/queries/{answer['query_id']}/reconstruction", json={})
-    assert begun.status_code == 202, begun.text
-    job = f"/v1/reconstructions/{begun.json()['job_id']}"
-    until(lambda: http.get(job).json()["state"] in ("succeeded", "failed"))
-    told = http.get(job).json()
-    assert told["parent_frame"] == "query.sensor"
-    assert ids[0] in [one["frame_id"] for one in told["result"]["views"]]
-    assert None not in [one["frame_id"] for one in told["result"]["views"]]  # nor the query
-    assert told["result"]["query_explained"] > 0.9
-
-    answer = found(http.post(f"{path}/queries", **shots[1].form()))
-    begun = http.post(f"/v1/queries/{answer['query_id']}/reconstruction", json={"frames": [ids[1]]})
-    job = f"/v1/reconstructions/{begun.json()['job_id']}"
-    until(lambda: http.get(job).json()["state"] in ("succeeded", "failed"))
-    told = http.get(job).json()
-    assert told["state"] == "failed"
-    assert told["error"]
 
 
 @pytest.fixture(scope="module")
@@ -327,34 +215,3 @@ def test_an_image_has_no_viewpoint_and_needs_a_camera(served, gate, shots, refus
     problem = refused(answer, 422, "invalid-request")
     assert [one["field"] for one in problem["errors"]] == ["intrinsics"]
     assert served.client.get(f"{gate}/frames").json()["items"] == []
-
-
-def test_many_at_once(served, make_map, shots, clouds, until):
-    """A batch of both kinds, and an archive of clouds with poses and their units."""
-    path, http = make_map(served, "yard-of-clouds"), served.client
-    files = [("frame", ("a", shots[4].png)), ("frame", ("b", write_ply(clouds[4])))]
-    metas = json.dumps([{"intrinsics": shots[4].camera}, {}])
-    batch = http.post(f"{path}/frames/batch", files=files, data={"metas": metas}).json()
-    assert [one["status"] for one in batch["items"]] == [202, 202], batch
-
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        archive.writestr("run/clouds.json", json.dumps({"units_per_metre": 1000}))
-        for i in (0, 1):
-            archive.writestr(f"run/{i}.ply", write_ply(1000.0 * clouds[i]))
-        archive.writestr("run/0.pose.txt", "\n".join(" ".join(map(str, r)) for r in shots[0].pose))
-        archive.writestr("run/2.pcd", b"# .PCD v0.7\nnothing")
-    zipped = {"content": packed.getvalue(), "headers": {"Content-Type": "application/zip"}}
-    job = http.post(f"{path}/imports", **zipped).headers["location"]
-    until(lambda: http.get(job).json()["state"] == "succeeded")
-    job_id = job.rpartition("/")[2]
-    items = http.get(f"{path}/imports/{job_id}/items").json()["items"]
-    assert [(one["name"], one["status"]) for one in items] \
-        == [("run/0.ply", 202), ("run/1.ply", 202), ("run/2.pcd", 422)]  # fmt: skip
-    until(lambda: http.get(path).json()["frames"].get("indexed") == 4)
-    told = http.get(f"{path}/frames/{items[0]['frame_id']}").json()
-    assert (told["kind"], told["units_per_metre"], told["session"]) == ("cloud", 1000, "run")
-    assert np.allclose(told["pose"]["matrix"], shots[0].pose, atol=1e-6)
-    answer = found_by_the_map(http.post(f"{path}/queries", **form(write_ply(clouds[0]))))
-    assert answer["matches"][0]["frame_id"] == items[0]["frame_id"]
-    assert np.allclose(answer["matches"][0]["transform"]["matrix"], np.eye(4), atol=0.02)

@@ -24,36 +24,6 @@ from service.metrics import Sampler
 from tests.whole_engine import Engine
 
 
-def test_what_was_done_is_told(served, make_map, shots, until):
-    path, client = make_map(served, "figures"), served.client
-    sent = client.post(f"{path}/frames", **shots[0].form(), headers={"Prefer": "wait=200"}).json()
-    asked = client.post(f"{path}/queries", json={"frame_id": sent["frame_id"], "k": 1})
-    assert asked.status_code == 200
-    own = client.get("/v1/stats", params={"map": "figures", "minutes": 5}).json()
-    assert (own["total"]["received"], own["total"]["indexed"], own["frames"]) == (
-        1, 1, {"indexed": 1}
-    )  # fmt: skip
-    assert sum(one["indexed"] for one in own["minutes"]) == 1
-    assert own["use"] == {
-        "frames": 1, "bytes": len(shots[0].png),
-        "quota_frames": None, "quota_bytes": None, "retention_days": None,
-    }  # fmt: skip
-    every = client.get("/v1/stats").json()
-    assert (len(every["minutes"]), every["use"]) == (60, None)
-    assert every["total"]["indexed"] >= 1
-    (worker,) = every["workers"]
-    assert int(worker["name"].rpartition(":")[2]) in served.workers
-
-    def counted() -> dict[str, Any] | None:  # within ten seconds, as it says
-        total: dict[str, Any] = client.get("/v1/stats").json()["total"]
-        status = asked.json()["status"]
-        return total if total["queries"].get(status, 0) >= 1 else None
-
-    total = until(counted)
-    assert total["requests"] >= 3
-    assert 0 < total["latency"]["p50"] <= total["latency"]["p95"] <= total["latency"]["p99"] < 90
-
-
 @pytest.mark.parametrize("asked", [{"minutes": 0}, {"minutes": 61}, {"minutes": "x"}])
 def test_history_has_an_hour(served, refused, asked):
     refused(served.client.get("/v1/stats", params=asked), 422, "invalid-request")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
@@ -34,33 +33,6 @@ def by_form(served, rooms, shot, given: str, **meta: object) -> Any:
     return served.client.post(f"{rooms['path']}/queries", **form)
 
 
-def by_id(served, rooms, which: int, given: object) -> Any:
-    body = {"frame_id": rooms["ids"][which], "stages": "retrieve", "k": 50, "filter": given}
-    return served.client.post(f"{rooms['path']}/queries", json=body)
-
-
-def places(rooms, answer: Any) -> list[int]:
-    assert answer.status_code == 200, answer.text
-    told = answer.json()
-    assert told["counts"]["passed"] == len(told["matches"])
-    return sorted(rooms["ids"].index(match["frame_id"]) for match in told["matches"])
-
-
-@pytest.mark.parametrize(
-    ("given", "passing"),
-    [
-        ({"session": "run-1"}, [3, 4, 5]),
-        ({"captured_after": "2026-11-16T10:30:20+01:00"}, [2, 5]),
-        (None, [0, 1, 2, 3, 4, 5]),
-    ],
-)
-def test_only_what_passes_is_found(served, rooms, shots, given, passing):
-    assert places(rooms, by_form(served, rooms, shots[0], json.dumps(given))) == passing
-    for form in (given, json.dumps(given)):  # JSON takes text as well
-        others = [one for one in passing if one != 1]
-        assert places(rooms, by_id(served, rooms, 1, form)) == others
-
-
 @pytest.mark.parametrize(
     ("given", "field", "text"),
     [
@@ -90,25 +62,3 @@ def test_what_makes_no_sense_is_named(served, rooms, shots, refused, given, fiel
     problem = refused(by_form(served, rooms, shots[0], given), 422, "invalid-request")
     assert [one["field"] for one in problem["errors"]] == [field]
     assert text in problem["errors"][0]["reason"]
-
-
-def test_a_frame_is_kept_only_where_the_map_lacks_its_place(served, make_map, shots, refused):
-    path = make_map(served, "novel")
-    wait = {"Prefer": "wait=200"}
-
-    def send(shot, if_novel: str, headers: dict[str, str]) -> Any:
-        form = shot.form()
-        form["data"]["if_novel"] = if_novel
-        return served.client.post(f"{path}/frames", **form, headers=headers)
-
-    first = send(shots[0], "true", wait)
-    assert (first.status_code, first.json()["state"]) == (201, "indexed")
-    second = send(shots[1], "1", wait)
-    told = second.json()
-    assert (second.status_code, told["state"]) == (201, "redundant")
-    assert first.json()["frame_id"] in told["reason"]
-    again = send(shots[1], "false", {})  # it is sent once more, and to be kept
-    assert (again.status_code, again.json()["frame_id"]) == (202, told["frame_id"])
-    for wrong in ("0", "2", "nan", "maybe", ""):
-        problem = refused(send(shots[2], wrong, {}), 422, "invalid-request", "`if_novel` is")
-        assert [one["field"] for one in problem["errors"]] == ["if_novel"]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 from collections.abc import Callable
 from typing import Any
 
@@ -70,23 +68,3 @@ def test_lists_refuse_what_they_cannot_have(
         refused(answer, 422, "invalid-request", "order")
     for name in ("", "a\0", "a" * 256):
         refused(served.client.get(f"{path}/frames", params={"name": name}), 422, "invalid-request")
-
-
-def test_an_import_of_two_folders_into_one_session_is_one_path(
-    served: Any, make_map: Callable[..., str], small_shots: list[Any], until: Callable[..., Any]
-) -> None:
-    path, archive = make_map(served, "one-path"), io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as packed:
-        packed.writestr("scene/intrinsics.json", json.dumps(small_shots[0].camera))
-        for i, shot in enumerate(small_shots[:4]):
-            packed.writestr(f"scene/seq-0{1 + i // 2}/frame-{i % 2:06d}.depth.png", shot.png)
-    params = {"session": "run"}
-    body = {"content": archive.getvalue(), "headers": {"Content-Type": "application/zip"}}
-    job = served.client.post(f"{path}/imports", params=params, **body).json()["job_id"]
-    done = lambda: served.client.get(f"/v1/jobs/{job}").json()["state"] == "succeeded"  # noqa: E731
-    until(done)
-    listed = served.client.get(f"{path}/frames", params={"session": "run", "order": "taken"})
-    assert [(one["name"], one["sequence"]) for one in listed.json()["items"]] == [
-        ("frame-000000.depth.png", 0), ("frame-000001.depth.png", 1),
-        ("frame-000000.depth.png", 2), ("frame-000001.depth.png", 3),
-    ]  # fmt: skip

@@ -103,38 +103,3 @@ def test_what_asks_for_no_wait_is_not_waited_for(served, small_shots, prefer):
     shot = small_shots[80 + numbers.get(prefer, 5)]
     sent = served.client.post("/v1/maps/hurried/frames", **shot.form(), headers={"Prefer": prefer})
     assert (sent.status_code, sent.headers.get("preference-applied")) == (202, None)
-
-
-def test_pages_hold_every_frame_once_and_in_order(served, make_map, small_shots, refused):
-    path = make_map(served, "pages")
-    sent = []
-    for shot in small_shots[:7]:
-        answer = served.client.post(
-            f"{path}/frames", **shot.form(), headers={"Prefer": "respond-async, wait=200"}
-        )
-        assert answer.status_code == 201
-        sent.append(answer.json()["frame_id"])
-    served.client.delete(f"{path}/frames/{sent[2]}")
-    kept = [one for one in sent if one != sent[2]]
-    found: list[str] = []
-    cursor, sizes = None, []
-    while cursor is not None or not sizes:
-        asked = {"limit": 3} if cursor is None else {"limit": 3, "cursor": cursor}
-        page = served.client.get(f"{path}/frames", params=asked).json()
-        found += [one["frame_id"] for one in page["items"]]
-        sizes.append(len(page["items"]))
-        cursor = page["next_cursor"]
-    assert (found, sizes) == (kept, [3, 3])
-
-    def of_state(state: str) -> list[str]:
-        page = served.client.get(f"{path}/frames", params={"state": state}).json()
-        return [one["frame_id"] for one in page["items"]]
-
-    assert of_state("indexed") == kept
-    assert of_state("deleted") == [sent[2]]
-    assert of_state("received") == of_state("rejected") == of_state("failed") == []
-    for wrong in ({"state": "lost"}, {"limit": 0}, {"limit": 1001}, {"cursor": "-1"},
-                  {"cursor": "१"}, {"cursor": "9" * 19}, {"cursor": ""}):  # fmt: skip
-        answer = served.client.get(f"{path}/frames", params=wrong)
-        problem = refused(answer, 422, "invalid-request")
-        assert [one["field"] for one in problem["errors"]] == list(wrong)

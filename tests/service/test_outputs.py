@@ -6,7 +6,6 @@ import base64
 import io
 import re
 import socket
-from datetime import datetime
 from pathlib import Path
 
 import httpx
@@ -155,61 +154,6 @@ def test_what_cannot_be_made_is_refused(served, shown, refused, query, field):
     assert [one["field"] for one in problem["errors"]] == [field]
 
 
-def test_lists_by_metadata(served, shown, refused):
-    path, ids = shown
-
-    def listed(query):
-        page = served.client.get(f"{path}/frames?{query}")
-        assert page.status_code == 200, page.text
-        return [one["frame_id"] for one in page.json()["items"]]
-
-    assert listed("order=desc") == ids[::-1]
-    assert listed("tag=door&robot=r1&robot=r2") == ids[1:]
-    assert listed("captured_after=2026-11-16T10:30:01%2B01:00") == ids[1:]
-    assert listed("captured_before=2026-11-16T09:30:01Z&session=monday") == ids[:2]
-    assert listed("parent_frame=hall&has_pose=true&order=desc&limit=2") == ids[:0:-1]
-    assert listed("has_pose=false") == listed("received_before=2020-01-01T00:00:00Z") == []
-    page = served.client.get(f"{path}/frames?order=desc&limit=2").json()
-    assert listed(f"order=desc&limit=2&cursor={page['next_cursor']}") == ids[:1]
-    content = served.client.get(f"{path}/frames/{ids[1]}").json()["content_id"]
-    assert listed(f"content_id={content}") == [ids[1]]
-    for bad in ("sesion=monday", "order=up", "captured_after=2026-11-16T09:30:00", "tag=",
-                "content_id=abc", "has_pose=perhaps", "limit=0"):  # fmt: skip
-        problem = refused(served.client.get(f"{path}/frames?{bad}"), 422, "invalid-request")
-        assert bad.partition("=")[0] in problem["errors"][0]["field"]
-
-
-def test_sessions_and_a_trajectory(served, shown, refused):
-    path, ids = shown
-    (session,) = served.client.get(f"{path}/sessions").json()["items"]
-    assert session == {
-        "robot": "r2", "session": "monday", "frames": {"indexed": 3}, "with_pose": 3,
-        "first_captured_at": "2026-11-16T09:30:00Z", "last_captured_at": "2026-11-16T09:30:02Z",
-        "parent_frames": ["hall"], "tags": ["door"],
-    }  # fmt: skip
-    text = served.client.get(f"{path}/trajectory?session=monday")
-    assert text.headers["content-type"].partition(";")[0] == "text/plain"
-    start = datetime.fromisoformat("2026-11-16T09:30:00Z").timestamp()
-    lines = [line for line in text.text.splitlines() if not line.startswith("#")]
-    assert [[float(word) for word in line.split()] for line in lines] == [
-        [start + i, i, 0, 1, 0, 0, 0, 1] for i in range(3)
-    ]
-    assert "# poses of the sensors' frames in hall, metres" in text.text
-    url = f"{path}/trajectory?session=monday&captured_after=2026-11-16T09:30:01Z"
-    told = served.client.get(url, headers={"Accept": "application/json"}).json()
-    assert (told["frame_ids"], told["parent_frame"], told["left_out"]) == (ids[1:], "hall", 0)
-    assert told["poses"] == [[start + i, i, 0, 1, 0, 0, 0, 1] for i in (1, 2)]
-    thin = served.client.get(f"{path}/trajectory?session=monday&most=2")
-    lines = [line for line in thin.text.splitlines() if not line.startswith("#")]
-    assert [float(line.split()[0]) - start for line in lines] == [0, 2]
-    assert "# poses: 2 of 3, evenly spaced; frames left out: 1" in thin.text
-    refused(served.client.get(f"{path}/trajectory"), 422, "invalid-request", "session: ")
-    for most in (1, 10_001):
-        bad = served.client.get(f"{path}/trajectory?session=monday&most={most}")
-        refused(bad, 422, "invalid-request", "most: ")
-    refused(served.client.get(f"{path}/sessions?cursor=x"), 422, "invalid-request", "is not valid")
-
-
 def test_an_edit_does_not_overwrite_another(served, shown, refused):
     path, ids = shown
     url = f"{path}/frames/{ids[2]}"
@@ -247,23 +191,3 @@ def test_an_edit_does_not_overwrite_another(served, shown, refused):
         path, json={"title": None}, headers={"If-Match": whole.headers["etag"]}
     )
     refused(late, 412, "precondition-failed")
-
-
-def test_edits_that_are_none(served, shown, refused):
-    path, ids = shown
-    for url in (path, f"{path}/frames/{ids[0]}"):
-        before = served.client.get(url).json()
-        for body, headers, status, kind in (
-            (b"{}", {"Content-Type": "text/plain"}, 415, "unsupported-type"),
-            (b"{", {"Content-Type": "application/json"}, 400, "malformed-body"),
-            (b"[]", {"Content-Type": "application/json"}, 422, "invalid-request"),
-            (b'{"nobody": 1}', {"Content-Type": "application/json"}, 422, "invalid-request"),
-            (b" " * (1 << 19), {"Content-Type": "application/json"}, 413, "too-large"),
-        ):
-            refused(served.client.patch(url, content=body, headers=headers), status, kind)
-        assert served.client.get(url).json() == before
-    refused(served.client.patch(f"{path}/frames/x", json={}), 404, "unknown-frame")
-    refused(served.client.patch("/v1/maps/nowhere", json={}), 404, "unknown-map")
-    matrix = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
-    url = f"{path}/frames/{ids[0]}"
-    refused(served.client.patch(url, json={"pose": {"matrix": matrix}}), 422, "invalid-pose")

@@ -36,20 +36,6 @@ def odometry(T: Any) -> dict[str, Any]:
     return {"matrix": np.array(T).tolist(), "parent_frame": "odom"}
 
 
-def test_the_last_of_several_frames_is_placed(served, path, shots):
-    start = np.eye(4)
-    start[:3, 3] = 5.0, 6.0, 7.0  # of odometry nothing but what lies between frames counts
-    asked = [shots[1], shots[0]]
-    poses = [odometry(start @ np.array(shot.pose)) for shot in asked]
-    answer = ask(served, path, asked, poses, keep="false", k="3")
-    assert answer.status_code == 200, answer.text
-    there = answer.json()
-    assert (there["status"], there["verified_by"]) == ("found", "matches")
-    np.testing.assert_allclose(there["pose"]["matrix"], shots[0].pose, atol=0.03)
-    alone = served.client.post(f"{path}/localize", **shots[0].form())
-    assert there["votes"] == 2 * alone.json()["votes"]
-
-
 @pytest.mark.parametrize(
     ("count", "poses", "more", "told"),
     [

@@ -44,34 +44,6 @@ def test_the_answer_is_told_in_the_same_bytes(served, asked, shots):
     assert served.client.get(f"/v1/queries/{unkept['query_id']}").status_code == 404
 
 
-def test_everything_about_it_is_had(served, asked):
-    path, best = f"/v1/queries/{asked['query_id']}", asked["matches"][0]
-    cloud = served.client.get(f"{path}/cloud.ply")
-    assert (cloud.status_code, cloud.headers["content-type"]) == (200, "application/ply")
-    assert cloud.content.startswith(b"ply\nformat binary_little_endian 1.0\ncomment frame query.")
-    told = served.client.get(f"{path}/similarities").json()
-    assert {one["frame_id"] for one in told["frames"]} == {m["frame_id"] for m in asked["matches"]}
-    matrix = np.array(told["similarity"])
-    assert (matrix == matrix.T).all()
-    assert (np.diag(matrix) == 1).all()
-    assert matrix[0, 1] == round(best["similarity"], 4)
-    assert len(served.client.get(f"{path}/similarities?limit=1").json()["similarity"]) == 2
-    match = served.client.get(f"{path}/matches/{best['frame_id']}?map=looked-at").json()
-    for name in ("validation", "transform", "uncertainty"):
-        assert match[name] == best[name]
-    counted = len(match["query"]["inliers"]) + len(match["match"]["inliers"])
-    assert counted == best["validation"]["inliers"]
-    seen = set()
-    for color in ("source", "normal", "residual"):
-        laid = served.client.get(f"{path}/matches/{best['frame_id']}/overlay.ply?color={color}")
-        assert (laid.status_code, laid.headers["content-type"]) == (200, "application/ply")
-        assert f"comment frame {best['frame_id']}.optical\n".encode() in laid.content
-        seen.add(laid.content)
-    apart = f"{path}/matches/{best['frame_id']}/overlay.ply?transform=none"
-    seen.add(served.client.get(apart).content)
-    assert len(seen) == 4
-
-
 def test_what_is_not_there(served, asked, refused):
     path, best = f"/v1/queries/{asked['query_id']}", asked["matches"][0]["frame_id"]
     for tail in ("", "/cloud.ply", "/similarities", "/matches/x", "/matches/x/overlay.ply"):

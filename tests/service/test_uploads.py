@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections.abc import Callable
@@ -61,42 +60,6 @@ def test_depth_that_does_not_look_like_it_is_taken_when_trusted(
     cloud = {"content": b"ply\n", "headers": {"Content-Type": "application/ply"}}
     answer = http.post(f"{hall}/frames", params={"trust_depth": "true"}, **cloud)
     refused(answer, 422, "invalid-request", "`trust_depth` would have no effect")
-
-
-def test_a_frame_has_the_id_it_was_put_under(served, hall, small_shots, refused) -> None:
-    http, shot = served.client, small_shots[60]
-    path = f"{hall}/frames/Robot-1_0.png"
-    first = http.put(path, **shot.form(session="a"), headers={"Prefer": "wait=200"})
-    assert (first.status_code, first.json()["frame_id"]) == (201, "Robot-1_0.png")
-    again = http.put(path, **shot.form(session="a"))
-    assert (again.status_code, again.json()) == (200, first.json())
-    found = http.get(path).json()
-    assert (found["frame_id"], found["session"]) == ("Robot-1_0.png", "a")
-    problem = refused(http.put(path, **shot.form(session="b")), 409, "frame-conflict")
-    assert "a different session." in problem["detail"]
-    other = refused(http.put(path, **small_shots[1].form(session="a")), 409, "frame-conflict")
-    assert "different content" in other["detail"]
-    # the same content under another id is a frame of its own, and shares the blob
-    twin = http.put(f"{hall}/frames/twin", **shot.form(session="b"))
-    assert (twin.status_code, twin.json()["frame_id"]) == (202, "twin")
-    blob = hashlib.sha256(shot.png).hexdigest()
-    kept = served.folder / "blobs" / blob[:2] / blob
-    assert kept.read_bytes() == shot.png
-    # and POST goes on to know the content, by its metadata
-    assert http.post(f"{hall}/frames", **shot.form(session="a")).json()["frame_id"] == (
-        "Robot-1_0.png"
-    )
-    assert http.post(f"{hall}/frames", **shot.form(session="b")).json()["frame_id"] == "twin"
-    refused(http.post(f"{hall}/frames", **shot.form(session="c")), 409, "frame-conflict")
-    # who is deleted gives the id up, and the other keeps the blob
-    assert http.delete(path).status_code == 204
-    assert http.put(path, **small_shots[1].form()).status_code == 202
-    assert kept.exists()
-    assert http.delete(f"{hall}/frames/twin").status_code == 204
-    assert kept.exists()  # the deletion can be undone
-    back = http.post(f"{hall}/frames/twin/restore")
-    assert (back.status_code, back.json()["session"]) == (200, "b")
-    refused(http.post(f"{hall}/frames/twin/restore"), 404, "unknown-frame")
 
 
 @pytest.mark.parametrize("name", [".hidden", "-x", "_x", "a b", "ä", "x" * 65, "a%0ab"])
@@ -224,35 +187,6 @@ def batch(shots: list[Any], metas: object, **fields: str) -> dict[str, Any]:
     return {"files": files, "data": {"metas": json.dumps(metas), **fields}}
 
 
-def test_one_bad_frame_of_a_batch_costs_no_other(served, hall, small_shots) -> None:
-    http, shots = served.client, small_shots[6:10]
-    metas: list[dict[str, Any]] = [{"intrinsics": one.camera, "session": "b"} for one in shots]
-    assert http.post(f"{hall}/frames", **shots[1].form(session="b")).status_code == 202
-    conflict = http.post(f"{hall}/frames", **shots[2].form(session="other"))
-    assert conflict.status_code == 202
-    sent = [*shots, b"no image", shots[0], shots[3]]
-    said = [*metas, metas[0], metas[0], {**metas[3], "robott": "x"}]
-    key = {"Idempotency-Key": "batch"}
-    answer = http.post(f"{hall}/frames/batch", **batch(sent, said), headers=key)
-    assert answer.status_code == 200, answer.text
-    items = answer.json()["items"]
-    assert [one["status"] for one in items] == [202, 200, 409, 202, 422, 200, 422]
-    assert [one["problem"] and one["problem"]["type"] for one in items] == [
-        None, None, "/problems/frame-conflict", None, "/problems/unreadable-frame", None,
-        "/problems/invalid-request",
-    ]  # fmt: skip
-    assert items[5]["frame"]["frame_id"] == items[0]["frame"]["frame_id"]
-    assert items[6]["problem"]["errors"] == [
-        {"field": "robott", "reason": "Extra inputs are not permitted"}
-    ]
-    again = http.post(f"{hall}/frames/batch", **batch(sent, said), headers=key)
-    assert again.headers["idempotent-replayed"] == "true"
-    assert [one["status"] for one in again.json()["items"]] == [202, 200, 409, 202, 422, 200, 422]
-    assert [one["problem"] for one in again.json()["items"]] == [one["problem"] for one in items]
-    for one in (0, 3):
-        assert http.get(f"{hall}/frames/{items[one]['frame']['frame_id']}").status_code == 200
-
-
 def test_a_batch_that_is_none_is_refused_whole(
     served, hall, small_shots, refused: Callable[..., Any]
 ) -> None:
@@ -271,26 +205,6 @@ def test_a_batch_that_is_none_is_refused_whole(
             "unsupported-type")  # fmt: skip
     frames = http.get(f"{hall}/frames", params={"limit": 1000}).json()["items"]
     assert not any(one["bytes"] == len(shot.png) for one in frames)
-
-
-def test_a_compressed_depth_message_of_ros_is_its_png(served, make_map, shots) -> None:
-    """The data of the message as it is, with the 12 bytes before the PNG: the same content."""
-    make_map(served, "transported")
-    path = "/v1/maps/transported/frames"
-    first = served.client.post(path, **shots[0].form())
-    assert first.status_code == 202, first.text
-    data = bytes(12) + shots[0].png
-    camera = {name: shots[0].camera[name] for name in ("fx", "fy", "cx", "cy")}
-    again = served.client.post(
-        path, params=camera, content=data, headers={"Content-Type": "application/octet-stream"}
-    )
-    assert again.status_code == 200, again.text
-    assert again.json()["frame_id"] == first.json()["frame_id"]
-    without = served.client.post(
-        path, content=data, headers={"Content-Type": "application/octet-stream"}
-    )
-    assert without.status_code == 422
-    assert "fx" in without.text
 
 
 def test_up_goes_there_and_back(served, make_map, small_shots):
