@@ -114,20 +114,6 @@ def test_uv_installs_the_lock_and_then_our_packages(machine: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("variables", "index"),
-    [
-        ({}, ""),
-        ({"MIRROR": "http://a"}, "http://a"),
-        ({"MIRROR": "http://a", "PIP_INDEX_URL": "http://b"}, "http://b"),
-        ({"PIP_INDEX_URL": "http://b", "UV_DEFAULT_INDEX": "http://c"}, "http://c"),
-    ],
-)
-def test_uv_takes_the_index_of_pip(machine: Path, variables: dict[str, str], index: str) -> None:
-    done, _ = install(machine, "python", "environment", **variables)
-    assert done.stdout.splitlines()[1:] == [f"from {index}".strip()] * 2
-
-
-@pytest.mark.parametrize(
     ("variables", "reason"),
     [
         ({"BROKEN": f"{INSTALL.parent}/../requirements-uv.lock"}, "uv cannot be installed"),

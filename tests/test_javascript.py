@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -23,18 +22,6 @@ def check(folder: Path, path: str) -> subprocess.CompletedProcess[str]:
         text=True,
         check=False,
     )
-
-
-def test_without_node_one_line_says_that_it_was_skipped(tmp_path: Path) -> None:
-    done = check(FOLDER, str(tmp_path))
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == "JavaScript not checked: node or npm is not installed\n"
-
-
-def test_make_lint_runs_it() -> None:
-    recipe = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    assert recipe is not None
-    assert "@tools/javascript/check" in recipe[1].split()
 
 
 def test_its_tools_are_pinned_and_locked() -> None:

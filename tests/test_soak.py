@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 from collections import Counter
 from contextlib import closing
 from dataclasses import replace
@@ -18,17 +17,16 @@ from benchmarks.soak import attacks, audit, faults
 from benchmarks.soak.__main__ import parse_fault
 from benchmarks.soak.attacks import ATTACKS, AttackFigures
 from benchmarks.soak.audit import Found, check, count_separated, wrong_matches
-from benchmarks.soak.broken_uploads import FILES, BrokenFigures, mutated
-from benchmarks.soak.failover_client import Exchange, FailoverClient, RequestLog
-from benchmarks.soak.faults import CUT_OFF, FROZEN, FULL, PRIMARY, Kill, Promotion, schedule
-from benchmarks.soak.lock_samples import LockSampler, LockShares
-from benchmarks.soak.operations import OperationFigures, call_as_everybody, read_report
+from benchmarks.soak.broken_uploads import BrokenFigures
+from benchmarks.soak.failover_client import FailoverClient, RequestLog
+from benchmarks.soak.faults import CUT_OFF, FROZEN, FULL, PRIMARY, Promotion
+from benchmarks.soak.lock_samples import LockShares
+from benchmarks.soak.operations import OperationFigures, call_as_everybody
 from benchmarks.soak.plan import FAULTS, PLANS, Plan
-from benchmarks.soak.recordings import GRIDS, Shot, walks
-from benchmarks.soak.robots import Acknowledged, K, Ledger, Listener, Search
-from benchmarks.soak.run import SoakFigures, drive, outages
+from benchmarks.soak.recordings import Shot, walks
+from benchmarks.soak.robots import Acknowledged, Ledger, Listener, Search
+from benchmarks.soak.run import SoakFigures, drive
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.store import open_store
 from sceneprint.store.tables import audit as audit_table
@@ -167,53 +165,6 @@ def test_every_operation_answers_as_declared(tmp_path: Path, shots: list[Shot]) 
     assert all(one.requests > one.operations >= 40 for one in found[:4])
 
 
-def test_the_schedule_is_that_of_its_seed() -> None:
-    due = schedule(100, {"kill": 20, "failover": 2}, random.Random(3))
-    assert due == schedule(100, {"kill": 20, "failover": 2}, random.Random(3))
-    assert due != schedule(100, {"kill": 20, "failover": 2}, random.Random(4))
-    assert due == sorted(due)
-    assert all(10 <= at <= 90 for at, _ in due)
-    primaries = [at for at, victim in due if victim == PRIMARY]
-    assert len(due) == 22
-    assert [at < 50 for at in primaries] == [True, False]
-    more = schedule(100, {"kill": 20, "failover": 2, "freeze": 1, "partition": 3}, random.Random(3))
-    assert Counter(victim for _, victim in more)[CUT_OFF] == 3
-    assert [one for one in more if one[1] not in (CUT_OFF, FROZEN)] == due
-
-
-def test_walks_have_nothing_in_common(recording: Path) -> None:
-    found = walks(recording, 3, 24)
-    assert [len(one) for one in found] == [24, 24, 24]
-    assert len({shot.png for walk in found for shot in walk}) == 72
-    assert {shot.meta.intrinsics.width for shot in found[0] if shot.meta.intrinsics} == {160}
-    short = walks(recording, 30, 3)  # two robots share the frames of a grid
-    assert len({shot.png for walk in short for shot in walk}) == 90
-    with pytest.raises(DatasetError, match=f"fewer than 850 frames in {GRIDS} grids"):
-        walks(recording, 1, 850)
-
-
-def test_locks_are_sampled(postgres_url: str, tmp_path: Path) -> None:
-    with closing(open_store(postgres_url, tmp_path)) as store:
-        with store.database.write():  # everybody waits
-            everybody = sampled(postgres_url)
-        with store.database.write(map_number=7), store.database.write(map_number=8):
-            two_maps = sampled(postgres_url)
-        nobody = sampled(postgres_url)
-    assert everybody.everybody == everybody.seconds > 0 == everybody.one_map
-    assert two_maps.one_map == pytest.approx(2 * two_maps.seconds)
-    assert two_maps.everybody == nobody.everybody == nobody.one_map == 0 < nobody.seconds
-
-
-def sampled(url: str) -> LockShares:
-    """A few samples of the locks of a server."""
-    sampler = LockSampler(lambda: url.replace("+psycopg", ""))
-    sampler.start()
-    while sampler.shares.samples < 5 and sampler.is_alive():
-        pass
-    sampler.stop()
-    return sampler.shares
-
-
 def test_what_is_lost_is_seen(
     tmp_path: Path, shots: list[Shot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -281,13 +232,6 @@ OUT_OF_ORDER = "the matches are not in their order, or one is there twice"
 def test_a_wrong_answer_is_seen(answer: Search, wrong: list[str]) -> None:
     vectors = {"s0": np.array([0, 0]), "s1": np.array([4, 0]), "w": np.array([4, 4])}
     assert wrong_matches(answer, {"w": (6.0, 7.0)}, ["s0", "s1"], vectors) == wrong
-
-
-def test_a_frame_beyond_the_last_match_is_not_missed() -> None:
-    vectors = {"s0": np.array([0]), "s1": np.array([40])}
-    vectors |= {f"w{i}": np.array([i]) for i in range(1, K + 1)}
-    answer = search(*[(f"w{i}", i * i) for i in range(1, K + 1)])
-    assert wrong_matches(answer, {}, ["s0", "s1"], vectors) == []
 
 
 NOTHING: dict[str, Any] = {"acknowledged": 9, "indexed": 9, "looked_up": 9, "found": 9}
@@ -359,44 +303,9 @@ def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sou
     assert figures(found, **changed).sound is sound
 
 
-def test_a_wait_counts_for_the_first_fault_within_it() -> None:
-    kills = [Kill("service", 10.0), Kill("worker", 12.0), Kill("service", 20.0)]
-    exchanges = [
-        Exchange("upload", 9.0, 13.0, 2), Exchange("query", 14.0, 15.0, 3),
-        Exchange("upload", 1.0, 30.0, 1),
-    ]  # fmt: skip
-    assert outages(kills, exchanges) == {"service": [3.0, 0.0], "worker": [1.0]}
-
-
 def test_every_plan_has_known_faults_and_marks_in_the_page() -> None:
     text = (Path(__file__).parent.parent / "docs" / "fault_injection.md").read_text()
     for name, plan in PLANS.items():
         assert set(plan.faults) <= set(FAULTS)
         assert text.count(f"<!-- {name}:begin -->") == text.count(f"<!-- {name}:end -->") == 1
     assert parse_fault("full-disk=1") == ("full-disk", 1)
-
-
-def test_mutations_are_the_same_each_time_and_break_things(shots: list[Shot]) -> None:
-    first = [mutated(shots, 3, number) for number in range(50)]
-    assert first == [mutated(shots, 3, number) for number in range(50)]
-    assert first != [mutated(shots, 4, number) for number in range(50)]
-    sound = {(one.png, one.meta.model_dump_json()) for one in shots}
-    assert sum((one.data, one.meta) not in sound for one in first) >= 48
-    assert {mutated(shots, 3, number).kind for number in range(400)} == {"json", *FILES}
-
-
-@pytest.mark.parametrize(
-    ("line", "code", "figures", "sound"),
-    [
-        ("15575 generated, 1 found 1 unique failure", 1, (15575, 15574), False),
-        ("90 generated, 7 found 2 unique failures", 1, (90, 83), False),
-        ("15330 generated, 15330 passed", 0, (15330, 15330), True),
-        ("15330 generated, 15330 passed", 1, (15330, 0), False),
-        ("no test cases were generated", 0, (0, 0), False),
-    ],
-)
-def test_what_schemathesis_counted(
-    line: str, code: int, figures: tuple[int, int], sound: bool
-) -> None:
-    found = read_report("nobody", f"  Tested: 104\n\nTest cases:\n  {line}\n", code)
-    assert (found.requests, found.passed, found.sound) == (*figures, sound)

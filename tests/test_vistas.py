@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sceneprint.pictures import depth_view, normals_view, project_labels, vista_of
+from sceneprint.pictures import vista_of
 from sceneprint.types import Floats, Intrinsics, Sphere, Surface
 
 
@@ -73,27 +73,3 @@ def test_points_in_no_order_are_seen_from_above() -> None:
     assert at[:, 0].max() < rows / 2 < rows - 1  # y is up
     assert at[:, 1].min() > columns / 2  # x to the right
     assert under.shape[1] - 1 not in vista.pixels
-
-
-def test_what_pictures_of_clouds_say() -> None:
-    _, text = depth_view(around(2))
-    assert text["Description"].startswith("range: yellow 1.")
-    _, text = normals_view(around(2))
-    assert "of the x, y and z of its own axes" in text["Description"]
-    flat = np.random.default_rng(3).uniform(1, 3, (1, 50, 3)) * (1, 1, 0.1)
-    colours, text = depth_view(surface(flat, None))
-    assert {"low_m", "high_m"} <= text.keys()
-    top = vista_of(surface(flat, None))
-    highest = np.argmax(np.where(top.shown, top.of(top.distances), -9))
-    assert colours.reshape(-1, 3)[highest].tolist() == [253, 231, 37]  # yellow
-    nothing = surface(np.zeros((1, 3, 3)), None)
-    assert depth_view(nothing)[0].shape == (1, 1, 3)
-
-
-def test_labels_of_points_lie_where_the_points_are() -> None:
-    seen = around(2)
-    vista = vista_of(seen)
-    points = seen.points.reshape(-1, 3)
-    order = np.random.default_rng(5).permutation(12)
-    labels = np.arange(12, dtype=np.int32)[order]
-    assert np.array_equal(project_labels(vista, seen, points[order] * 1.01, labels), vista.pixels)

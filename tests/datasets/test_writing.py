@@ -68,18 +68,6 @@ def test_others_may_read_what_is_written(tmp_path: Path) -> None:
     assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o644
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_bad_scale(scale: float, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="depth_scale"):
-        write_depth_png(tmp_path / "a.png", np.ones((2, 2), np.float32), scale)
-
-
-@pytest.mark.parametrize("shape", [(4,), (2, 2, 1), (0, 3)])
-def test_bad_shape(shape: tuple[int, ...], tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="not \\(H, W\\)"):
-        write_depth_png(tmp_path / "a.png", np.ones(shape, np.float32), 1000.0)
-
-
 def test_a_trajectory_is_read_again_without_loss(tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
     poses = []
@@ -97,13 +85,3 @@ def test_a_trajectory_is_read_again_without_loss(tmp_path: Path) -> None:
     assert read.positions.tolist() == [T[:3, 3].tolist() for _, T in poses]
     for q, (_, T) in zip(read.quaternions, poses, strict=True):
         np.testing.assert_allclose(rotation_of(q), T[:3, :3], atol=1e-14)
-
-
-def test_a_trajectory_by_hand() -> None:
-    T = np.array([[0, -1, 0, 1], [1, 0, 0, -2], [0, 0, 1, 0.5], [0, 0, 0, 1]], float)  # 90 deg of z
-    (line,) = trajectory_text([trajectory_row(12.5, T)]).splitlines()
-    half = 0.5**0.5
-    assert [float(word) for word in line.split()] == pytest.approx(
-        [12.5, 1, -2, 0.5, 0, 0, half, half], abs=1e-13
-    )
-    assert trajectory_text([], ["nobody"]) == "# nobody\n"

@@ -13,17 +13,10 @@ import pytest
 from sceneprint.cli import main
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.models import Model, save_model
-from sceneprint.types import Cloud, DepthFrame, Floats, Floats32
+from sceneprint.types import Floats
 from sceneprint_lab.evaluation.baselines import (
-    BASELINES,
     FpfhVlad,
-    Rings,
-    Thumbnails,
     features,
-    ring_descriptor,
-    ring_distance,
-    ring_distances,
-    thumbnail,
     vlad,
 )
 from sceneprint_lab.evaluation.measures import points_of
@@ -35,90 +28,6 @@ def turned(points: Floats, sectors: int) -> Floats:
     c, s = np.cos(angle), np.sin(angle)
     result: Floats = points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
     return result
-
-
-def walls(seed: int) -> Floats:
-    """A few hundred points about the sensor, none near the edge of a sector."""
-    rng = np.random.default_rng(seed)
-    sectors = rng.integers(0, 60, 400) + rng.uniform(0.2, 0.8, 400)
-    angle, radius = sectors * 2 * np.pi / 60, rng.uniform(1, 79, 400)
-    return np.stack(
-        [radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-1.5, 9, 400)], axis=1
-    )
-
-
-def test_the_rings_of_five_points_by_hand() -> None:
-    points = np.array(
-        [
-            [3.0, 0.1, 0.5],  # the first ring of 4 m, the first sector of 6 degrees
-            [3.5, 0.1, 1.5],  # the same cell, and higher
-            [0.1, 9.0, -0.5],  # the third ring; 89 degrees: sector 14
-            [-50.0, -0.1, 3.0],  # ring 12; just over 180 degrees: sector 30
-            [80.0, 0.1, 9.0],  # beyond the last ring
-        ]
-    )
-    found = ring_descriptor(points)
-    assert found.shape == (20, 60)
-    assert {tuple(at) for at in np.argwhere(found)} == {(0, 0), (2, 14), (12, 30)}
-    assert found[0, 0] == np.float32(3.5)  # 1.5 m, lifted by 2
-    assert found[2, 14] == np.float32(1.5)
-    assert found[12, 30] == np.float32(5.0)
-
-
-def test_turning_by_sectors_shifts_the_columns() -> None:
-    points = walls(2)
-    own, other = ring_descriptor(points), ring_descriptor(turned(points, 7))
-    np.testing.assert_array_equal(np.roll(own, 7, axis=1), other)
-    distance, shift = ring_distance(own, other)
-    assert shift == 7
-    assert distance == pytest.approx(0.0, abs=1e-12)
-
-
-def plain_distance(a: Floats32, b: Floats32) -> float:
-    """The distance as it is printed, one cosine at a time."""
-    best = 2.0
-    for shift in range(a.shape[1]):
-        moved, total, count = np.roll(b, -shift, axis=1).astype(float), 0.0, 0
-        for s in range(a.shape[1]):
-            x, y = a[:, s].astype(float), moved[:, s]
-            if x.any() and y.any():
-                total += 1 - float(x @ y / np.linalg.norm(x) / np.linalg.norm(y))
-                count += 1
-        best = min(best, total / count) if count else best
-    return best
-
-
-def test_ring_distance_against_the_plain_loop() -> None:
-    own = ring_descriptor(walls(3)[:120])
-    others = np.stack([ring_descriptor(walls(seed)[:120]) for seed in (4, 5)])
-    found = ring_distances(own, others)
-    np.testing.assert_allclose(found, [plain_distance(own, o) for o in others], atol=1e-12)
-    assert min(found) > 0.05
-    assert ring_distance(own, np.zeros_like(own))[0] == 2.0  # nothing to compare
-
-
-def test_a_thumbnail_by_hand() -> None:
-    depth = np.zeros((4, 4), np.float32)
-    depth[0, 0], depth[1, 1] = 2.0, 4.0  # one cell of four pixels, two of them seen
-    depth[3, 2:] = 1.0
-    found = thumbnail(depth, 2, 2)
-    np.testing.assert_array_equal(found, np.array([[0.375, 0.0], [0.0, 1.0]], np.float32))
-
-
-def test_thumbnails_compared_by_hand() -> None:
-    own = np.array([[0.5, 0.0], [0.25, 1.0]], np.float32)
-    other = np.array([[0.75, 0.5], [0.0, 0.5]], np.float32)
-    by_difference, by_correlation = Thumbnails("l1"), Thumbnails("zncc")
-    # both have filled two cells: 0.25 and 0.5 apart
-    stack = np.stack([other, own, np.zeros_like(own)])
-    np.testing.assert_array_equal(by_difference.distances(own, stack), [0.375, 0.0, np.inf])
-    a, b = by_correlation.finish(own), by_correlation.finish(other)
-    assert np.linalg.norm(a) == pytest.approx(1.0)
-    assert a.sum() == pytest.approx(0.0, abs=1e-6)
-    found = by_correlation.distances(a, np.stack([b, a, by_correlation.finish(0 * own + 1)]))
-    np.testing.assert_allclose(found[1:], [0.0, 1.0], atol=1e-6)
-    # less their means 7/12 and 7/12: (-1, 0, -4, 5) and (2, -1, 0, -1), twelfths
-    assert found[0] == pytest.approx(1 + 7 / np.sqrt(42 * 6), abs=1e-6)
 
 
 def test_vlad_by_hand() -> None:
@@ -154,21 +63,6 @@ def test_fpfh_knows_a_cloud_that_was_turned(with_open3d: None) -> None:
     near = asked.finish(features(turned(points, 10)))
     distances = asked.distances(descriptor, np.stack([near, floors]))
     assert distances[0] < 0.5 * distances[1]
-
-
-def test_which_frames_each_is_made_for(room_frames: tuple[DepthFrame, ...]) -> None:
-    seen, fused = Cloud(np.ones((3, 3), np.float32)), Cloud(np.ones((3, 3), np.float32), False)
-    made_for = {
-        name: [make(9.0).takes(frame) for frame in (room_frames[0], seen, fused)]
-        for name, make in BASELINES.items()
-    }
-    assert made_for == {
-        "thumbnail_l1": [True, False, False],
-        "thumbnail_zncc": [True, False, False],
-        "fpfh_vlad": [True, True, True],
-        "rings": [False, True, False],
-    }
-    assert Rings().read(seen).sum() > 0
 
 
 @pytest.fixture(scope="module")

@@ -81,15 +81,6 @@ def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
         assert p["worst"] >= p["poor"] >= p["fair"] >= 0.0
 
 
-def test_kinds_count_by_their_shares() -> None:
-    """Evidence that is right at one kind of place and wrong at another has the odds of shares."""
-    e = PlaceEvidence(**{one.name: 0.0 for one in fields(PlaceEvidence)})  # type: ignore[arg-type]
-    samples = [JudgedQuery("a", "rooms", k, (e,), (True,)) for k in range(30)]
-    samples += [JudgedQuery("b", "absent", k, (e,), (False,)) for k in range(90)]
-    learnt = fit(samples, {"rooms": 3.0, "absent": 1.0}, ridge=0.0)
-    assert compute_confidences([e], ConfidenceModel(learnt)) == pytest.approx([0.75], abs=1e-3)
-
-
 def test_a_calibration_by_hand() -> None:
     found = calibration(
         [0.95, 0.95, 0.91, 0.15, 0.05, 0.05], [True, True, False, False, True, False]

@@ -8,7 +8,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -16,7 +15,6 @@ import sceneprint as sp
 from sceneprint.cli import main
 from sceneprint.geometry.rigid import pose_difference
 from sceneprint.models import Model, save_model
-from sceneprint_lab.evaluation.report import seven_scenes_table
 
 ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}
 RETRIEVAL = {"top1_overlap_50", "top5_overlap_50", "top1_overlap_30", "mean_overlap"}
@@ -212,34 +210,6 @@ def test_only_frames_that_overlap_little(building: Path, model_file: Path, tmp_p
     assert found["settings"]["max_overlap"] == 0.7
 
 
-def test_the_table_of_several_scenes(
-    building: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for room in ("room-000", "room-001"):
-        source = building / room / "seq-01"
-        for number, frames in ((1, range(0, 12, 3)), (2, range(1, 12, 6))):
-            own = tmp_path / "scenes" / room / f"seq-{number:02d}"
-            own.mkdir(parents=True)
-            for i in frames:
-                for end in ("depth.png", "pose.txt"):
-                    name = f"frame-{i:06d}.{end}"
-                    (own / name).write_bytes((source / name).read_bytes())
-        scene = tmp_path / "scenes" / room
-        camera = (building / room / "intrinsics.json").read_bytes()
-        (scene / "intrinsics.json").write_bytes(camera)
-        (scene / "TrainSplit.txt").write_text("sequence1\n")
-        (scene / "TestSplit.txt").write_text("sequence2\n")
-    found = evaluated(tmp_path, tmp_path / "scenes", "--model", model_file, "--jobs", 1)
-    assert found["counts"] == {"queries": 4, "database": 8, "left_out": 0}
-    assert set(found["scenes"]) == set(found["by_scene"]) == {"room-000", "room-001"}
-    each = [found["scenes"][room]["R"]["mean_overlap"] for room in found["scenes"]]
-    assert found["average"]["R"]["mean_overlap"] == pytest.approx(np.mean(each))
-    out = capsys.readouterr().out
-    assert "room-001, alone" in out
-    assert "Average" in out
-    assert "Combine" in out
-
-
 @pytest.fixture(scope="module")
 def seven_scenes(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes laid out as in the official download: splits, a picture, no intrinsics.json."""
@@ -256,62 +226,6 @@ def seven_scenes(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         (folder / scene / "TestSplit.txt").write_text("sequence2\r\n")
         Image.new("RGB", (4, 4)).save(folder / scene / f"{scene}.png")
     return folder
-
-
-def test_seven_scenes_beside_the_paper(
-    seven_scenes: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = ("--7scenes", seven_scenes, "--model", model_file, "--jobs", 1)
-    found = evaluated(tmp_path, *asked)
-    assert found["counts"] == {"queries": 4, "database": 8, "left_out": 0}
-    assert found["settings"]["seven_scenes"] == str(seven_scenes)
-    shown, told = capsys.readouterr()
-    assert told.splitlines()[0] == f"not in {seven_scenes}: fire, heads, office, pumpkin, stairs"
-    _, _, table = shown.partition("7-Scenes, queries within 5 cm and 5 deg, %\n")
-    head, *lines = table.splitlines()
-    assert head.split() == ["R", "DR", "VDR", "average", "R,", "paper", "VDR,", "paper"]
-    rows = {name: cells for name, *cells in (line.split() for line in lines)}
-    assert list(rows) == ["chess", "redkitchen", "average", "combine"]
-    assert rows["chess"][4:] == ["97.3", "99.5"]
-    assert rows["redkitchen"][4:] == ["87.9", "93.7"]
-    assert rows["average"][4:] == ["84.8", "90.3"]
-    assert rows["combine"][4:] == ["84.8", "90.4"]
-    for name, figures in {**found["scenes"], "combine": found}.items():
-        for cell, row in zip(rows[name], ("R", "DR", "VDR", "pose_average"), strict=False):
-            assert float(cell) == pytest.approx(100 * figures[row]["within_5cm_5deg"], abs=0.05)
-    mean = np.mean([100 * each["VDR"]["within_5cm_5deg"] for each in found["scenes"].values()])
-    assert float(rows["average"][2]) == pytest.approx(mean, abs=0.05)
-
-
-def test_the_table_of_seven_scenes_by_hand() -> None:
-    def shares(*given: float | None) -> dict[str, Any]:
-        rows = ("R", "DR", "VDR", "pose_average", "VR")
-        return {row: {"within_5cm_5deg": share} for row, share in zip(rows, given, strict=True)}
-
-    found = shares(0.1, 0.2, 0.3, 0.4, 0.9) | {
-        "scenes": {
-            "fire": shares(0.5, 0.6, 0.7, 0.8, 0.9),
-            "stairs": shares(0, 1, None, 0.25, 0.9),
-        },
-        "average": shares(0.25, 0.8, 0.7, 0.525, 0.9),
-    }
-    assert [line.split() for line in seven_scenes_table(found, "fire")[2:]] == [
-        ["fire", "50.0", "60.0", "70.0", "80.0", "92.3", "97.8"],
-        ["stairs", "0.0", "100.0", "-", "25.0", "54.8", "61.0"],
-        ["average", "25.0", "80.0", "70.0", "52.5", "84.8", "90.3"],
-        ["combine", "10.0", "20.0", "30.0", "40.0", "84.8", "90.4"],
-    ]
-    assert len(seven_scenes_table(shares(0, 0, 0, 0, 0), "office")) == 3
-
-
-def test_one_of_seven_scenes_is_no_average(
-    seven_scenes: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(seven_scenes / "chess", tmp_path / "own" / "chess")
-    asked = ["--7scenes", tmp_path / "own", "--model", model_file, "--jobs", 1]
-    assert main(["evaluate", *map(str, asked)]) == 0
-    _, _, table = capsys.readouterr().out.partition("7-Scenes, queries")
-    assert [line.split()[0] for line in table.splitlines()[2:]] == ["chess"]
 
 
 @pytest.mark.parametrize(
@@ -373,19 +287,6 @@ def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_pat
     asked += ["--levels", "99", "--json", tmp_path / "a" / "b.json"]
     assert main(["evaluate", *map(str, asked)]) == 2
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_reason_is_of_the_frames_that_are_missing(
-    building: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = copied(building / "room-000", tmp_path / "room")
-    for i in (0, 3):
-        (copy / "seq-01" / f"frame-{i:06d}.depth.png").write_bytes(b"no picture")
-    asked = [copy, "--db", "0:3", "--queries", "3:4", "--model", model_file, "--jobs", 1]
-    assert main(["evaluate", *map(str, asked)]) == 2
-    error = capsys.readouterr().err
-    assert "The first that was left out is room/seq-01/frame-000003" in error
-    assert ".." not in error
 
 
 @pytest.mark.parametrize(

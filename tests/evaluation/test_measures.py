@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +15,14 @@ from sceneprint_lab.evaluation.judgement import views_to_average
 from sceneprint_lab.evaluation.measures import (
     PLACES,
     absent,
-    accuracy,
     answers,
     bound,
     diversity,
     lost,
-    oracle_and_random,
     place_of,
     rows,
     upper_bound,
     validation,
-    voxels,
 )
 from sceneprint_lab.evaluation.protocol import (
     Error,
@@ -36,10 +32,7 @@ from sceneprint_lab.evaluation.protocol import (
     pose_error,
 )
 from sceneprint_lab.evaluation.report import (
-    average,
-    measured,
     per_query,
-    table,
     to_json,
     without_infinities,
 )
@@ -93,22 +86,6 @@ def test_acceptance_of_three_queries(three: list[QueryOutcome]) -> None:
         "pairs": 1,
         "pairs_accepted": 1,
     }
-
-
-def test_chance_of_three_queries(three: list[QueryOutcome]) -> None:
-    found = oracle_and_random(three)
-    assert found["oracle"]["mean_overlap"] == pytest.approx(0.55)
-    assert found["oracle"]["top1_overlap_50"] == 1.0
-    assert found["random"]["mean_overlap"] == pytest.approx((0.3 + 0.225) / 2)
-    assert found["random"]["top1_overlap_50"] == 0.25
-    assert found["random"]["top5_overlap_50"] == 1.0  # four frames: five hold them all
-
-
-def test_random_five(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
-    # 2 of 10 overlap by half: five miss both with 8!/(3! 5!) / (10!/(5! 5!)) = 56 / 252
-    one = make_outcome([0], [0], [make_pair(0)], least=[0.6, 0.6] + [0.0] * 8)
-    found = oracle_and_random([one])["random"]["top5_overlap_50"]
-    assert found == pytest.approx(1 - 56 / 252)
 
 
 def test_whole_answers_by_hand() -> None:
@@ -218,14 +195,6 @@ def dots(*columns: int, shift: float = 0.0, depth: float = 1.01) -> DepthFrame:
     return DepthFrame(image, CAMERA, "dots", pose)
 
 
-def test_voxels_by_hand() -> None:
-    assert len(voxels(dots(0, 10, 20))) == 3
-    assert len(voxels(dots(0, 1, 11, 21))) == 1  # odd columns are not looked at
-    assert len(voxels(dots(0, 2, depth=0.5))) == 1  # 1 cm apart
-    assert len(voxels(dots(0, depth=4.1))) == 0
-    assert set(voxels(dots(10))) == set(voxels(dots(0, shift=0.101)))
-
-
 def test_diversity_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
     database = [dots(0), dots(0), dots(0, 10), dots(0, 10, 20), dots(30)]
     poses: list[Floats] = [np.eye(4) for _ in database]
@@ -249,33 +218,6 @@ def test_diversity_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> No
     assert found["translation"]["VDR"] == {"mean_m": 4.5, "std_m": 3.5}
     assert found["coverage"] == {"VR": 1.0, "VDR": 3.0, "ratio_of_means": 3.0, "mean_ratio": 3.0}
     assert (found["queries"], found["queries_validated"]) == (1, 1)
-
-
-def test_views_that_see_only_what_is_too_far_cover_nothing(
-    make_outcome: MakeOutcome, make_pair: MakePair
-) -> None:
-    far = dots(0, depth=5.0)
-    both = make_outcome([0, 1], [0, 1], [make_pair(0), make_pair(1)])
-    found = diversity([both], [np.eye(4)] * 2, [far, far].__getitem__)
-    assert found["queries_validated"] == 1
-    assert set(found["coverage"].values()) == {None}
-
-
-def test_without_anything_to_count_there_is_null(
-    make_outcome: MakeOutcome, make_pair: MakePair
-) -> None:
-    away = make_outcome([0], [0], [make_pair(0, "rejected", scene="there")], present=False)
-
-    def nothing(match: int) -> DepthFrame:
-        raise AssertionError("no depth is needed")
-
-    found = measured([away], [np.eye(4)], nothing)
-    assert found["R"]["within_5cm_5deg"] is None
-    assert found["R"]["mean_overlap"] is None
-    assert found["validation"]["precision"] is None
-    assert found["diversity"]["coverage"]["VR"] is None
-    assert found["lost"]["rejected"] == 1 or found["lost"]["nothing_overlaps"] == 1
-    assert accuracy([])["median_translation_m"] is None
 
 
 def test_json_has_null_for_what_is_infinite(three: list[QueryOutcome]) -> None:
@@ -321,24 +263,3 @@ def test_answers_of_a_query_by_hand(make_outcome: MakeOutcome, make_pair: MakePa
         ("b", 19, "ambiguous", None, still),
     ]
     assert all(set(match) == set(keys) for match in said["matches"])
-
-
-def test_average_of_scenes(three: list[QueryOutcome]) -> None:
-    poses = [np.eye(4)] * 4
-    first = measured(three[:1], poses, lambda match: dots(match))
-    second = measured(three[1:2], poses, lambda match: dots(match))
-    found = average([first, second])
-    assert found["VR"]["within_5cm_5deg"] == 0.5
-    assert found["VDR"]["median_translation_m"] is None  # the second scene found nothing
-    assert found["R"]["mean_overlap"] == pytest.approx(0.3)
-
-
-def test_table_reads_well(three: list[QueryOutcome]) -> None:
-    found: dict[str, Any] = measured(three, [np.eye(4)] * 4, lambda match: dots(match))
-    found["left_out"] = [{"name": "a\nb", "reason": "dark"}, {"name": "c", "reason": "dark"}]
-    found["milliseconds"] = {"rank": 1.0, "validate": None}
-    lines = table(found)
-    assert not [line for line in lines if "nan" in line or "\n" in line]
-    assert lines[2].split() == ["VR", "0.500", "0.500", "8.5", "0.5"]
-    assert "queries       1 found, 1 wrongly accepted, 1 ambiguous" in lines
-    assert lines[-2].startswith("left out      'a\\nb': dark; and 1 more")

@@ -88,11 +88,3 @@ def test_pairs_of_two_scenes_are_shared_out_and_a_quarter_is_planar() -> None:
     assert sum(counts["ab"]) >= 8  # a quarter, and what chance adds
     assert sum(counts["ac"]) >= 8
     assert sum(counts["ac"]) < 20
-
-
-def test_where_less_is_to_be_had_less_is_drawn() -> None:
-    two = [*places("a", 2), *places("b", 3)]
-    nothing = Overlaps(np.zeros((5, 5)), np.zeros((5, 5)))
-    drawn = draw(two, nothing, NO_PLANES[:5], Drawing(pairs=9, negatives=50, apart=1))
-    kinds = [one.kind for one in drawn]
-    assert (kinds.count("cross_scene"), kinds.count("same_scene")) == (6, 1 + 3)

@@ -14,11 +14,8 @@ import pytest
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
 from sceneprint.types import Floats
 from sceneprint_lab.evaluation.pair_report import (
-    curves,
-    evidence,
     pair_figures,
     pair_table,
-    residual,
     second_pairs,
     support,
 )
@@ -76,16 +73,6 @@ def found(tried: list[Tried]) -> dict[str, Any]:
     return pair_figures(evaluation(tried), {"seed": 0, "right": RIGHT})
 
 
-def test_bins(found: dict[str, Any]) -> None:
-    first, second, third, _ = (found["bins"][name] for name in BINS)
-    assert [one["pairs"] for one in (first, second, third)] == [2, 3, 0]
-    assert first["success"] == {"within_5cm_5deg": 0, "within_10cm_10deg": 0, "right": 0}
-    assert first["bound"] == {"within_5cm_5deg": 0.5, "within_10cm_10deg": 1, "right": 1}
-    assert second["success"]["within_5cm_5deg"] == pytest.approx(1 / 3)
-    assert second["success"]["right"] == 1.0  # accepted or not
-    assert set(third["success"].values()) == {None}
-
-
 def test_precision_is_null_where_none_was_accepted(found: dict[str, Any]) -> None:
     first, second, third, _ = (found["bins"][name]["validation"] for name in BINS)
     assert (first["precision"], first["recall"], first["accepted"]) == (None, None, 0)
@@ -121,46 +108,6 @@ def test_failures_are_named_the_worst_first(found: dict[str, Any]) -> None:
     assert found["failures"][0]["translation_m"] is None  # there is no truth
     assert found["failures"][2]["translation_m"] == pytest.approx(0.15)
     assert found["failures"][3]["reason"] == "as given"
-
-
-def test_a_wider_limit_makes_more_right(tried: list[Tried]) -> None:
-    wide = [replace(one, pair=replace(one.pair, limits=(0.3, 3.0))) for one in tried]
-    found = pair_figures(replace(evaluation(wide), limits=(0.3, 3.0)), {"right": (0.3, 3.0)})
-    assert found["bins"]["10-30"]["success"]["right"] == 0.5
-    assert found["bins"]["10-30"]["success"]["within_10cm_10deg"] == 0.0
-    assert [one["what"] for one in found["failures"]].count("not_believed") == 2
-
-
-def test_statistics(make_pair: Callable[..., ValidatedPair]) -> None:
-    v = make_pair(0).validation
-    assert evidence(replace(v, overlap=0.5, violations=0.04), ACCEPTANCE) == pytest.approx(0.3)
-    assert evidence(replace(v, overlap=0.5, violations=None), ACCEPTANCE) == 0.5
-    assert residual(replace(v, residual_m=0.04, residual_rad=0.0), ACCEPTANCE) == 0.5
-    assert residual(
-        replace(v, residual_m=0.04, residual_rad=math.radians(10)), ACCEPTANCE
-    ) == pytest.approx(2.0)
-
-
-def test_curves(make_pair: Callable[..., ValidatedPair]) -> None:
-    def one(right: bool, status: str, **told: Any) -> ValidatedPair:
-        pair = make_pair(0, status, off=CM3 if right else AWAY)
-        return replace(pair, validation=replace(pair.validation, **told))
-
-    pairs = [
-        one(True, "accepted", overlap=0.6, residual_m=0.01, ambiguity=0.0),
-        one(True, "ambiguous", overlap=0.4, residual_m=0.02, ambiguity=0.2),
-        one(False, "rejected", overlap=0.5, residual_m=0.03, ambiguity=0.0),
-        one(False, "rejected", T_match_query=None, overlap=0.9, residual_m=0.0, ambiguity=0.0),
-    ]
-    found = curves(pairs, ACCEPTANCE)
-    assert found["overlap"]["area"] == pytest.approx(3 / 4)  # without a transform: last of all
-    assert found["overlap"]["right_at"] == {"0": 0.5, "0.01": 0.5, "0.05": 0.5}
-    assert found["residual"]["area"] == 1.0  # small is good
-    assert (found["ambiguity"]["right"], found["ambiguity"]["wrong"]) == (2, 0)
-    assert found["ambiguity"]["area"] is None
-    assert (found["violations"]["right"], found["violations"]["wrong"]) == (2, 2)
-    blind = [replace(p, validation=replace(p.validation, violations=None)) for p in pairs]
-    assert curves(blind, ACCEPTANCE)["violations"]["area"] == 0.5  # nothing is known
 
 
 def test_baselines_beside_ours(tried: list[Tried]) -> None:

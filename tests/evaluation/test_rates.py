@@ -24,14 +24,6 @@ def test_none_seen_is_the_rule_of_three() -> None:
     assert upper_bound(0, 2000, 0.99) == pytest.approx(4.6 / 2000, rel=2e-3)
 
 
-def test_the_ends() -> None:
-    assert upper_bound(0, 0) is None
-    assert upper_bound(5, 5) == 1.0
-    for seen, of in ((3, 2), (-1, 2)):
-        with pytest.raises(ValueError, match="is no rate"):
-            upper_bound(seen, of)
-
-
 def test_a_curve_by_hand() -> None:
     right = np.array([True, True, False, True, False])
     curve = roc(np.array([5.0, 4.0, 3.0, 3.0, 1.0]), right)
@@ -55,21 +47,3 @@ def test_the_area_is_the_share_of_couples_in_order() -> None:
     assert curve is not None
     good, bad = scores[right][:, None], scores[~right]
     assert curve.area == pytest.approx(((good > bad) + (good == bad) / 2).mean())
-
-
-def test_a_long_curve_is_thinned_and_keeps_its_ends() -> None:
-    rng = np.random.default_rng(5)
-    right = rng.random(3000) < 0.5
-    curve = roc(rng.normal(size=3000) + right, right)
-    assert curve is not None
-    points = curve.thinned(50)
-    assert 30 < len(points) <= 50
-    assert points[0][:2] == [0.0, 0.0]
-    assert points[-1][:2] == [1.0, 1.0]
-    steps = np.diff(np.array(points)[:, :2].sum(axis=1))
-    assert 0 < steps.min() <= steps.max() < 0.06
-
-
-def test_there_is_no_curve_of_one_kind() -> None:
-    assert roc(np.arange(3.0), np.ones(3, bool)) is None
-    assert roc(np.arange(0.0), np.ones(0, bool)) is None

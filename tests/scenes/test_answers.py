@@ -11,8 +11,8 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import Alternative, Answer
-from sceneprint_viewers.answer_scene import MANY, ONE, AnswerScene, short_name, space_name
-from sceneprint_viewers.map_scene import evenly_taken, listed_runs, map_runs
+from sceneprint_viewers.answer_scene import MANY, ONE, AnswerScene
+from sceneprint_viewers.map_scene import map_runs
 from sceneprint_viewers.scene import (
     QUERY,
     STRONG,
@@ -142,13 +142,6 @@ def test_alternatives_are_told_from_the_answer(
     assert there["query.optical/query/label"].text == "my frame: ambiguous"
 
 
-def test_names_that_people_gave_are_not_cut() -> None:
-    assert short_name("frame-000012") == "frame-000012"
-    assert short_name("0123456789abcdef" * 2) == "01234567"
-    assert space_name("hall", "map", several=False) == "map"
-    assert space_name("hall", "map", several=True) == "hall: map"
-
-
 def test_what_is_not_found_lies_in_a_space_of_its_own(client: Client, answer: Answer) -> None:
     lost = answer.model_copy(update={"status": "not_found", "location": None, "matches": []})
     writer = drawn(client, lost)
@@ -216,14 +209,6 @@ def test_without_poses_the_query_lies_in_its_best_match(
         STRONG, (120, 180, 255),
     }  # fmt: skip
     assert writer.contents(-2)[space].up.tolist() == [0, -1, 0]
-
-
-def test_frames_are_taken_evenly(client: Client) -> None:
-    runs = listed_runs(client.frames(MAP))
-    ids = [frame_id for run in runs for frame_id in run.frame_ids]
-    assert [one[1] for one in evenly_taken(runs, 100)] == ids
-    assert [one[1] for one in evenly_taken(runs, 3)] == [ids[0], ids[4], ids[8]]
-    assert evenly_taken(runs, 0) == evenly_taken([], 5) == []
 
 
 def test_a_moment_takes_the_place_of_the_one_before() -> None:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from sceneprint_client.api.base import CameraIntrinsics
 from sceneprint_viewers.scene import (
-    AXES_M,
     FRUSTUM_M,
     SMALL_M,
     frustum,
     height_colours,
-    nearest_axis,
-    point_size,
-    sensor_outline,
     small_outline,
     up_of_sensors,
 )
@@ -38,12 +33,6 @@ def test_the_outline_of_a_camera() -> None:
     assert small.width_px < drawn.width_px
 
 
-def test_a_sensor_that_is_no_camera_has_axes() -> None:
-    ends = [strip[1].tolist() for strip in sensor_outline(None, (1, 2, 3)).strips]
-    assert ends == (np.eye(3) * AXES_M).tolist()
-    assert small_outline(None, (1, 2, 3)).strips[0][1][0] == SMALL_M
-
-
 def test_colours_rise_with_height() -> None:
     points = np.zeros((101, 3))
     points[:, 1] = np.linspace(0, -5, 101)  # y down
@@ -56,19 +45,6 @@ def test_colours_rise_with_height() -> None:
     assert abs(outlier[:101].astype(int) - colours).max() < 12
     assert height_colours(np.zeros((0, 3)), up).shape == (0, 3)
     assert len({tuple(one) for one in height_colours(np.ones((5, 3)), up).tolist()}) == 1
-
-
-def test_points_of_scanners_are_larger() -> None:
-    assert point_size(0.02, cameras=True) == 0.02
-    assert point_size(0.02, cameras=False) == 0.08
-
-
-@pytest.mark.parametrize(
-    ("direction", "axis"),
-    [((0.5, -0.7, 0.4), (0, -1, 0)), ((0.1, 0.2, 0.9), (0, 0, 1)), ((-1, 0, 0), (-1, 0, 0))],
-)
-def test_the_nearest_axis(direction: tuple[float, ...], axis: tuple[int, ...]) -> None:
-    assert nearest_axis(np.array(direction)).tolist() == list(axis)
 
 
 def test_up_is_where_sensors_are_carried_upright() -> None:

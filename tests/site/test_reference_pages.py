@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 from pathlib import Path
@@ -12,12 +11,9 @@ import pytest
 
 import sceneprint_client
 from sceneprint import errors
-from sceneprint.cli import all_commands, parser
-from sceneprint.cli.completion import subcommands
 from sceneprint_client import Client
 from service.problems import type_of as problem_type
 from tools.site import http_pages
-from tools.site.code_pages import metric_families
 from tools.site.error_page import kinds, remedy, status
 from tools.site.markup import cell
 from tools.site.reference import GeneratedPage, api_document, generated_pages
@@ -72,73 +68,6 @@ def test_every_operation_is_described_once_on_the_page_of_its_resource(
     )
     assert set(listed) == wanted
     assert pages["reference/http/index.md"].text.splitlines()[2].startswith(f"{len(wanted)} opera")
-
-
-def test_an_operation_says_what_it_takes_and_what_it_answers(
-    pages: dict[str, GeneratedPage],
-) -> None:
-    text = sections(pages["reference/http/jobs.md"].text)["Retry job"]
-    assert "POST /v1/jobs/{job_id}/retry" in text
-    assert ["`job_id`", "path (required)", "string", ""] in rows(text)
-    answers = {cells[0]: cells[1] for cells in rows(text)}
-    assert answers["202"] == "[Job](records.md#job)"
-    problems = [name for name in answers if answers[name] == "[Problem](records.md#problem)"]
-    assert problems == ["404, 409, 400, 401, 403, 408, 421, 429, 500, 503, 507"]
-    ask = sections(pages["reference/http/queries.md"].text)["Ask"]
-    folded = ask.split('??? note "Parameters if the body is the frame itself"')[1].split("**Body**")
-    assert "`fx` | query | number | of the camera, pixels." in folded[0]
-    assert "**Body** `multipart/form-data`" in ask
-    body = {cells[0]: cells[1:] for cells in rows(ask)}
-    assert body["`frame` (required)"][0] == "file"
-    assert body["`meta` (required)"][0].startswith("[FrameMeta](records.md#framemeta)")
-
-
-def test_every_record_has_its_fields(
-    document: dict[str, Any], pages: dict[str, GeneratedPage]
-) -> None:
-    schemas = document["components"]["schemas"]
-    text = pages["reference/http/records.md"].text
-    found = sections(text)
-    assert len(found) == len(schemas) > 140
-    fields = sum(len(schema.get("properties", {})) for schema in schemas.values())
-    assert sum(len(rows(body)) for body in found.values()) == fields + sum(
-        1 for schema in schemas.values() if schema.get("properties")
-    )
-    answer = {cells[0]: cells[1] for cells in rows(found["Answer"])}
-    assert answer["`status` (required)"] == "`found` or `ambiguous` or `not_found` or `unvalidated`"
-    assert answer["`alternatives`"] == "list of [Alternative](records.md#alternative)"
-    assert "received" in found["FrameState"]
-    assert r"Page\[Frame\]" in found
-
-
-def test_every_metric_is_listed_with_its_labels(pages: dict[str, GeneratedPage]) -> None:
-    watched = (ROOT / "docs/operations.md").read_text().split("| metric |")[1].split("\n\n")[0]
-    names = {one.name for one in metric_families()}
-    assert names == set(re.findall(r"`(sceneprint_\w+)`", watched))
-    told = {cells[0].strip("`"): cells[1:] for cells in rows(pages["reference/metrics.md"].text)}
-    assert set(told) == names | {"metric"}
-    assert told["sceneprint_requests_total"] == [
-        "counter", "`method`, `route`, `status`", "Requests answered.",
-    ]  # fmt: skip
-
-
-def test_every_command_is_described_with_all_its_options(pages: dict[str, GeneratedPage]) -> None:
-    found = sections(pages["reference/commands.md"].text)
-    parsers = {name: one for name, _, one in subcommands(parser())}
-    assert list(found) == list(parsers)
-    assert [name for name in found if " " not in name] == list(all_commands())
-    assert {"make association", "make mesh"} < found.keys()
-    for name, command in parsers.items():
-        cells = [row[0] for row in rows(found[name])]
-        for option in command._actions:
-            if option.help == argparse.SUPPRESS or "--help" in option.option_strings:
-                continue
-            for flag in option.option_strings:
-                assert any(flag in re.split(r"[`, ]+", one) for one in cells), (name, flag)
-    query = {row[0]: row[1] for row in rows(found["query"])}
-    assert query["`--k K`"].startswith("largest number of accepted matches to list")
-    assert query["`--k K`"].endswith("(default: 5)")
-    assert found["query"].split("```text\n")[1].startswith("sceneprint query [-h]")
 
 
 def test_every_error_is_listed_with_its_status_and_what_to_do(

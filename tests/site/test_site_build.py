@@ -18,7 +18,6 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from tools.site.hooks import RANKED_LAST
 from tools.site.reference import generated_pages
 
 if TYPE_CHECKING:
@@ -116,25 +115,6 @@ def test_nothing_is_loaded_from_another_host(site: Path, read: dict[Path, PageRe
     assert {one for pair in found for one in pair if "//" in one and "data:" not in one} == set()
 
 
-def test_figures_are_drawn_while_the_site_is_built(read: dict[Path, PageReader]) -> None:
-    texts = [path.read_text() for path in read]
-    assert sum(text.count('<figure class="diagram"') for text in texts) == 5
-    assert not any('class="mermaid"' in text for text in texts)
-
-
-def test_no_list_and_no_table_is_left_as_text(site: Path) -> None:
-    """As one would be that git hosts understand and Python-Markdown does not."""
-    code = re.compile(r"<(pre|code|script)\b.*?</\1>", re.DOTALL)
-    left = [
-        f"{path.relative_to(site)}: {line}"
-        for path in sorted(site.rglob("*.html"))
-        for line in re.findall(
-            r"^\s*(?:\|.*\||[*-] \w.*|\d+\. \w.*)$", code.sub("", path.read_text()), re.MULTILINE
-        )
-    ]
-    assert left == []
-
-
 class _QuietHandler(SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         """Say nothing."""
@@ -164,74 +144,6 @@ def browser() -> Iterator[Browser]:
         one = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         yield one
         one.close()
-
-
-#: What newcomers type, and the pages of which one has to be among the first three results.
-QUESTIONS = {
-    "realsense": "sensors/realsense",
-    "image_rect_raw": "sensors/realsense",
-    "zed_node": "sensors/zed",
-    "azure kinect depth image": "sensors/azure_kinect",
-    "orbbec gemini launch": "sensors/orbbec",
-    "oak-d stereo": "sensors/oak",
-    "zed point cloud": "sensors/zed",
-    "iphone lidar": "sensors/iphone",
-    "velodyne topic": "sensors/velodyne",
-    "ouster timestamp": "sensors/ouster",
-    "livox custommsg": "sensors/livox",
-    "hesai imu": "sensors/hesai",
-    "tf_static missing": "troubleshooting",
-    "no poses": "troubleshooting",
-    "not_found every time": "troubleshooting",
-    "ambiguous everywhere": "troubleshooting",
-    "wrong frame": "troubleshooting",
-    "depth scale": "troubleshooting",
-    "infrared instead of depth": "troubleshooting",
-    "jobs stay queued": "troubleshooting",
-    "api key refused": "troubleshooting",
-    "507": "troubleshooting",
-    "gpu": "troubleshooting",
-    "first query slow": "troubleshooting",
-    "two robots one map": "associations",
-    "upload rosbag": "recordings",
-    "install": "getting_started",
-    "nav2": "ros2/sceneprint_ros/index",
-    "covariance": "uncertainty",
-}
-#: Asks the worker that the page itself searches with; its messages are numbered in this order.
-ASK = """async (questions) => {
-    const [SETUP, , QUERY] = [0, 1, 2];
-    const {base, search} = JSON.parse(document.getElementById("__config").textContent);
-    const root = new URL(`${base}/`, location);
-    const worker = new Worker(new URL(search, root));
-    const ask = (type, data) => new Promise((resolve, reject) => {
-        worker.onmessage = (event) => resolve(event.data.data);
-        worker.onerror = reject;
-        worker.postMessage({type, data});
-    });
-    const index = await (await fetch(new URL("search/search_index.json", root))).json();
-    await ask(SETUP, {...index, options: {suggest: false}});
-    const found = {};
-    for (const question of questions) {
-        const {items} = await ask(QUERY, question);
-        found[question] = items.map(([page]) => page.location.split(".html")[0]);
-    }
-    return found;
-}"""
-
-
-def test_the_search_leads_newcomers_to_the_right_page(address: str, browser: Browser) -> None:
-    page = browser.new_page()
-    page.goto(f"{address}/index.html")
-    found = page.evaluate(ASK, [*QUESTIONS, "evaluation"])
-    page.close()
-    firsts = {question: found[question][:3] for question in QUESTIONS}
-    assert {one: firsts[one] for one in QUESTIONS if QUESTIONS[one] not in firsts[one]} == {}
-    # pages of measurements are found, after all others
-    last = found["evaluation"]
-    measured = [one for one in last if f"docs/{one}.md" in RANKED_LAST]
-    assert "evaluation" in measured
-    assert last[-len(measured) :] == measured
 
 
 @pytest.mark.thorough

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from sceneprint_lab.synth import furniture
-from sceneprint_lab.synth.furniture import Shelf, curtain, radiator, scatter
-from sceneprint_lab.synth.mesh import SyntheticMesh, area, face_normals, volume
+from sceneprint_lab.synth.mesh import SyntheticMesh, face_normals, volume
 
 PIECES = [
     furniture.table, furniture.round_table, furniture.desk, furniture.chair,
@@ -42,21 +41,3 @@ def test_a_thing_is_solid_and_small(builder):
         assert_solid(mesh)
         assert abs(mesh.vertices[:, 2].min()) < 0.15
         assert np.ptp(mesh.vertices, axis=0).max() < 1.2
-
-
-def test_scattered_things_stay_on_their_surface():
-    surface = Shelf(1.0, 2.0, 1.5, 0.8, 0.7, 0.5, 15)
-    mesh = scatter(surface, np.random.default_rng(1))
-    assert len(mesh.faces) > 100
-    assert mesh.vertices[:, 2].min() > 0.7 - 0.15
-    assert mesh.vertices[:, 2].max() <= 0.7 + 0.5
-    assert np.abs(mesh.vertices[:, 0] - 1.0).max() < 0.75 + 0.3
-    assert np.abs(mesh.vertices[:, 1] - 2.0).max() < 0.4 + 0.3
-
-
-def test_curtain_and_radiator_are_solid():
-    rng = np.random.default_rng(0)
-    assert_solid(curtain(1.0, 2.0, rng))
-    for _ in range(5):
-        assert_solid(radiator(1.0, 0.6, rng))
-    assert area(curtain(1.0, 2.0, rng)) > 2 * 1.0 * 2.0  # waves are longer than the line

@@ -13,7 +13,7 @@ import pytest
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.types import Floats, Intrinsics
 from sceneprint_lab.evaluation.protocol import overlaps, view_of
-from sceneprint_lab.synth import KINECT, Room, render, synthesise_lookalike
+from sceneprint_lab.synth import Room, render, synthesise_lookalike
 from sceneprint_lab.synth.lookalikes import (
     APART,
     ELSEWHERE,
@@ -24,7 +24,6 @@ from sceneprint_lab.synth.lookalikes import (
     bare_floor,
     cabinet,
     difference_share,
-    equal_bays,
     equal_offices,
 )
 from sceneprint_lab.synth.mesh import rotation_z
@@ -73,11 +72,6 @@ def test_a_site_depends_on_its_seed_and_number_alone(kind: str) -> None:
     assert len(set(names)) == len(names)
     shown = [float(np.mean(frame.depth > 0)) for frame in site.queries]
     assert min(shown) > 0.3
-
-
-def test_there_is_no_other_kind() -> None:
-    with pytest.raises(ValueError, match=r"no kind 'stairs' of look-alikes\. Choose from object, "):
-        synthesise_lookalike("stairs", 0, 0)
 
 
 @pytest.mark.thorough
@@ -150,18 +144,6 @@ def test_equal_offices_differ_by_what_people_move_and_not_at_all_without_it() ->
     assert 0.01 < np.median(shares) < 0.4
 
 
-def test_bays_repeat() -> None:
-    hall, pitch = equal_bays(4, Likeness(0.0, 0.0, 0.0, 1.0), np.random.default_rng(4))
-    width = hall.size[1]
-    for x, y in ((0.5, 0.5), (0.3, 0.6)):
-        T = orbit((x * pitch, y * width, 0.8), 0.2, 1, np.random.default_rng(0))[0]
-        shifted = T.copy()
-        shifted[0, 3] += pitch
-        # the ends of the hall are seen from elsewhere, the bays are not
-        alike = np.abs(render(hall, T, KINECT) - render(hall, shifted, KINECT)) < 1e-3
-        assert alike.mean() > 0.8
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "scenes"), [("object", 1), ("kitchens", 2)])
 def test_the_layout_is_read_back(
@@ -184,11 +166,3 @@ def test_the_layout_is_read_back(
             back = reference.read()
             np.testing.assert_allclose(back.depth, frame.depth, atol=1e-6)
             np.testing.assert_allclose(back.pose, frame.pose, atol=1e-6)
-
-
-def test_lookalikes_have_paths_of_their_own(
-    tmp_path: Path, run_command: Callable[..., Any]
-) -> None:
-    _, told = run_command("synth", tmp_path / "x", "--lookalikes", "object", "--path", expect=2)
-    assert "--lookalikes and --path: look-alike sites have paths of their own." in told
-    assert not (tmp_path / "x").exists()

@@ -70,35 +70,3 @@ def test_without_errors_nothing_is_lost_and_all_is_exact(shell: Caster) -> None:
     lowest = np.abs(elevation - elevation.min()) < 1e-4
     expected = 6.0 / (math.cos(math.radians(15)) * np.cos(math.radians(0.2)))
     assert ranges(points[ahead & lowest]) == pytest.approx(expected, abs=2e-3)
-
-
-def test_rings_are_at_the_stated_elevations(shell: Caster) -> None:
-    points = scan(shell, np.eye(4), SENSOR, np.random.default_rng(0))
-    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
-    assert np.unique(np.round(elevation, 2)) == pytest.approx(np.arange(-15.0, 15.1, 2.0), abs=0.01)
-
-
-def test_range_limits_and_the_carrier_hide_points(shell: Caster) -> None:
-    seen = scan(shell, np.eye(4), replace(SENSOR, minimum=4.5, maximum=6.5), _rng())
-    assert ranges(seen).min() >= 4.5
-    assert ranges(seen).max() <= 6.5 + 1e-5
-    blind = replace(SENSOR, blind_middle=math.pi, blind_width=1.0, blind_below=0.0)
-    points = scan(shell, np.eye(4), blind, _rng())
-    behind = np.abs(np.arctan2(points[:, 1], points[:, 0])) > math.pi - 0.49
-    assert behind.any()
-    assert points[behind, 2].min() > 0.0  # only lasers that look over the carrier
-    assert points[~behind, 2].min() < 0.0
-
-
-def test_far_and_grazing_returns_are_lost_first() -> None:
-    """Of a floor, all comes back from close by and little from where the ray only grazes it."""
-    floor = Caster(box(200.0, 200.0, 1.0, (0.0, 0.0, -2.5)))
-    sensor = replace(SENSOR, lowest=math.radians(-30), highest=math.radians(-2), grazing=0.1)
-    points = scan(floor, np.eye(4), sensor, _rng())
-    near = (ranges(points) < 5).sum()
-    assert near / (900 * (sensor.elevations < -math.asin(1.5 / 5)).sum()) > 0.95
-    assert (ranges(points) > 35).sum() < 0.5 * 900
-
-
-def _rng() -> np.random.Generator:
-    return np.random.default_rng(3)
