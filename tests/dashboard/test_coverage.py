@@ -123,6 +123,7 @@ def test_a_result_is_begun_shown_and_explained(
     assert asked.json()["frame"] == {"map": "four-sides", "frame_id": frame["frame_id"]}
 
 
+@pytest.mark.thorough
 def test_two_results_are_compared(
     station: Any, four_sides: dict[str, Any], page: Page, settle: Settle, until: Callable[..., Any]
 ) -> None:

@@ -141,6 +141,7 @@ def test_a_click_counts_although_what_was_pressed_is_drawn_anew(
     expect(page).to_have_url(f"{station.home}{there}")
 
 
+@pytest.mark.thorough
 def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(
     page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any]
 ) -> None:
@@ -295,6 +296,7 @@ def test_frame_page_tells_what_the_api_tells(
     assert download.value.path().read_bytes() == station.frames[4].png
 
 
+@pytest.mark.thorough
 def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
     page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any]
 ) -> None:

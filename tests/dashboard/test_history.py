@@ -81,6 +81,7 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(station, asked,
     assert page.locator(".state h2").inner_text() == "No queries match"
 
 
+@pytest.mark.thorough
 def test_new_queries_are_announced_and_looking_leaves_none(station, asked, page, settle, until):
     before = records(station)
     page.goto(f"{station.home}#/maps/seen/queries")

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from playwright.sync_api import Page, expect
 
 Settle = Callable[[Page], None]
@@ -67,6 +68,7 @@ def test_a_map_is_made(
     assert (made["title"], made["model"].partition("-")[0]) == ("Made by hand", "depth")
 
 
+@pytest.mark.thorough
 def test_a_map_is_retitled_and_an_edit_of_another_not_overwritten_unseen(
     station: Any, page: Page, settle: Settle
 ) -> None:
@@ -140,6 +142,7 @@ def test_a_map_keeps_the_focus_while_its_counts_move(
     expect(page).to_have_url(f"{station.home}#/maps/focused/place")
 
 
+@pytest.mark.thorough
 def test_many_maps_are_few_requests(station: Any, page: Page, settle: Settle) -> None:
     for number in range(40):
         station.make_map(f"many-{number:02d}")

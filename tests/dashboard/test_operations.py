@@ -112,6 +112,7 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     assert axe(page) == []
 
 
+@pytest.mark.thorough
 def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
     station, page, settle, axe, until, repair
 ):
@@ -147,6 +148,7 @@ def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
     until(lambda: page.locator("li.job").get_by_text("retried").count() == 3)
 
 
+@pytest.mark.thorough
 def test_events_come_live_and_take_no_focus(station, page, settle, until, axe):
     page.goto(f"{station.home}#/operations?tab=events")
     settle(page)
@@ -169,6 +171,7 @@ def test_events_come_live_and_take_no_focus(station, page, settle, until, axe):
     assert page.locator("li.event").count() == min(len(told), 101)
 
 
+@pytest.mark.thorough
 def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open_page, settle, axe):
     page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
     page.allowed.append("401")

@@ -105,6 +105,7 @@ def test_what_is_shown_is_what_the_api_says(
     assert axe(page) == []
 
 
+@pytest.mark.thorough
 def test_before_after_and_what_is_drawn(
     page: Page, station: Any, answer: Any, settle: Any, pixels: Any, until: Any
 ) -> None:
@@ -191,6 +192,7 @@ def box(ahead: float) -> dict[str, Any]:
     return {"files": parts, "data": {"meta": json.dumps({"intrinsics": lens})}}
 
 
+@pytest.mark.thorough
 def test_an_ambiguous_match_has_its_rival(
     page: Page, station: Any, settle: Any, axe: Any, until: Any, pixels: Any
 ) -> None:
@@ -271,6 +273,7 @@ def test_a_camera_that_is_not_known_is_as_wide_as_what_was_seen(
     assert far.max(axis=0) == pytest.approx([2, 0.5, 2])
 
 
+@pytest.mark.thorough
 def test_what_is_gone_says_so(page: Page, station: Any, answer: Any, settle: Any, axe: Any) -> None:
     page.allowed += ["404", "409"]  # type: ignore[attr-defined]
     gone = {"query_id": "0" * 32}
@@ -285,6 +288,7 @@ def test_what_is_gone_says_so(page: Page, station: Any, answer: Any, settle: Any
     assert axe(page) == []
 
 
+@pytest.mark.thorough
 def test_without_webgl_the_numbers_are_still_there(
     open_page: Any, station: Any, answer: Any, settle: Any
 ) -> None:

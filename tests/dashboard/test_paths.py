@@ -119,6 +119,7 @@ def test_runs_are_joined_from_here(
     expect(page.locator(".paths-run")).to_have_text(["1bob4 poses"])
 
 
+@pytest.mark.thorough
 def test_a_join_is_undone_from_here(
     page: Page, station: Any, settle: Any, until: Any, room_views: Any, tmp_path: Path
 ) -> None:
@@ -154,6 +155,7 @@ def test_a_join_is_undone_from_here(
     assert station.client.get(path).json()["parent_frames"] == 2
 
 
+@pytest.mark.thorough
 def test_a_query_is_among_them(
     page: Page, station: Any, settle: Any, axe: Any, until: Callable[..., Any]
 ) -> None:
@@ -207,6 +209,7 @@ def test_a_query_is_among_them(
     assert page.evaluate("css => document.querySelector(css).viewer.frames", CANVAS) == drawn
 
 
+@pytest.mark.thorough
 def test_alternatives_are_drawn_alike_and_none_as_the_answer(
     page: Page, station: Any, four_sides: dict[str, Any], settle: Any, axe: Any, until: Any
 ) -> None:
@@ -241,6 +244,7 @@ def test_alternatives_are_drawn_alike_and_none_as_the_answer(
     expect(labels).to_have_count(0)
 
 
+@pytest.mark.thorough
 def test_what_is_not_there_is_told(
     page: Page, open_page: Callable[..., Page], station: Any, settle: Any
 ) -> None:

@@ -162,6 +162,7 @@ def test_what_is_drawn_is_in_the_address_and_reached_by_keys(
     assert page.evaluate("document.documentElement.scrollWidth") == 390
 
 
+@pytest.mark.thorough
 def test_it_is_measured_and_frames_are_boxed(
     page: Page, station: Any, built: dict[str, Any], settle: Any, until: Any
 ) -> None:
@@ -244,6 +245,7 @@ def ask(station: Any, robot: str, sent: int) -> dict[str, Any]:
     return dict(answer.json())
 
 
+@pytest.mark.thorough
 def test_robots_stand_where_their_queries_found_them(
     page: Page, station: Any, patrolled: dict[str, Any], settle: Any, axe: Any, until: Any
 ) -> None:
@@ -305,6 +307,7 @@ def test_robots_stand_where_their_queries_found_them(
     expect(rows.first).to_contain_text("cart")
 
 
+@pytest.mark.thorough
 def test_a_query_between_the_list_and_the_events_moves_its_robot_too(
     page: Page, station: Any, patrolled: dict[str, Any], settle: Any, until: Any
 ) -> None:
@@ -337,6 +340,7 @@ def test_a_query_between_the_list_and_the_events_moves_its_robot_too(
     expect(rows.first).to_contain_text("late", timeout=60_000)
 
 
+@pytest.mark.thorough
 def test_what_is_missing_is_told(
     page: Page, open_page: Callable[..., Page], station: Any, built: dict[str, Any], settle: Any,
     until: Any,

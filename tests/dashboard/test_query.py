@@ -156,6 +156,7 @@ def test_the_verdict_is_the_status(page, ask, search, status, title):
         assert tiles(page, "VDR") == tiles(page, "DR") == []
 
 
+@pytest.mark.thorough
 def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, settle, axe):
     assert (four_sides["status"], four_sides["location"]) == ("ambiguous", None)
     several = four_sides["alternatives"]
@@ -388,6 +389,7 @@ def test_a_control_asks_again(station, page, ask, settle):
     assert len(accepted(shown(station, page))) == 1
 
 
+@pytest.mark.thorough
 def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle):
     answer = ask("&k=1&candidates=4&session=room-0/ann,room-0/bob,room-1/ann")
     options = {
@@ -442,6 +444,7 @@ def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle):
     assert "nobody" in page.locator(".query-why-result").inner_text()
 
 
+@pytest.mark.thorough
 def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
     """It is sent once: the kept answer is asked with every change, and by who has its id."""
     frame = station.frames[3]
@@ -498,6 +501,7 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
     assert shown(station, page)["matches"] == answer["matches"]
 
 
+@pytest.mark.thorough
 def test_what_is_no_longer_kept_is_asked_again_where_it_can_be(station, page, ask, settle):
     answer = ask("&k=1")
     (station.data / "queries" / answer["query_id"]).unlink()
@@ -514,6 +518,7 @@ def test_what_is_no_longer_kept_is_asked_again_where_it_can_be(station, page, as
     assert page.get_by_role("link", name="Repeat the query").count() == 0
 
 
+@pytest.mark.thorough
 def test_an_answer_outlives_frames_of_its_ranking(station, page, settle, until):
     path = station.make_map("shrinking")
     for sent in station.frames[:6]:
@@ -534,6 +539,7 @@ def test_an_answer_outlives_frames_of_its_ranking(station, page, settle, until):
     assert "6 of 6 compared, 5 shown" in head
 
 
+@pytest.mark.thorough
 def test_an_answer_is_kept_shared_and_released(station, open_page, settle, axe, until):
     page = open_page(permissions=["clipboard-read", "clipboard-write"])
     frame = station.frames[2].frame_id
@@ -565,6 +571,7 @@ def test_an_answer_is_kept_shared_and_released(station, open_page, settle, axe, 
     expect(row).to_have_count(0)
 
 
+@pytest.mark.thorough
 def test_an_answer_is_reconstructed(station, page, ask, settle, with_open3d):
     answer = ask("&k=3")
     page.goto(f"{station.home}#/queries/{answer['query_id']}")

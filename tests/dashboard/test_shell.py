@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
 from playwright.sync_api import Page, expect
 
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
@@ -63,6 +64,7 @@ def test_a_theme_is_kept(station: Any, page: Page, settle: Callable[[Page], None
     assert page.evaluate(colour) == dark
 
 
+@pytest.mark.thorough
 def test_keys(
     station: Any,
     open_page: Callable[..., Page],
@@ -151,6 +153,7 @@ def test_addresses_focus_and_keyboard(
     expect(page.get_by_role("main")).to_contain_text("There is no page at this address.")
 
 
+@pytest.mark.thorough
 def test_a_page_looks_the_same_wherever_one_comes_from(
     station: Any, page: Page, settle: Callable[[Page], None]
 ) -> None:
@@ -169,6 +172,7 @@ def test_a_page_looks_the_same_wherever_one_comes_from(
     assert page.evaluate(look) == alone
 
 
+@pytest.mark.thorough
 def test_a_service_without_maps_goes_and_comes_back(
     serve: Callable[..., Any],
     free_port: int,
@@ -236,6 +240,7 @@ def test_nothing_is_wider_than_a_small_screen(
         assert page.evaluate(small) == []
 
 
+@pytest.mark.thorough
 def test_the_api_s_page_draws_every_operation_with_its_own_files(page: Page, station: Any) -> None:
     told = station.client.get("/openapi.json").json()
     operations = sum(len(one) for one in told["paths"].values())

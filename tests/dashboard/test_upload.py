@@ -170,6 +170,7 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
     assert axe(page) == []
 
 
+@pytest.mark.thorough
 def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
     page: Page, station: Any, settle: Callable[[Page], None]
 ) -> None:
@@ -256,6 +257,7 @@ def test_five_hundred_files_and_a_service_that_asks_to_wait(
         page.close()  # it asks no more
 
 
+@pytest.mark.thorough
 def test_who_may_only_look_is_told_so(
     open_page: Callable[..., Page], station: Any, settle: Callable[[Page], None]
 ) -> None:
@@ -272,6 +274,7 @@ def test_who_may_only_look_is_told_so(
     expect(page.get_by_role("link", name="Upload frames")).to_have_count(0)
 
 
+@pytest.mark.thorough
 def test_a_cloud_or_mesh_may_be_a_whole_map(
     page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]],
     room_mesh: bytes,

@@ -153,6 +153,7 @@ def run_until_killed(
     server.kill()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
 def test_no_kill_separates_a_change_its_event_and_its_line(

@@ -112,6 +112,7 @@ def rooms(
     return replace(made, join=join, association=f"{path}/associations/{found['job_id']}")
 
 
+@pytest.mark.thorough
 def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms: Rooms) -> None:
     assert (rooms.join["strength"], rooms.join["root"]) == ("strong", "ann/morning")
     matched = set()
@@ -129,6 +130,7 @@ def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms: Rooms) 
     assert matched == {("ann", "ann/morning"), ("bob", "bob/evening")}
 
 
+@pytest.mark.thorough
 def test_sessions_that_are_joined_can_be_compared_and_covered(rooms: Rooms) -> None:
     parents = {
         one["robot"]: one["parent_frames"]
@@ -143,6 +145,7 @@ def test_sessions_that_are_joined_can_be_compared_and_covered(rooms: Rooms) -> N
     assert covered["found"] >= 0.8 * covered["frames"]
 
 
+@pytest.mark.thorough
 def test_frames_that_come_later_follow_the_join(rooms: Rooms) -> None:
     client, frame = rooms.server.client, rooms.held_out[0]
     again = _add(rooms.server, rooms.path, rooms.bob, "bob", 0)
@@ -171,6 +174,7 @@ def test_frames_that_come_later_follow_the_join(rooms: Rooms) -> None:
     assert client.delete(url).status_code in (200, 204)
 
 
+@pytest.mark.thorough
 def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms: Rooms) -> None:
     frame = rooms.held_out[-1]
     assert frame.pose is not None
@@ -184,6 +188,7 @@ def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms: Rooms) -> None:
     assert pose_difference(ORIGINS["ann/morning"] @ np.array(pose["matrix"]), frame.pose)[0] < 0.1
 
 
+@pytest.mark.thorough
 def test_a_join_is_undone(rooms: Rooms) -> None:
     """The last test of the map."""
     client, url = rooms.server.client, rooms.association
