@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -293,6 +294,12 @@ def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, ro
     assert told.trends == dict.fromkeys(told.trends, 0) | {"better": len(places)}
     backwards = engine.coverage.changes("hall", before.job_id, after.job_id)
     assert backwards.trends["worse"] == len(places)
+    with engine.store.database.read() as connection:
+        items = list(connection.execute(select(job_items.c.data)).scalars())
+    frames = [item for item in items if "frame" in item]
+    assert len(frames) > 20
+    written = json.dumps(frames)  # a deleted frame leaves no position behind
+    assert not [x for x, *_ in rooms.positions if f"{x:.6f}"[:8] in written]
     # frames that were deleted since are in no list and are no look-alikes
     whole = frames_of(engine, engine.coverage.get("hall", rooms.whole))
     assert {frame.session for frame in whole} == {"a", "c"}

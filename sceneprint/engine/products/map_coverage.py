@@ -285,12 +285,12 @@ def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
 
 def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> CoverageFrame:
     stop = stops[item["frame"]]
-    at = item["at"]
+    pose = stop.pose
     same = ("number", "outcome", "reason", "cause", "error_m", "error_deg")
     return CoverageFrame(
         frame_id=stop.id, robot=stop.robot, session=stop.session,
-        parent_frame=item["parent"],
-        position=None if at is None else Vector(x=at[0], y=at[1], z=at[2]),
+        parent_frame=None if pose is None else stop.parent,
+        position=None if pose is None else Vector(x=pose[0][3], y=pose[1][3], z=pose[2][3]),
         look_alikes=[stops[one].id for one in item["look_alikes"] if one in stops],
         **{name: item[name] for name in same},
     )  # fmt: skip
@@ -326,8 +326,6 @@ def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict
     ]
     return {
         "outcome": outcome, "reason": answer.reason, "cause": answer.cause,
-        "parent": stop.parent if own is not None else None,
-        "at": None if own is None else own[:3, 3].tolist(),
         "error_m": None if off is None else off[0],
         "error_deg": None if off is None else math.degrees(off[1]),
         "look_alikes": _look_alikes(answer, elsewhere),
@@ -375,17 +373,21 @@ def plans_of(
     connection: Connection, row: MapRow, items: Sequence[dict[str, Any]], cell_m: float | None
 ) -> tuple[list[CoveragePlan], float]:
     """Plans of the queried frames that have poses, and the width of their cells, metres."""
-    by_parent: dict[str, list[dict[str, Any]]] = {}
-    for item in items:
-        if item["at"] is not None:
-            by_parent.setdefault(item["parent"], []).append(item)
+    outcomes = {item["frame"]: item["outcome"] for item in items}
+    by_parent: dict[str, list[PathFrame]] = {}
+    for stop in path_frames(connection, outcomes).values():
+        if stop.pose is not None and stop.parent is not None:
+            by_parent.setdefault(stop.parent, []).append(stop)
     names = sorted(by_parent, key=lambda name: (-len(by_parent[name]), name))[:MOST_PLANS]
     queried = {
-        name: [QueriedPosition(np.array(one["at"]), one["outcome"]) for one in by_parent[name]]
+        name: [
+            QueriedPosition(np.array(stop.pose)[:3, 3], outcomes[stop.number])
+            for stop in by_parent[name]
+        ]
         for name in names
     }
     axes = {
-        name: parent_axes(connection, row, [item["frame"] for item in by_parent[name]])
+        name: parent_axes(connection, row, [stop.number for stop in by_parent[name]])
         for name in names
     }
     return coverage_plans(queried, positions_of_map(connection, row.number), axes, cell_m)
