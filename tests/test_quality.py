@@ -160,7 +160,7 @@ def test_the_table_keeps_the_distances_of_the_exact_path(data_root: Path, signer
 def test_retrieval(
     data_root: Path, paper: Signer, split: str, oracle: float, mean_overlap: float, top1: float
 ) -> None:
-    """Every fourth frame of the splits of docs/performance.md: .604 and .603, .84 and .73."""
+    """Every fourth frame of the splits of docs/model.md: .604 and .603, .84 and .73."""
     (sequence,) = find_sequences(data_root / "7scenes/redkitchen")
     database, queries = (
         [sequence.frames[i].read_depth() for i in part[::4]] for part in SPLITS[split]
@@ -208,7 +208,7 @@ def test_another_rooms_frame_is_farther(
 def test_a_roll_of_the_camera_changes_little(signer: Signer, views: list[RolledView]) -> None:
     """The same content at every angle: what is left is the segmentation's own noise.
 
-    A third of d0 is what we want; one of the 84 measurements misses it, as docs/performance.md
+    A third of d0 is what we want; one of the 84 measurements misses it, as docs/limits.md
     says, and a rectangular sensor, whose content changes, is not held to it.
     """
     shares = np.array([shares_of_d0(one, signer, round_lens=True) for one in views])
