@@ -1,4 +1,4 @@
-"""`python -m service`: the service alone, by the settings of the environment."""
+"""`python -m service`: run the service without workers, with settings from the environment."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from service.server import run
 
 
 def main() -> int:
-    """Serve until told to stop; errors are one line and exit code 2."""
+    """Serve until a signal ends the process. Errors are printed in one line, with exit code 2."""
     log_as_json()
-    # uvicorn handles both signals while it runs, and raises them again at the end
+    # uvicorn handles both signals while it runs, and raises them again when it stops.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         read_secret_files(os.environ)
@@ -26,7 +26,7 @@ def main() -> int:
         print(f"service: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
         return 2
     except KeyboardInterrupt:
-        pass  # the ordinary end
+        pass  # the normal end
     return 0
 
 

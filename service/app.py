@@ -1,4 +1,4 @@
-"""The application: its routes, and the concerns that they call."""
+"""The ASGI application: its routes, OpenAPI document and background tasks."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ from service.routes import (
 )
 from service.running_service import Service
 
-# The OpenAPI document: FastAPI's, and the records that only bodies of our own reading use.
+# The OpenAPI document: that of FastAPI, with the records that routes parse themselves.
 
 
 def openapi_of(app: FastAPI) -> dict[str, Any]:
-    """The document of an application, made once."""
+    """Return the OpenAPI document of an application, which is built once."""
     if app.openapi_schema is None:
         document = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes
@@ -109,7 +109,7 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
             schemas.setdefault(name, schema)
         for operation in (one for path in document["paths"].values() for one in path.values()):
             if "application/json" in operation["responses"].get("422", {}).get("content", {}):
-                del operation["responses"]["422"]  # FastAPI's guess: a name in a path is never so
+                del operation["responses"]["422"]  # FastAPI adds it for every path parameter
         for name in ("HTTPValidationError", "ValidationError"):
             schemas.pop(name, None)
         app.openapi_schema = document
@@ -118,7 +118,7 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
 
 log = logging.getLogger(__name__)
 
-#: In the order in which the document lists them.
+#: Routers in the order of the OpenAPI document.
 ROUTERS = (
     maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
     maps.edits_router, copies.router,
@@ -132,8 +132,8 @@ ROUTERS = (
 )  # fmt: skip
 
 DESCRIPTION = """\
-Where have I seen this before? Upload depth frames or point clouds to a map, and ask where another
-was taken: pure geometry, no colour, no pose prior. docs/api.md is a tour with curl.
+Where have I seen this before? Upload depth frames or point clouds to a map, and query where another
+frame was taken: pure geometry, no colour, no pose prior. docs/api.md is a tour with curl.
 
 Lengths are metres. Camera frames are optical (x right, y down, z forward), clouds keep the axes of
 their sensor. Refusals are problem documents (RFC 9457) that say what happened, why, and what to do.
@@ -142,7 +142,7 @@ their sensor. Refusals are problem documents (RFC 9457) that say what happened, 
 
 @asynccontextmanager
 async def warming(context: Context) -> AsyncIterator[None]:
-    """Compile or load kernels and tables in the background, so that the service answers at once."""
+    """Compile or load kernels and tables in the background; the service responds meanwhile."""
     stop = threading.Event()
     context.signers.hold()
     task = asyncio.create_task(to_thread.run_sync(_warm, context, stop))
@@ -150,7 +150,7 @@ async def warming(context: Context) -> AsyncIterator[None]:
         yield
     finally:
         stop.set()
-        await task  # the store must outlast it
+        await task  # the task uses the store, which closes next
 
 
 def _warm(context: Context, stop: threading.Event) -> None:
@@ -163,17 +163,17 @@ def _warm(context: Context, stop: threading.Event) -> None:
     context.store.decoders.start()
     try:
         context.signers.warm()
-    except SceneprintError as error:  # the first requests load what they need, or say the same
+    except SceneprintError as error:  # later requests load the models, or report the error
         log.info("store unreachable", extra={"error": str(error)})
 
 
 @asynccontextmanager
 async def housekeeping(service: Service) -> AsyncIterator[None]:
-    """Write figures and uses of keys, and drop what is held of deleted frames, now and then."""
+    """Write metrics and uses of keys regularly, and drop cached data of deleted frames."""
     database, sampler = service.context.store.database, service.metrics.sampler
     purging = MemoryPurging(service.context)
 
-    async def keep() -> None:
+    async def repeat() -> None:
         while True:
             await asyncio.sleep(SAMPLED_S)
             await to_thread.run_sync(sampler.flush, database)
@@ -183,7 +183,7 @@ async def housekeeping(service: Service) -> AsyncIterator[None]:
             except SceneprintError as error:
                 log.info("store unreachable", extra={"error": str(error)})
 
-    task = asyncio.create_task(keep())
+    task = asyncio.create_task(repeat())
     try:
         yield
     finally:
@@ -191,7 +191,7 @@ async def housekeeping(service: Service) -> AsyncIterator[None]:
         with suppress(asyncio.CancelledError):
             await task
         await to_thread.run_sync(sampler.flush, database)
-        with suppress(SceneprintError):  # of a store that is away
+        with suppress(SceneprintError):  # the store may be unreachable
             await to_thread.run_sync(service.key_uses.write, database)
 
 
@@ -203,11 +203,11 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        # its server was there when the process began, and may have gone since
+        # The database server was reachable when the process started, but may have stopped since.
         opened = open_context(settings, PATIENCE_S)
         async with contextmanager_in_threadpool(opened) as context:
             service = Service(context, figures)
-            # more than the requests of one tenant hold, so that others find a thread
+            # Above the limit of one tenant, so that other tenants always find a free thread.
             to_thread.current_default_thread_limiter().total_tokens += service.places
             app.state.service, app.state.refusals = service, RefusalFilter()
             loading = warming(context) if warm else nullcontext()
@@ -215,13 +215,13 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
                 yield
             service.feed.close()
 
-    # a path with a slash too many is not there: a redirection has no problem document, and would
-    # lead whoever follows it, with a key, to where Host says, and behind a proxy away from TLS
+    # A path with an extra slash is a 404: a redirection would send the client, with its key, to the
+    # address in Host, and behind a proxy to an address without TLS.
     app = FastAPI(
         title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan,
         redirect_slashes=False, docs_url=None, redoc_url=None, openapi_url=None,
     )  # fmt: skip
-    for router in (*ROUTERS, admin.router):  # as they are: `include_router` would make each anew
+    for router in (*ROUTERS, admin.router):  # `include_router` would build every route again
         app.router.routes.extend(router.routes)
     app.include_router(static_files.routes(lambda: openapi_of(app)))
     app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))

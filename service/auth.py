@@ -1,12 +1,11 @@
-"""Who asks, and what they may: one path for all routes.
+"""Authentication and authorisation of all routes, and the audit log of refused requests.
 
     request  --caller-->  Caller, with the Service  --may_read | may_write-->  a map
-    refusal  --record_refusal-->  a line of the audit log
+    refused request  --record_refusal-->  a line of the audit log
 
-What depends on nothing slow is asked in the event loop: a thread's turn comes late where many
-are at work.
-
-What a caller may not read is not there: the same answer, word for word, as where there is none.
+Dependencies that do not block run in the event loop, because a thread may become free only after a
+wait under load. A map that the caller may not read gets the same response, word for word, as a map
+that does not exist.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ log = logging.getLogger(__name__)
 
 
 def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> bool:
-    """Return whether grants, by names of maps and `*` for all, include a scope for a map, by
+    """Return whether grants (scope by map name, `*` for all maps) include a scope for a map, by
     default for all maps.
     """
     least = SCOPES.index(scope)
@@ -62,34 +61,34 @@ def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> 
     return any(SCOPES.index(one) >= least for one in held)
 
 
-#: The map of a match, in requests for one.
+#: Map of a match, in requests for one match.
 MatchMap = Annotated[
     str | None,
     Query(
         alias="map",
         max_length=128,
-        description="Where matches of several maps have the same id; default: the first of them.",
+        description="Map of the match, if several maps have the same id; default: the first one.",
     ),
 ]
 
 
-# Who asks, and what they may.
+# Callers and their scopes.
 
-_bearer = HTTPBearer(auto_error=False, description="A key made by `sceneprint keys`.")
+_bearer = HTTPBearer(auto_error=False, description="A key that `sceneprint keys` created.")
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks.
+    """Sender of a request, with the data of its key.
 
     Parameters
     ----------
-    name : of the key; "" where none is asked for
+    name : name of the key; "" if no key is required
     grants : scope by name of a map, `*` for all
-    expires_at : of the key, seconds since 1970; None: never
-    key_id : of the key; None where none is asked for
-    tenant : of the key; NOBODY where none is asked for
-    created_at : of the key, seconds since 1970; None where none is asked for
+    expires_at : expiry of the key, seconds since 1970; None if it does not expire
+    key_id : id of the key; None if no key is required
+    tenant : tenant of the key; NOBODY if no key is required
+    created_at : creation time of the key, seconds since 1970; None if no key is required
     """
 
     name: str
@@ -100,7 +99,7 @@ class Caller:
     created_at: float | None = None
 
     def may(self, scope: Scope, map_name: str = EVERY) -> bool:
-        """Whether the caller may do that with a map; default: with all and what is of none."""
+        """Return whether the caller has a scope for a map, by default for all maps."""
         return allows(self.grants, scope, map_name)
 
     def require(self, map_name: str, scope: Scope) -> None:
@@ -113,12 +112,12 @@ class Caller:
             raise _forbidden(self, scope, f"map {map_name!r:.80}")
 
     def require_new(self, map_name: str) -> None:
-        """See that the caller may make a map of a name; Forbidden, be it there or not."""
+        """Raise Forbidden if the caller may not create a map of this name, existing or not."""
         if not self.may("admin", map_name):
             raise _forbidden(self, "admin", f"a map named {map_name!r:.80}")
 
     def require_every(self, scope: Scope) -> None:
-        """See that the caller may do that with all maps, and with what is of none; Forbidden."""
+        """Raise Forbidden if the caller does not have the scope for all maps."""
         if not self.may(scope):
             raise _forbidden(self, scope, "all maps")
 
@@ -134,17 +133,17 @@ class Caller:
         return job
 
     def readable(self, names: Iterable[str]) -> list[str]:
-        """Those of some maps that the caller may read."""
+        """Return the names of maps that the caller may read."""
         return [name for name in names if self.may("read", name)]
 
     @property
     def reads_every(self) -> bool:
-        """Whether there is no map that the caller may not read."""
+        """Whether the caller may read all maps."""
         return self.may("read")
 
     @property
     def named(self) -> tuple[str, ...] | None:
-        """Names of the maps that the caller may read, where it may not read all; else None."""
+        """Names of the maps that the caller may read; None if it may read all maps."""
         return None if self.reads_every else tuple(sorted(set(self.grants) - {EVERY}))
 
 
@@ -160,24 +159,24 @@ def require_readable(query_id: str, here: Service, asking: Caller) -> QueryRow:
 
 
 def anybody() -> Caller:
-    """Where no key is asked for: whoever reaches the service is on its machine."""
+    """Return the caller if no key is required. Only processes of this machine reach the service."""
     return Caller("", {EVERY: "admin"})
 
 
 async def caller(
     request: Request, here: Here,
-    given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
+    credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller:  # fmt: skip
-    """Return the caller by the key in the request. A key is checked even if none is required: a
-    wrong one would otherwise go unnoticed. Raise KeyRequired if it is missing, unknown, revoked or
+    """Return the caller of the key in the request. A key is checked even if none is required, so
+    that a wrong key is noticed. Raise KeyRequired if the key is missing, unknown, revoked or
     expired, and RateLimited or Busy if its tenant sends too many requests.
     """
-    if given is None:
+    if credentials is None:
         if requires_key(request, here):
-            raise KeyRequired(_why(request, here))
+            raise KeyRequired(_key_required_text(request, here))
         set_actor(Actor("", address_of(request) or None))
         return anybody()
-    key = await to_thread.run_sync(here.find_key, given.credentials, limiter=here.lookups)
+    key = await to_thread.run_sync(here.find_key, credentials.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
         raise KeyRequired(_REFUSED_KEY)
@@ -190,14 +189,14 @@ async def caller(
 
 
 async def _admit(request: Request, here: Service, tenant: str) -> None:
-    """Count a request for its tenant, before its body is read, until it is answered."""
+    """Count a request for its tenant until the response ends; the body is read afterwards."""
     set_tenant(tenant)
     enforce_rate_limit(request, here.limits.requests, tenant, request_cost(request))
     if not here.requests.take(tenant, 1, here.places):
         raise too_many_requests(share(here.places))
     request.state.place = partial(here.requests.give, tenant, 1)
     request.state.at_end.append(request.state.place)
-    if not is_import(request.scope):  # which is written where it stays
+    if not is_import(request.scope):  # the body of an import is written to its final place
         length = request.headers.get("content-length", "")
         known = length.isascii() and length.isdigit()
         here.spool.require_room(tenant, int(length) if known else 0)
@@ -208,7 +207,7 @@ async def _admit(request: Request, here: Service, tenant: str) -> None:
 
 
 def release_place(request: Request) -> None:
-    """Count a request no more as one in progress: it goes on for as long as somebody listens."""
+    """Stop counting a request as one in progress, because a stream lasts as long as its client."""
     place = getattr(request.state, "place", None)
     if place is not None:
         request.state.at_end.remove(place)
@@ -216,8 +215,9 @@ def release_place(request: Request) -> None:
 
 
 async def hold_read(request: Request, here: Service, tenant: str) -> None:
-    """Wait for a turn of the shared threads, several for a page of many rows, held until the answer
-    begins. Raise Busy if none comes in time; requests without a key share with nobody.
+    """Wait for a turn in the shared threads, held until the response begins. A page of many rows
+    takes several turns. Raise Busy if none becomes free in time. Requests without a key do not
+    wait.
     """
     if tenant == NOBODY:
         return
@@ -229,8 +229,8 @@ async def hold_read(request: Request, here: Service, tenant: str) -> None:
 def v1_router(
     prefix: str = "", tag: str | None = None, *depends: Callable[..., object]
 ) -> APIRouter:
-    """Return a router of paths below /v1, each of which checks the caller and `depends`. `tag`
-    names its operations in the OpenAPI document.
+    """Return a router for paths below /v1, which all check the caller and `depends`. `tag` names
+    the operations in the OpenAPI document.
     """
     dependencies = [Depends(one) for one in (caller, *depends)]
     tags: list[str | Enum] | None = None if tag is None else [tag]
@@ -240,30 +240,30 @@ def v1_router(
 
 
 class ListRoute(APIRoute):
-    """A route whose page of a list is written as JSON by the thread that made it, item by item.
+    """A route that serialises a page of a list in the thread that read it, item by item.
 
-    FastAPI would write it in the event loop, in one call that lets no other thread compute: 1000
-    rows keep every other request waiting for 10 ms.
+    FastAPI would serialise it in the event loop with one call, which blocks all other requests for
+    10 ms per 1000 rows.
     """
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
-        super().__init__(path, _write_pages_of(endpoint), **options)
+        super().__init__(path, _serialize_pages_of(endpoint), **options)
 
 
-def _write_pages_of(endpoint: Callable[..., Any]) -> Callable[..., Any]:
+def _serialize_pages_of(endpoint: Callable[..., Any]) -> Callable[..., Any]:
     if iscoroutinefunction(endpoint):
         return endpoint
 
     @wraps(endpoint)
-    def answer(*given: Any, **named: Any) -> Any:
-        found = endpoint(*given, **named)
-        return page_response(found) if isinstance(found, Page) else found
+    def answer(*arguments: Any, **options: Any) -> Any:
+        result = endpoint(*arguments, **options)
+        return page_response(result) if isinstance(result, Page) else result
 
     return answer
 
 
 def page_response(page: Page[Any]) -> Response:
-    """A page as JSON, the same text as pydantic writes in one go."""
+    """Return a page as JSON, with the same text as pydantic writes in one call."""
     items = ",".join([one.model_dump_json(by_alias=True) for one in page.items])
     rest = page.model_dump_json(by_alias=True, exclude={"items"})
     return Response(f'{{"items":[{items}],{rest[1:]}', media_type="application/json")
@@ -274,38 +274,37 @@ Asking = Annotated[Caller, Depends(caller)]
 
 async def guest(
     request: Request, here: Here,
-    given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
+    credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller | None:  # fmt: skip
-    """Return the caller of a route that anybody may use; None without a key. Raise KeyRequired if
+    """Return the caller of a route that needs no key; None without a key. Raise KeyRequired if
     the key is unknown, revoked or expired.
     """
-    if given is None and requires_key(request, here):
+    if credentials is None and requires_key(request, here):
         return None
-    return await caller(request, here, given)
+    return await caller(request, here, credentials)
 
 
 Guest = Annotated[Caller | None, Depends(guest)]
 
 
 def requires_key(request: Request, here: Here) -> bool:
-    """Whether whoever sent a request must show a key: it may have come from another machine."""
+    """Return whether a request needs a key because it may come from another machine."""
     return here.keys or request.state.forwarded is not None
 
 
 def address_of(request: Request) -> str:
-    """Where a request came from: of the connection itself, whatever its headers say."""
+    """Return the address of the client's connection, which headers cannot forge."""
     return "" if request.client is None else request.client.host
 
 
-#: The same of all three: who tries keys learns of none that it was one.
+#: One text for all three causes, so that it does not reveal whether a guessed key once existed.
 _REFUSED_KEY = (
     "The key that was sent is unknown, revoked or expired. Check that it is complete, or ask the "
     "operator for another; `sceneprint keys --create NAME` creates one."
 )
 
 
-def _why(request: Request, here: Here) -> str:
-    """Why a key is asked for, and how to come by one."""
+def _key_required_text(request: Request, here: Here) -> str:
     reason = "This service requires a key."
     if not here.keys:
         reason = (
@@ -319,27 +318,27 @@ def _why(request: Request, here: Here) -> str:
 
 
 async def may_read(map_name: str, asking: Asking) -> None:
-    """For routes of a map: UnknownMap where the caller may not read it."""
+    """Raise UnknownMap if the caller may not read the map."""
     asking.require(map_name, "read")
 
 
 async def may_write(map_name: str, asking: Asking) -> None:
-    """For routes that change what is in a map."""
+    """Raise UnknownMap or Forbidden if the caller may not change the content of the map."""
     asking.require(map_name, "write")
 
 
 async def may_admin(map_name: str, asking: Asking) -> None:
-    """For routes that change a map itself."""
+    """Raise UnknownMap or Forbidden if the caller may not change the map itself."""
     asking.require(map_name, "admin")
 
 
 async def reads_every(asking: Asking) -> None:
-    """For routes that tell of all maps together."""
+    """Raise Forbidden if the caller may not read all maps."""
     asking.require_every("read")
 
 
 async def administers(asking: Asking) -> None:
-    """For routes that are the operator's."""
+    """Raise Forbidden if the caller is not an administrator of all maps."""
     asking.require_every("admin")
 
 
@@ -352,61 +351,61 @@ def _forbidden(asking: Caller, scope: Scope, what: str) -> Forbidden:
 
 # Refused requests in the audit log.
 
-#: Statuses of what was refused for who asked.
+#: Status codes of requests that were refused because of their caller.
 REFUSED = (401, 403)
-#: Refusals of one caller from one address that are noted at once, and how long one more takes.
+#: Refusals of one caller and address that are logged at once, and the time until the next one.
 AT_ONCE, AGAIN_S = 10, 600.0
-#: Refusals of all callers together that are noted at once, and each second: each is a commit.
+#: Refusals of all callers that are logged at once, and per second. Each one is a commit.
 ALL_AT_ONCE, ALL_PER_S = 20, 1.0
 
 
 class RefusalFilter:
-    """Decides which refusals are logged: however many there are, they fill neither log nor disk. It
-    remembers the `most` latest callers and addresses.
+    """Limiter of logged refusals, so that they fill neither the log nor the disk. It remembers the
+    `most` latest callers and addresses.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, most: int = 10_000) -> None:
         self._each = TokenBucket("refusals", 1 / AGAIN_S, AT_ONCE, most, clock)
         self._all = TokenBucket("refusals", ALL_PER_S, ALL_AT_ONCE, most, clock)
-        self._passed_over: OrderedDict[str, int] = OrderedDict()
+        self._skipped: OrderedDict[str, int] = OrderedDict()
         self._most = most
 
     def count(self, caller: str, address: str) -> int | None:
-        """How many refusals alike were passed over before this one; None: it is passed over."""
+        """Return the number of skipped similar refusals before this one; None to skip this one."""
         whose = f"{network_of(address)} {caller}"
         for bucket, of in ((self._each, whose), (self._all, "")):
             state = bucket.take(of)
             if state is not None and not state.allowed:
-                self._passed_over[whose] = self._passed_over.pop(whose, 0) + 1
-                if len(self._passed_over) > self._most:
-                    self._passed_over.popitem(last=False)
+                self._skipped[whose] = self._skipped.pop(whose, 0) + 1
+                if len(self._skipped) > self._most:
+                    self._skipped.popitem(last=False)
                 return None
-        return self._passed_over.pop(whose, 0)
+        return self._skipped.pop(whose, 0)
 
 
 async def record_refusal(scope: AsgiScope, status: int) -> None:
-    """Write a line of the audit log for a refused request before it is answered, unless there were
-    too many. An answer is not held back by a log that cannot be written.
+    """Write a line of the audit log for a refused request before the response, unless there were
+    too many. If the log cannot be written, the response is sent anyway.
     """
     state: dict[str, Any] = scope["state"]
     client = scope.get("client")
     actor = Actor(state.get("caller", ""), None if client is None else client[0])
-    missed = scope["app"].state.refusals.count(actor.name, actor.address or "")
-    if missed is None:
+    skipped = scope["app"].state.refusals.count(actor.name, actor.address or "")
+    if skipped is None:
         return
     path: dict[str, str] = scope.get("path_params", {})
     targets = [value for name, value in path.items() if name != "map_name"]
     data: dict[str, Any] = {"status": status}
     data["operation"] = getattr(scope.get("route"), "name", None) or "request"
-    if missed:
-        data["not_noted_before"] = missed
+    if skipped:
+        data["not_noted_before"] = skipped
     service: Service = scope["app"].state.service
     write = partial(
         service.audit.record_refusal, actor, state.get("tenant", NOBODY),
         path.get("map_name"), targets[-1] if targets else None, state["request_id"], **data,
     )  # fmt: skip
     try:
-        # however long its turn takes: who asks much must not get rid of what is noted
+        # It waits without a limit, so that a flood of requests cannot suppress audit lines.
         await service.run(write, patient=True)
     except SceneprintError as error:
         log.error("audit entry not written", extra={"action": "refused", "error": str(error)})

@@ -1,4 +1,4 @@
-"""Bodies of requests: forms with a frame, or JSON."""
+"""Parsers of request bodies: forms with frames, single frames and JSON."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ from service.limits import IN_MEMORY
 
 _Record = TypeVar("_Record", bound=BaseModel)
 
-# A frame as the whole body of a request, and what is known of it in the query string.
+# A request whose body is the frame, with its metadata in the query string.
 #
 # curl --data-binary @frame.png -H 'Content-Type: image/png' '...?fx=585&fy=585&cx=320&cy=240'
 # curl --data-binary @scan.ply -H 'Content-Type: application/ply' '...?robot=spot'
 
-#: Types of a body that is a frame; its first bytes decide which of them it is.
+#: Media types of frames. The first bytes of the body decide the format.
 TYPES = media_types_of("depth", "cloud")
 
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
@@ -66,47 +66,47 @@ _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def content(types: Sequence[str] = TYPES) -> dict[str, Any]:
-    """Bodies of this kind, for `requestBody.content` of the OpenAPI document."""
+    """Return `requestBody.content` of these media types for the OpenAPI document."""
     return {one: {"schema": {"type": "string", "format": "binary"}} for one in types}
 
 
 def parameters() -> list[dict[str, Any]]:
-    """What the query string may say of a frame that is the body, for the OpenAPI document."""
+    """Return the query parameters of a frame that is the body, for the OpenAPI document."""
     number, text = {"type": "number"}, {"type": "string"}
     whole = {"type": "integer", "minimum": 1, "maximum": 65535}
-    own = "Where the frame is the body: "
-    told: dict[str, tuple[dict[str, Any], str]] = {
-        "meta": (text, "FrameMeta as JSON, in place of what follows."),
-        **dict.fromkeys(("fx", "fy", "cx", "cy"), (number, "of the camera, pixels.")),
-        "width": (whole, "of the camera's image, pixels; default: that of the image."),
-        "height": (whole, "as `width`."),
+    own = "Only if the body is the frame: "
+    texts: dict[str, tuple[dict[str, Any], str]] = {
+        "meta": (text, "FrameMeta as JSON, in place of the parameters below."),
+        **dict.fromkeys(("fx", "fy", "cx", "cy"), (number, "camera intrinsics, pixels.")),
+        "width": (whole, "width of the camera's image, pixels; default: that of the image."),
+        "height": (whole, "height of the camera's image, pixels; default: that of the image."),
         "distortion": (text, "k1,k2,p1,p2[,k3] of OpenCV."),
         "depth_scale": (number, "stored units per metre; default: 1000."),
-        "depth_along_ray": ({"type": "boolean"}, "samples are ranges along the pixel's ray."),
-        "trust_depth": ({"type": "boolean"}, "take a depth image that does not look like one."),
-        "viewpoint": (text, "of a point cloud: x,y,z in metres; `none` where there is none."),
-        "units_per_metre": (number, "of a point cloud; default: 1."),
+        "depth_along_ray": ({"type": "boolean"}, "whether samples are ranges along the ray."),
+        "trust_depth": ({"type": "boolean"}, "accept a depth image that fails the sanity check."),
+        "viewpoint": (text, "viewpoint of a point cloud as x,y,z in metres, or `none`."),
+        "units_per_metre": (number, "units per metre of a point cloud; default: 1."),
         "format": (
             {"type": "string", "enum": list(get_args(CloudFormat))},
-            "of a point cloud: needed for `kitti` alone.",
+            "format of a point cloud; required only for `kitti`.",
         ),
-        "robot": (text, "who took it."),
-        "session": (text, "in which run."),
-        "captured_at": ({"type": "string", "format": "date-time"}, "when, with its time zone."),
-        "name": (text, "of the original file or message."),
-        "sequence": ({"type": "integer", "minimum": 0}, "place within the session."),
-        "tags": (text, "with commas between."),
+        "robot": (text, "name of the robot."),
+        "session": (text, "name of the session."),
+        "captured_at": ({"type": "string", "format": "date-time"}, "capture time with time zone."),
+        "name": (text, "name of the original file or message."),
+        "sequence": ({"type": "integer", "minimum": 0}, "index within the session."),
+        "tags": (text, "tags, separated by commas."),
         "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}: metres, unit quaternion."),
-        "parent_frame": (text, "what `pose` leads to; default: ROBOT/SESSION."),
-        "base": (text, "T_base_sensor, written as `pose`: where the sensor sits on the robot."),
-        "base_frame": (text, "what the robot calls its base; default: base_link."),
-        "up": (text, "up in the sensor's axes as x,y,z: a unit vector."),
+        "parent_frame": (text, "parent frame of `pose`; default: ROBOT/SESSION."),
+        "base": (text, "T_base_sensor, the mounting pose of the sensor, in the format of `pose`."),
+        "base_frame": (text, "name of the robot's base frame; default: base_link."),
+        "up": (text, "unit vector x,y,z that points up, in the axes of the sensor."),
     }
-    return [query_parameter(name, schema, own + what) for name, (schema, what) in told.items()]
+    return [query_parameter(name, schema, own + what) for name, (schema, what) in texts.items()]
 
 
 def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> dict[str, Any]:
-    """A parameter of the query string that may be left out, for the OpenAPI document."""
+    """Return an optional parameter of the query string, for the OpenAPI document."""
     return {
         "name": name, "in": "query", "required": False, "schema": schema,
         "description": description,
@@ -116,26 +116,26 @@ def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> d
 async def received(
     request: Request, fields: Sequence[str]
 ) -> tuple[UploadFile, FrameMeta, dict[str, str]]:
-    """Read a body that is a frame.
+    """Read a request whose body is the frame.
 
     Parameters
     ----------
-    request : of one of `TYPES`
-    fields : that the query string may have beside what is known of the frame
+    request : request with a media type of `TYPES`
+    fields : names of query parameters that are allowed beside the metadata
 
     Returns
     -------
-    file : to be closed
-    meta : what is known of it
-    others : those of `fields` that were given
+    file : spooled body, which the caller closes
+    meta : metadata of the frame
+    others : parameters of `fields` that are present
 
     Raises
     ------
-    InvalidRequest : a parameter is missing, unknown, given twice or not as it should be.
-    MalformedBody : `meta` is no JSON.
-    StoreFull, UnusableStore : the machine cannot keep the body until it is read.
+    InvalidRequest : If a parameter is missing, unknown, repeated or invalid.
+    MalformedBody : If `meta` is not JSON.
+    StoreFull, UnusableStore : If the body cannot be written to the temporary folder.
     """
-    given = query_parameters(request, ("meta", *_CAMERA, *_PLAIN, *_OTHERS, *fields))
+    values = query_parameters(request, ("meta", *_CAMERA, *_PLAIN, *_OTHERS, *fields))
     spooled = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY)  # noqa: SIM115  (the caller's)
     file = UploadFile(cast(BinaryIO, spooled), size=0)
     try:
@@ -149,8 +149,8 @@ async def received(
                 raise UnreadableFrame(_NO_BODY)
         except OSError as error:
             raise unspoolable(error) from error
-        others = {name: given.pop(name) for name in fields if name in given}
-        meta = _query_meta(given, head)  # a query string is short
+        others = {name: values.pop(name) for name in fields if name in values}
+        meta = _query_meta(values, head)
     except BaseException:
         await file.close()
         raise
@@ -158,7 +158,7 @@ async def received(
 
 
 def unspoolable(error: OSError) -> UnusableStore:
-    """That the machine cannot keep a body until it is read."""
+    """Return the error for a body that cannot be written to the temporary folder."""
     kind = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else UnusableStore
     return kind(
         f"The upload cannot be written to the temporary folder ({error}). Free some space there, "
@@ -170,7 +170,7 @@ def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
     """Return the query string of a request that is not a form; raise InvalidRequest for unknown or
     repeated parameters.
     """
-    given: dict[str, str] = {}
+    values: dict[str, str] = {}
     for name, value in request.query_params.multi_items():
         if name not in known:
             raise InvalidRequest(
@@ -178,81 +178,82 @@ def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
                 f"{', '.join(sorted(known))}.",
                 ((name[:80], "unknown"),),
             )
-        if name in given:
+        if name in values:
             raise InvalidRequest(
-                f"The query string has {name!r} twice. Send it once.", ((name, "given twice"),)
+                f"The query string has {name!r} twice. Send it once.", ((name, "repeated"),)
             )
-        given[name] = value
-    return given
+        values[name] = value
+    return values
 
 
-def _query_meta(given: dict[str, str], head: bytes) -> FrameMeta:
-    text = take_alone(given, "meta")
+def _query_meta(values: dict[str, str], head: bytes) -> FrameMeta:
+    text = take_alone(values, "meta")
     if text is not None:
         return read_meta(text, "The parameter `meta`")
-    return record_of(FrameMeta, _fields(given, head), "The frame metadata in the query string")
+    return record_of(FrameMeta, _fields(values, head), "The frame metadata in the query string")
 
 
-def take_alone(given: dict[str, str], name: str) -> str | None:
-    """Take a parameter that stands for all others; InvalidRequest where it has some beside it."""
-    text = given.pop(name, None)
-    if text is not None and given:
+def take_alone(values: dict[str, str], name: str) -> str | None:
+    """Pop a parameter that replaces all others; raise InvalidRequest if others are present."""
+    text = values.pop(name, None)
+    if text is not None and values:
         raise InvalidRequest(
-            f"The query string has `{name}` and {', '.join(sorted(given))}. Put everything into "
-            f"`{name}`, or leave it out.",
-            tuple((other, f"beside {name}") for other in sorted(given)),
+            f"The query string has `{name}` and {', '.join(sorted(values))}. Put all fields into "
+            f"`{name}`, or omit `{name}`.",
+            tuple((other, f"conflicts with {name}") for other in sorted(values)),
         )
     return text
 
 
-def _fields(given: Mapping[str, str], head: bytes) -> dict[str, Any]:
-    """Fields of FrameMeta from single parameters."""
-    camera: dict[str, Any] = {name: given[name] for name in _CAMERA if name in given}
+def _fields(values: Mapping[str, str], head: bytes) -> dict[str, Any]:
+    """Return the fields of FrameMeta from single query parameters."""
+    camera: dict[str, Any] = {name: values[name] for name in _CAMERA if name in values}
     if "distortion" in camera:
         camera["distortion"] = camera["distortion"].split(",")
     size = size_of(head)
-    # an array of three or four columns is a cloud, unless somebody speaks of a camera
-    is_image = bool(camera) or ("format" not in given and format_of(head) is None)
+    # An array of three or four columns is a cloud unless the request has camera parameters.
+    is_image = bool(camera) or ("format" not in values and format_of(head) is None)
     if size is not None and is_image:
         camera = {"width": size[0], "height": size[1], **camera}
-    found: dict[str, Any] = {"intrinsics": camera} if camera else {}
-    if "viewpoint" in given:
-        found["viewpoint"] = _viewpoint(given["viewpoint"])
-    found |= {name: given[name] for name in _PLAIN if name in given}
-    if given.get("tags"):
-        found["tags"] = given["tags"].split(",")
-    add_transform(found, given, "pose", "pose", "parent_frame")
-    add_transform(found, given, "base", "T_base_sensor", "base_frame")
-    add_up(found, given)
-    return found
+    fields: dict[str, Any] = {"intrinsics": camera} if camera else {}
+    if "viewpoint" in values:
+        fields["viewpoint"] = _viewpoint(values["viewpoint"])
+    fields |= {name: values[name] for name in _PLAIN if name in values}
+    if values.get("tags"):
+        fields["tags"] = values["tags"].split(",")
+    add_transform(fields, values, "pose", "pose", "parent_frame")
+    add_transform(fields, values, "base", "T_base_sensor", "base_frame")
+    add_up(fields, values)
+    return fields
 
 
-def add_up(found: dict[str, Any], given: Mapping[str, str]) -> None:
-    """Add `up` where the query string has it; the record sees whether it is a direction."""
-    if "up" in given:
-        found["up"] = given["up"].split(",")
+def add_up(fields: dict[str, Any], values: Mapping[str, str]) -> None:
+    """Add `up` of the query string, if present; the record validates it."""
+    if "up" in values:
+        fields["up"] = values["up"].split(",")
 
 
 def add_transform(
-    found: dict[str, Any], given: Mapping[str, str], name: str, field: str, frame: str
+    fields: dict[str, Any], values: Mapping[str, str], name: str, field: str, frame: str
 ) -> None:
-    """Add a transform that the query string has, and the frame that it leads to.
+    """Add a transform of the query string, if present, and its parent frame.
 
     Parameters
     ----------
-    found : fields of a record
-    given : the query string
-    name, frame : of the two parameters
+    fields : fields of a record, to which the transform is added
+    values : parameters of the query string
+    name, frame : names of the parameters of the transform and of its parent frame
+    field : name of the field of the transform
 
     Raises
     ------
-    InvalidRequest : it has not seven numbers, or the frame is given alone.
+    InvalidRequest : If the transform does not have seven numbers, or the frame is sent without it.
     """
-    if name in given:
-        found[field] = _transform(name, given[name])
-        if frame in given:
-            found[field][frame] = given[frame]
-    elif frame in given:
+    if name in values:
+        fields[field] = _transform(name, values[name])
+        if frame in values:
+            fields[field][frame] = values[frame]
+    elif frame in values:
         raise InvalidRequest(
             f"The query string has `{frame}` but no `{name}`. Send both.",
             ((frame, f"without {name}"),),
@@ -286,10 +287,10 @@ def _transform(name: str, text: str) -> dict[str, Any]:
     }
 
 
-#: Most bytes of a form field that is no file, and of a JSON body.
+#: Maximum size of a form field other than a file, and of a JSON body, bytes.
 FIELD_BYTES = 1 << 18
 FORM = "multipart/form-data"
-#: Charsets a form may name: those whose text is UTF-8 as well.
+#: Charsets that a form may declare; their text is also valid UTF-8.
 _CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii")
 
 FRAME_BODY: dict[str, Any] = {
@@ -318,13 +319,13 @@ FRAME_BODY: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class FormUpload:
-    """A frame that came in a form, or as the body.
+    """A frame of a form or a body.
 
     Parameters
     ----------
-    file : its bytes, large ones on disk until they are read
-    meta : what is known of it
-    fields : what else the form or the query string says
+    file : content of the frame; large files stay on disk until they are read
+    meta : metadata of the frame
+    fields : other fields of the form or the query string
     """
 
     file: BinaryIO
@@ -333,43 +334,42 @@ class FormUpload:
 
 
 _NO_BODY = (
-    "The body is empty. Send the file itself: of curl, with --data-binary @FILE or -F frame=@FILE."
+    "The body is empty. Send the file itself, with curl by --data-binary @FILE or -F frame=@FILE."
 )
 
 
 def _has_no_body(request: Request) -> bool:
-    """Return whether the headers of a request say that nothing follows them."""
+    """Return whether the headers of a request announce no body."""
     headers = request.headers
     return headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
 
 
 def media_type(request: Request) -> str:
-    """Type of the body, without its parameters."""
+    """Return the media type of the body without its parameters."""
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
 def _charset(request: Request) -> str:
-    """Charset that a form names, in lower case; UTF-8 where it names none."""
+    """Return the charset of a form in lower case; default: UTF-8."""
     _, parameters = parse_options_header(request.headers["content-type"])
     return parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
 
 
 @asynccontextmanager
 async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
-    """Read a frame: a form with a file part `frame`, a field `meta`, and others that are named; or
-    the frame alone, with the same in the query string.
+    """Read a frame from a form with a file part `frame`, a field `meta` and the named fields, or
+    from a body that is the frame, with the same fields in the query string.
 
     Parameters
     ----------
-    request : with the body
-    fields : names of the other fields that it may have
+    fields : names of other fields that the request may have
 
     Raises
     ------
-    UnsupportedType : neither.
-    MalformedBody : a form or JSON that cannot be parsed.
-    InvalidRequest : a part is missing or unknown, or `meta` is not as it should be.
-    StoreFull, UnusableStore : the machine cannot keep it until it is read.
+    UnsupportedType : If the body is neither.
+    MalformedBody : If the form or its JSON cannot be parsed.
+    InvalidRequest : If a part is missing or unknown, or `meta` is invalid.
+    StoreFull, UnusableStore : If the frame cannot be written to the temporary folder.
     """
     if media_type(request) in TYPES:
         file, meta, others = await received(request, fields)
@@ -393,17 +393,16 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
 
 @asynccontextmanager
 async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
-    """Read a form; its files are closed afterwards. Errors as for `uploaded`."""
+    """Read a form, and close its files afterwards. Errors are those of `uploaded`."""
     if _has_no_body(request):
         raise MalformedBody(_NO_BODY)
     if media_type(request) != FORM:
         raise UnsupportedType(
             f"The body is {media_type(request) or 'of no type'!r:.80}. Send a frame as {FORM}: a "
-            "file part `frame` and a field `meta` with JSON. You can also send a single frame "
-            f"as the whole body, as {', '.join(TYPES)}."
+            "file part `frame` and a field `meta` with JSON. You can also send a single frame as "
+            f"the whole body, with one of the types {', '.join(TYPES)}."
         )
-    # Python decodes some of the others in a time that grows with the square of their length, and
-    # not every version of Python alike
+    # Some versions of Python decode other charsets in quadratic time.
     if (charset := _charset(request)) not in _CHARSETS:
         raise MalformedBody(
             f"The form's charset is {charset!r:.80}. Send the form in UTF-8, without `charset`."
@@ -415,7 +414,7 @@ async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
             f"The form cannot be parsed ({getattr(error, 'detail', error)}). Send a file part "
             "`frame` and a field `meta`, with a boundary as in RFC 7578."
         ) from error
-    except OSError as error:  # what is too large for memory is spooled to a file meanwhile
+    except OSError as error:  # large parts are spooled to a file
         raise unspoolable(error) from error
     try:
         yield form
@@ -424,7 +423,7 @@ async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
 
 
 def check_parts(form: FormData, known: Collection[str]) -> None:
-    """See that a form has no part that would have no effect; InvalidRequest."""
+    """Raise InvalidRequest if a form has a part that would have no effect."""
     for name in form:
         if name not in known:
             raise InvalidRequest(
@@ -435,7 +434,7 @@ def check_parts(form: FormData, known: Collection[str]) -> None:
 
 
 def texts_of(form: FormData) -> dict[str, str]:
-    """The parts of a form that are no files, each once; InvalidRequest."""
+    """Return the text parts of a form; raise InvalidRequest for a repeated part."""
     return {name: _text(form.getlist(name), name) for name in form if name != "frame"}
 
 
@@ -475,7 +474,7 @@ async def read_json(request: Request) -> Any:
     if not body:
         raise MalformedBody("The body is empty. Send a JSON object.")
     try:
-        return from_json(bytes(body))  # unlike `json`, no text that is not Unicode
+        return from_json(bytes(body))  # unlike `json`, it refuses lone surrogates
     except ValueError as error:
         raise MalformedBody(f"The body is not JSON ({error}). Send a JSON object.") from error
 
@@ -483,9 +482,8 @@ async def read_json(request: Request) -> Any:
 async def read_json_object(
     request: Request, what: str, types: Sequence[str], otherwise: str = ""
 ) -> dict[str, Any]:
-    """A JSON object that is sent as one of some types; errors as of `read_record`.
-
-    FastAPI would read and parse all of it before it asks for a key.
+    """Return a JSON object that is sent with one of some media types; errors are those of
+    `read_record`. FastAPI would parse the body before it checks the key.
     """
     if media_type(request) not in types:
         raise UnsupportedType(
@@ -503,19 +501,18 @@ async def read_json_object(
 async def read_record(
     request: Request, kind: type[_Record], what: str, *, optional: bool = False
 ) -> _Record:
-    """A record that is sent as JSON.
+    """Return a record that is sent as JSON.
 
     Parameters
     ----------
-    request : with the body
-    kind : of the record
-    what : to begin an error with, such as "The association"
-    optional : whether a request may come without a body: a record of defaults
+    kind : class of the record
+    what : start of error messages, such as "The association"
+    optional : whether a missing body stands for a record of defaults
 
     Raises
     ------
-    UnsupportedType, MalformedBody, TooLarge : not JSON; see `read_json`.
-    InvalidRequest : not such a record.
+    UnsupportedType, MalformedBody, TooLarge : If the body is not valid JSON; see `read_json`.
+    InvalidRequest : If the JSON is not a valid record.
     """
     if optional and _has_no_body(request):
         return kind()
@@ -525,7 +522,7 @@ async def read_record(
 
 
 def read_meta(text: str, what: str) -> FrameMeta:
-    """The metadata of a frame from JSON, or what is wrong with it."""
+    """Return the metadata of a frame from JSON; `what` starts the messages of errors."""
     try:
         return FrameMeta.model_validate_json(text)
     except ValidationError as error:
@@ -553,20 +550,20 @@ def _text(values: list[UploadFile | str], name: str) -> str:
     return values[0]
 
 
-# Many frames in one form, each with its own metadata and its own answer.
+# Several frames in one form, each with its own metadata and its own result.
 #
 # form  --frames_of-->  FormFrames  --read-->  Upload, ...  --upload_responses-->  Batch
 
 
 @dataclass(frozen=True, eq=False)
 class FormFrames:
-    """Frames that came in one form.
+    """Frames of one form.
 
     Parameters
     ----------
-    files : their bytes, not yet read
-    metas : what is known of each, or why that cannot be
-    texts : the other fields
+    files : contents of the frames, not yet read
+    metas : metadata of each frame, or the error in them
+    texts : the other fields of the form
     """
 
     files: Sequence[BinaryIO]
@@ -575,16 +572,16 @@ class FormFrames:
 
     @property
     def priority(self) -> int:
-        """Of all, in the queue."""
+        """Priority of all frames in the queue."""
         return priority_of(self.texts)
 
     @property
     def if_novel(self) -> float | None:
-        """Of all: kept only if new by so much."""
+        """Minimum novelty of all frames; None keeps all of them."""
         return novelty_of(self.texts.get("if_novel"))
 
     def read(self) -> list[Upload]:
-        """Those whose metadata are sound."""
+        """Return the uploads whose metadata are valid."""
         return [
             Upload(file.read(), meta, self.priority, self.if_novel)
             for file, meta in zip(self.files, self.metas, strict=True)
@@ -592,7 +589,7 @@ class FormFrames:
         ]
 
     def faults(self) -> list[str]:
-        """What is wrong with the others."""
+        """Return the index and the error of each frame whose metadata are invalid."""
         return [f"{i} {one}" for i, one in enumerate(self.metas) if not isinstance(one, FrameMeta)]
 
 
@@ -604,14 +601,13 @@ async def frames_of(
 
     Parameters
     ----------
-    request : with the form
-    fields : names of the other fields that it may have
-    most : frames that it may have
+    fields : names of other fields that the form may have
+    most : maximum number of frames
 
     Raises
     ------
-    UnsupportedType, MalformedBody, StoreFull, UnusableStore : see `form_of`.
-    InvalidRequest : there is no frame, or there are not as many metadata as frames.
+    UnsupportedType, MalformedBody, StoreFull, UnusableStore : See `form_of`.
+    InvalidRequest : If there is no frame, or the numbers of metadata and frames differ.
     """
     async with form_of(request, most_files=most) as form:
         check_parts(form, ("frame", "metas", *fields))
@@ -626,12 +622,12 @@ async def frames_of(
         texts = dict(texts_of(form))
         metas = _metas(texts.pop("metas", None), len(files))
         batch = FormFrames(files, metas, texts)
-        _ = batch.priority, batch.if_novel  # what is wrong with them is said before anything else
+        _ = batch.priority, batch.if_novel  # raises early if they are invalid
         yield batch
 
 
 def upload_responses(batch: FormFrames, outcomes: Sequence[UploadResult]) -> Batch:
-    """What came of each frame, in their order."""
+    """Return the result of each frame in the order of the form."""
     rest = iter(outcomes)
     return Batch(
         items=[
@@ -649,31 +645,31 @@ def _metas(text: str | None, count: int) -> list[FrameMeta | InvalidRequest]:
             (("metas", "missing"),),
         )
     try:
-        given = from_json(text)
+        metas = from_json(text)
     except ValueError as error:
         raise MalformedBody("The field `metas` is not JSON. Send an object or a list.") from error
-    if isinstance(given, dict):
-        return [_batch_meta(given)] * count
-    if not isinstance(given, list) or len(given) != count:
-        told = f"a list of {len(given)}" if isinstance(given, list) else "neither object nor list"
+    if isinstance(metas, dict):
+        return [_batch_meta(metas)] * count
+    if not isinstance(metas, list) or len(metas) != count:
+        kind = f"a list of {len(metas)}" if isinstance(metas, list) else "neither object nor list"
         raise InvalidRequest(
-            f"`metas` is {told}, but there are {count} frames. Send one object for all, or a "
+            f"`metas` is {kind}, but there are {count} frames. Send one object for all, or a "
             "list with one for each.",
             (("metas", "not one for each frame"),),
         )
-    return [_batch_meta(one) for one in given]
+    return [_batch_meta(one) for one in metas]
 
 
-def _batch_meta(given: Any) -> FrameMeta | InvalidRequest:
+def _batch_meta(meta: Any) -> FrameMeta | InvalidRequest:
     try:
-        return FrameMeta.model_validate(given)
+        return FrameMeta.model_validate(meta)
     except ValidationError as error:
         return invalid_record(error, "The frame metadata")
 
 
-# The header Idempotency-Key: a request that is sent again takes effect once.
+# The header Idempotency-Key: a repeated request takes effect once.
 #
-# guarded(asking, key, route, payload...)  -->  Once, which the engine stores with what it made
+# guarded(asking, key, route, payload...)  -->  IdempotentRequest, stored with the result
 
 #: As a parameter of a route: `key: IdempotencyKey = None`.
 IdempotencyKey = Annotated[
@@ -683,21 +679,21 @@ IdempotencyKey = Annotated[
         min_length=1,
         max_length=255,
         pattern=r"^[\x20-\x7e]+$",
-        description="Made up by the caller for this request, printable ASCII. The same request "
-        "sent again with it within a day takes effect once, and is answered as things are now, "
-        "with `Idempotent-Replayed: true`; another request with it is refused.",
+        description="Random key of this request, printable ASCII. If you repeat the request with "
+        "the same key within a day, it takes effect once; the response shows the present state, "
+        "with `Idempotent-Replayed: true`. A different request with the same key is refused.",
     ),
 ]
 
 
 def guarded(asking: Caller, key: str | None, *parts: object) -> IdempotentRequest | None:
-    """What makes a request take effect once; None where the caller asks for no such thing.
+    """Return the record that makes a request take effect once; None without an idempotency key.
 
     Parameters
     ----------
-    asking : who asks: keys of two callers have nothing to do with each other
-    parts : of the request, all that makes it another one: route, map, content, metadata; bytes,
-        records, or what JSON can say
+    asking : caller of the request; the keys of different callers are independent
+    parts : everything that distinguishes the request, such as route, map, content and metadata, as
+        bytes, records or JSON values
     """
     if key is None:
         return None
@@ -706,7 +702,7 @@ def guarded(asking: Caller, key: str | None, *parts: object) -> IdempotentReques
 
 
 def mark_replayed(response: Response, *, replayed: bool) -> None:
-    """Say that an answer is that of an earlier request."""
+    """Mark a response as that of an earlier request."""
     if replayed:
         response.headers["Idempotent-Replayed"] = "true"
 
@@ -715,7 +711,7 @@ def _plain(part: object) -> object:
     if isinstance(part, bytes):
         return hashlib.sha256(part).hexdigest()
     if isinstance(part, BaseModel):
-        # a field that a later version adds leaves the fingerprint of a request without it as it is
+        # Defaults are left out, so a new field in a later version keeps the fingerprint.
         return part.model_dump(mode="json", exclude_defaults=True)
     if isinstance(part, list | tuple):
         return [_plain(one) for one in part]

@@ -1,6 +1,6 @@
-"""The service in this process, for `sceneprint_client.Client.embedded`: no port, no other process.
+"""The service inside a Python process, without a port, for `sceneprint_client.Client.embedded`.
 
-httpx.Request  --LocalService-->  the application in a thread of its own  -->  httpx.Response
+httpx.Request  --LocalService-->  the application in its own thread  -->  httpx.Response
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from sceneprint.engine.upkeep.housekeeping import Housekeeping
 from sceneprint.settings import Settings
 from service.app import create_app
 
-#: Jobs after which it is looked whether an index has fallen behind.
+#: Number of jobs after which housekeeping runs.
 _UPKEEP = 256
-#: Seconds between two looks whether the program is about to end without closing its client.
+#: Interval of checks whether the main thread has ended without closing the client, seconds.
 _LOOK_S = 0.5
-#: What one process has of itself: no more than its memory bounds.
+#: Limits of an embedded service; only memory limits its own process.
 _MOST_WAITING, _LONGEST_WAIT_S, _MOST_BYTES, _MOST_STREAMS = 10_000, 3600.0, 2 << 30, 10_000
 
 
 def embedded_settings(path: Path) -> Settings:
-    """The settings of a service that one process has for itself.
+    """Return the settings of a service for one process.
 
-    A folder was named, so nothing goes elsewhere, whatever the environment says; nobody else
-    asks, so no key is needed and nobody is sent away. Frames are the program's own, so they are
-    decoded here: no other process is started.
+    All data goes to the folder, whatever the environment says. No key is needed and nothing is
+    limited, because the process is the only caller. Frames come from the process itself, so they
+    are decoded in it, without another process.
     """
     settings = Settings(
         data_dir=path.absolute(), database_url=None, index_dir=None,
@@ -49,22 +49,21 @@ def embedded_settings(path: Path) -> Settings:
         queued_requests=_MOST_WAITING, queue_timeout_s=_LONGEST_WAIT_S,
         max_event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip
-    # more than may be set: that is what a decoder takes
+    # This exceeds the maximum of the setting; it is the limit of the decoders.
     return settings.model_copy(update={"max_upload_bytes": _MOST_BYTES})
 
 
 class LocalService(httpx.BaseTransport):
-    """The application on a data folder, as a transport of httpx; may be called from any thread.
-
-    It ends with the program where nobody closes it.
+    """The application on a data folder, as a transport of httpx. It is thread-safe, and stops with
+    the program if nobody closes it.
 
     Parameters
     ----------
-    path : the folder, made where missing
+    path : data folder, created if missing
 
     Raises
     ------
-    UnusableStore, NewerSchema : it cannot be opened.
+    UnusableStore, NewerSchema : If the store cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,7 +74,7 @@ class LocalService(httpx.BaseTransport):
         self._exchanges: dict[asyncio.Task[None], LocalExchange] = {}
         self._name = f"embedded-{os.getpid()}"
         self._jobs = itertools.count(1)
-        # this thread computes as well as those of the service: sums have one order everywhere
+        # The calling thread also computes; one BLAS thread keeps the order of sums the same.
         self._limits = threadpool_limits(1)
         opened: Future[Context] = Future()
         self._thread = threading.Thread(target=self._serve, args=(opened,), name=self._name)
@@ -88,7 +87,7 @@ class LocalService(httpx.BaseTransport):
             raise
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """Ask the application; the response streams."""
+        """Send a request to the application, and return a streaming response."""
         exchange = LocalExchange(self._loop, iter(request.stream))  # type: ignore[arg-type]
         answering = self._answer(_scope_of(request), exchange)
         try:
@@ -106,22 +105,22 @@ class LocalService(httpx.BaseTransport):
         return httpx.Response(start["status"], headers=start["headers"], stream=exchange)
 
     def work(self, pause_s: float) -> None:
-        """Do a job, or wait so long where there is none to do."""
+        """Run one job, or wait for `pause_s` seconds if there is none."""
         claimed = self._runner.claim(self._name)
         if claimed is None:
             time.sleep(pause_s)
             return
         try:
             self._runner.run(claimed)
-        except BaseException:  # such as Ctrl-C: another need not wait for the lease to run out
+        except BaseException:  # such as Ctrl-C: other workers need not wait until the lease expires
             self._runner.put_back(claimed)
             raise
         if next(self._jobs) % _UPKEEP == 0:
             self._housekeeping.run()
 
     def close(self) -> None:
-        """End all requests, and give back what was opened."""
-        with suppress(RuntimeError):  # it has ended already
+        """End all requests and release all resources."""
+        with suppress(RuntimeError):  # the loop has already stopped
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
         self._limits.restore_original_limits()
@@ -160,7 +159,7 @@ class LocalService(httpx.BaseTransport):
 
 
 class _Step(Enum):
-    """What the application tells the thread that asked."""
+    """Messages from the application to the calling thread."""
 
     WANTS_BODY = auto()
     START = auto()
@@ -169,26 +168,27 @@ class _Step(Enum):
 
 
 class LocalExchange(httpx.SyncByteStream):
-    """One request and its response: the application on one side, who asks on the other.
+    """One request and its response, between the application and the calling thread.
 
-    Each side waits for the other, so that neither holds more than one part of a body.
+    Each side waits for the other, so neither holds more than one part of a body.
 
     Parameters
     ----------
-    body : of the request; read in the thread that asks
+    loop : event loop of the application
+    body : body of the request, read in the calling thread
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, body: Iterator[bytes]) -> None:
         self._loop, self._body = loop, body
         self._steps: SimpleQueue[tuple[_Step, Any]] = SimpleQueue()
         self._parts: asyncio.Queue[bytes | None] = asyncio.Queue()  # None: the body's end
-        self._taken, self._gone = asyncio.Event(), asyncio.Event()
+        self._consumed, self._gone = asyncio.Event(), asyncio.Event()
         self._whole = False
 
-    # in the loop of the application
+    # Methods for the event loop of the application.
 
     async def receive(self) -> Message:
-        """The next part of the request's body; after the last, that nobody listens any more."""
+        """Return the next part of the request's body; after the last, wait for the disconnect."""
         if not (self._whole or self._gone.is_set()):
             self._steps.put((_Step.WANTS_BODY, None))
             part = await self._parts.get()
@@ -199,33 +199,33 @@ class LocalExchange(httpx.SyncByteStream):
         return {"type": "http.disconnect"}
 
     async def send(self, message: Message) -> None:
-        """A part of the response; waits until it is taken."""
+        """Pass a part of the response to the caller, and wait until the caller has read it."""
         if self._gone.is_set():
             return
         if message["type"] == "http.response.start":
             self._steps.put((_Step.START, message))
             return
         if message.get("body"):
-            self._taken.clear()
+            self._consumed.clear()
             self._steps.put((_Step.PART, bytes(message["body"])))
-            await self._taken.wait()
+            await self._consumed.wait()
         if not message.get("more_body", False):
             self.end()
 
     def end(self) -> None:
-        """There is no more."""
+        """Mark the end of the response."""
         self._steps.put((_Step.END, None))
 
     def leave(self) -> None:
-        """Nobody listens any more."""
+        """Disconnect the caller."""
         self._gone.set()
-        self._taken.set()
+        self._consumed.set()
         self._parts.put_nowait(None)
 
-    # in the thread that asks
+    # Methods for the calling thread.
 
     def start(self) -> Message | None:
-        """Status and headers of the response; None where there is none."""
+        """Return the status and headers of the response; None if there is no response."""
         step, message = self._next()
         return message if step is _Step.START else None
 
@@ -234,11 +234,11 @@ class LocalExchange(httpx.SyncByteStream):
             step, part = self._next()
             if step is _Step.END:
                 return
-            self._call(self._taken.set)
+            self._call(self._consumed.set)
             yield part
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop reading the response."""
         self._call(self.leave)
 
     def _next(self) -> tuple[_Step, Any]:
@@ -249,13 +249,13 @@ class LocalExchange(httpx.SyncByteStream):
             self._call(self._parts.put_nowait, next((part for part in self._body if part), None))
 
     def _call(self, do: Callable[..., object], *arguments: object) -> None:
-        with suppress(RuntimeError):  # the loop has ended, and nobody waits in it
+        with suppress(RuntimeError):  # the loop has stopped
             self._loop.call_soon_threadsafe(do, *arguments)
 
 
 def _scope_of(request: httpx.Request) -> Scope:
-    """What an ASGI application is told of a request."""
-    headers = [(b"host", b"localhost")]  # whatever the client calls it
+    """Return the ASGI scope of a request."""
+    headers = [(b"host", b"localhost")]  # in place of the host name that the client uses
     headers += [
         (name.lower(), value) for name, value in request.headers.raw if name.lower() != b"host"
     ]

@@ -1,9 +1,9 @@
-"""One poller a process, and the streams of events that it feeds.
+"""Event streams, all fed by one poller per process.
 
-    database  --Feed-->  the newest events in memory  -->  every stream, each at its own place
+    database  --Feed-->  the newest events in memory  -->  streams, each at its own position
 
-A stream that is further behind than memory reaches reads the database itself until it has caught
-up. So nobody who reads slowly costs memory, and nobody who waits costs a look at the database.
+A stream that lags behind the events in memory reads the database itself until it has caught up.
+Slow readers therefore cost no memory, and idle streams cost no queries.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from service.limits import Broken, Holdings, share
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at the database, half of them where there was something; and after one
-#: that failed.
+#: Pause between two polls of the database, seconds (half of it after new events), and the pause
+#: after an error.
 POLL_S, TROUBLE_S = 0.1, 1.0
-#: Seconds of silence after which a stream says that it lives.
+#: Interval of keep-alive messages on a silent stream, seconds.
 ALIVE_S = 3.0
-#: Events held in memory, and read or told at once.
+#: Number of events in memory, and maximum number in one read or message.
 HELD, MOST = 4096, 500
 
 
 class Feed:
-    """The streams of one process.
+    """The event streams of one process.
 
     Parameters
     ----------
-    database : that is looked at while anybody listens
-    most : streams at once
-    kept : newest events of each map that are kept for sure
+    database : database that is polled while streams are open
+    most : maximum number of open streams
+    kept : number of newest events of each map that the database never deletes
     """
 
     def __init__(self, database: Database, most: int, kept: int) -> None:
@@ -62,23 +62,23 @@ class Feed:
         self._closed = False
         self._poller: asyncio.Task[None] | None = None
         self._held: deque[EventRow] = deque()
-        # all that is newer than `_since` and known is held; None: nobody has looked yet
+        # All events after `_since` are in memory; None if the database was not polled yet.
         self._since: int | None = None
         self._newest = 0
-        self._last: EventRow | None = None  # the one of the number `_newest`
-        # which line of history these are of, and how often one took its place that lacks what was
-        # told: a standby that was behind gives numbers out again that readers know of others
-        self._history, self._turned = database.history, 0
+        self._last: EventRow | None = None  # the event with the number `_newest`
+        # Identity of the database's history, and how often it was replaced by one that lacks known
+        # events: a standby that lagged behind assigns the same numbers to other events.
+        self._history, self._rewinds = database.history, 0
         self._news = asyncio.Event()
 
     @property
     def streams(self) -> int:
-        """How many there are."""
+        """Number of open streams."""
         return self._streams.total
 
     def join(self, tenant: str = NOBODY) -> None:
-        """Take a place, to be given back by `leave`. Raise Busy if all are taken, and RateLimited
-        if the tenant has its share.
+        """Reserve a stream, until `leave`. Raise Busy if all are in use, and RateLimited if the
+        tenant has reached its share.
         """
         if self._closed or self._streams.total >= self._most:
             raise Busy(
@@ -92,7 +92,7 @@ class Feed:
             )
 
     def leave(self, tenant: str = NOBODY) -> None:
-        """Give the place back; the last one who leaves stops the poller."""
+        """Release a stream. The poller stops with the last one."""
         self._streams.give(tenant, 1)
         if self._streams.total == 0 and self._poller is not None:
             self._poller.cancel()
@@ -106,47 +106,47 @@ class Feed:
         self._wake()
 
     async def batches(
-        self, wanted: EventFilter, after: int | None, may_go_on: Callable[[], bool]
+        self, wanted: EventFilter, after: int | None, has_access: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
-        """Events as they come, each time with the number of the last one that the reader may know
-        and needs no more.
+        """Yield events as they occur, with the number of the last event that the reader has passed.
 
-        At first, and once in ALIVE_S whatever else there is, the list is empty: others' events are
-        no silence to the poller, and are to who waits for his own. Nor do they move the number.
+        The first list, and one in every ALIVE_S seconds, is empty, even while events that the
+        filter excludes keep the poller busy. Excluded events do not change the number.
 
         Parameters
         ----------
-        wanted : the others are passed over
-        after : number from which to go on; None: from now on
-        may_go_on : asked once in ALIVE_S, in a thread; False ends the stream
+        wanted : filter of the events
+        after : number of the event to continue after; None starts with new events
+        has_access : function that is called every ALIVE_S seconds in a thread; False ends the
+            stream
         """
         try:
-            async for batch in self._batches(wanted, after, may_go_on):
+            async for batch in self._batches(wanted, after, has_access):
                 yield batch
-        except SceneprintError as error:  # who listens comes back, and is told what is wrong
+        except SceneprintError as error:  # the client reconnects, and then gets the error
             log.error("event stream failed", extra={"error": str(error)})
 
     async def _batches(
-        self, wanted: EventFilter, after: int | None, may_go_on: Callable[[], bool]
+        self, wanted: EventFilter, after: int | None, has_access: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         if self._poller is None or self._poller.done():
             self._poller = asyncio.create_task(self._poll())
-        turned = self._turned
+        rewinds = self._rewinds
         first, place, seen = await to_thread.run_sync(
             begin, self._database, wanted, self._kept, after
         )
-        yield first, seen  # also where it is empty: the reader learns its place
+        yield first, seen  # even if it is empty, because the reader needs its position
         clock = asyncio.get_running_loop().time
         due = clock() + ALIVE_S
         while not self._closed:
             if clock() >= due:
-                if not await to_thread.run_sync(may_go_on) or self._poller.done():
-                    return  # without a poller it would be silent for ever
+                if not await to_thread.run_sync(has_access) or self._poller.done():
+                    return  # without a poller the stream would stay silent
                 yield [], seen
                 due = clock() + ALIVE_S
             news = self._news
-            if turned != self._turned:
-                turned = self._turned
+            if rewinds != self._rewinds:
+                rewinds = self._rewinds
                 _, place, seen = await to_thread.run_sync(
                     begin, self._database, wanted, self._kept, None
                 )
@@ -172,13 +172,13 @@ class Feed:
                 await asyncio.wait_for(news.wait(), max(due - clock(), 0.0))
 
     def _after(self, place: int) -> tuple[list[EventRow], int]:
-        """The next of the events held, and the number up to which these are all."""
+        """Return the next events in memory, and the number up to which they are complete."""
         newer = sum(1 for event in reversed(self._held) if event.number > place)
         start = len(self._held) - newer
         found = list(islice(self._held, start, start + MOST))
         return found, found[-1].number if found else self._newest
 
-    def _look(self) -> EventRow | None:
+    def _read_newest(self) -> EventRow | None:
         number_events(self._database)
         with self._database.read() as connection:
             newest = newest_number(connection)
@@ -186,7 +186,7 @@ class Feed:
         return found[0] if found else None
 
     def _is_behind(self) -> bool:
-        """Whether the database lacks the last event that is known, or has another in its place."""
+        """Return whether the last known event is missing in the database or differs there."""
         if self._last is None:
             return False
         with self._database.read() as connection:
@@ -194,19 +194,19 @@ class Feed:
             return list_events(connection, EventFilter(), after=after, limit=1) != [self._last]
 
     async def _begin(self) -> None:
-        """Go on from the newest event that there is."""
-        self._last = await to_thread.run_sync(self._look)
+        """Continue from the newest event of the database."""
+        self._last = await to_thread.run_sync(self._read_newest)
         self._history = self._database.history
         self._held.clear()
         self._newest = self._since = 0 if self._last is None else self._last.number
 
-    def _more(self, place: int) -> list[EventRow]:
+    def _read_after(self, place: int) -> list[EventRow]:
         number_events(self._database)
         with self._database.read() as connection:
             return list_events(connection, EventFilter(), after=place, limit=MOST)
 
     async def _poll(self) -> None:
-        """Look for what is new, as long as anybody listens."""
+        """Poll the database while streams are open."""
         pause = 0.0
         while True:
             await asyncio.sleep(pause)
@@ -214,14 +214,14 @@ class Feed:
                 if self._since is None:
                     await self._begin()
                     self._wake()
-                found = await to_thread.run_sync(self._more, self._newest)
+                found = await to_thread.run_sync(self._read_after, self._newest)
                 if self._history != self._database.history:
                     history = self._database.history
                     if await to_thread.run_sync(self._is_behind):
                         await self._begin()
-                        self._turned += 1
+                        self._rewinds += 1
                         self._wake()
-                    else:  # as a synchronous standby: it has all that was told
+                    else:  # a synchronous standby, which has all known events
                         self._history = history
                     pause = 0.0
                     continue
@@ -242,28 +242,28 @@ class Feed:
         self._news = asyncio.Event()
 
 
-# Server-sent events: what a stream looks like on the wire, and how it ends.
+# Server-sent events.
 #
-# Events  --message-->  text of the stream  --EventStream-->  who listens, until either side ends it
+#     Event  --message-->  text of the stream  --EventStream-->  client
 
 MEDIA_TYPE = "text/event-stream"
-#: Milliseconds after which a listener who lost the stream comes back.
+#: Time until a client reconnects after a lost stream, milliseconds.
 RETRY_MS = 1000
 BEGIN = f"retry: {RETRY_MS}\n\n".encode()
 
 
 def message(event: Event) -> bytes:
-    """An event as a message of the stream; JSON has no line break within it."""
+    """Return an event as a message of the stream. JSON contains no line breaks."""
     return f"id: {event.id}\ndata: {event.model_dump_json()}\n\n".encode()
 
 
 def alive(place: str) -> bytes:
-    """A comment, and the id to come back with: there was nothing to be told."""
+    """Return a keep-alive comment with the id that the client should continue from."""
     return f": alive\nid: {place}\n\n".encode()
 
 
 class EventStream(Response):
-    """A body that goes on until its source ends or nobody listens; then `left` is called."""
+    """A response that lasts until its source ends or the client leaves; then it calls `left`."""
 
     media_type = MEDIA_TYPE
 
@@ -275,7 +275,7 @@ class EventStream(Response):
         self._source, self._left = source, left
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it."""
+        """Send the response."""
         del scope
         try:
             await send(
@@ -302,7 +302,7 @@ class EventStream(Response):
 async def _until_gone(receive: Receive, scope: anyio.CancelScope) -> None:
     try:
         while (await receive())["type"] != "http.disconnect":
-            pass  # a body that nobody asked for
+            pass  # a body without meaning
     except (ClientDisconnect, Broken):
         pass
     scope.cancel()

@@ -1,11 +1,11 @@
-"""Limits: what tenants share, how often a caller may ask, and what a body may be while it arrives.
+"""Limits: shares of tenants, request rates, and the size and speed of request bodies.
 
-Tenants share turns at work, places to wait, and bytes. Where no key is asked for there is one
-tenant, NOBODY, which shares with nobody.
+Tenants share turns, waiting places and bytes. If no key is required, there is only the tenant
+NOBODY, which has no limits.
 
-A rate is a bucket of tokens for each caller: every request takes one or more, and they come back
-at a steady rate; beyond, 429. A full bucket and no bucket are the same, so that those not seen for
-long may be forgotten.
+A rate limit is a token bucket for each caller: every request takes one or more tokens, and tokens
+return at a constant rate. Without enough tokens the response is 429. A full bucket equals no
+bucket, so callers that have not been seen for long are forgotten.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ T = TypeVar("T")
 
 
 class Holdings:
-    """What each tenant holds of something that there is so much of: three quarters at most."""
+    """Amounts of a limited resource that tenants hold, at most three quarters each."""
 
     def __init__(self) -> None:
         self._held: Counter[str] = Counter()
         self.total = 0
 
     def take(self, tenant: str, amount: int, room: int) -> bool:
-        """Let a tenant hold more, where its share of all the room allows; whether it does."""
+        """Add to the amount of a tenant, and return True, if its share of `room` allows it."""
         if not self.allows(tenant, amount, room):
             return False
         self._held[tenant] += amount
@@ -53,15 +53,15 @@ class Holdings:
         return True
 
     def allows(self, tenant: str, amount: int, room: int) -> bool:
-        """Whether a tenant may hold so much more."""
+        """Return whether a tenant may hold `amount` more."""
         return tenant == NOBODY or self._held[tenant] + amount <= share(room)
 
     def by_tenant(self) -> dict[str, int]:
-        """What each tenant holds that holds anything."""
+        """Return the amount that each tenant holds, without zeros."""
         return {tenant: self._held[tenant] for tenant in list(self._held)}
 
     def give(self, tenant: str, amount: int) -> None:
-        """Take back from a tenant what it held."""
+        """Subtract from the amount that a tenant holds."""
         self._held[tenant] -= amount
         self.total -= amount
         if not self._held[tenant]:
@@ -69,12 +69,12 @@ class Holdings:
 
 
 def share(room: int) -> int:
-    """How much of some room a tenant may hold; the rest is for others."""
+    """Return the amount of `room` that one tenant may hold; the rest is for other tenants."""
     return max(3 * room // 4, 1)
 
 
 class Turns:
-    """Turns of requests: see TurnOrder."""
+    """Turns of requests, in the order of TurnOrder."""
 
     def __init__(
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
@@ -84,7 +84,7 @@ class Turns:
         self._timer: asyncio.TimerHandle | None = None
 
     async def acquire(self, tenant: str, weight: int = 1) -> int:
-        """Wait for a turn, or for several at once; returns how many: give them back."""
+        """Wait for `weight` turns; return the number of turns to release."""
         turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         weight = self._order.enter(tenant, turn, weight)
         self._admit()
@@ -92,14 +92,14 @@ class Turns:
             await turn
         except asyncio.CancelledError:
             if self._order.leave(tenant, turn):
-                self._admit()  # who gave up may have been in the way of others
+                self._admit()  # the cancelled request may have blocked others
             else:
                 self.release(tenant, weight)
             raise
         return weight
 
     def release(self, tenant: str, weight: int = 1) -> None:
-        """Give turns back."""
+        """Release turns."""
         self._order.release(tenant, weight)
         self._admit()
 
@@ -117,28 +117,28 @@ class Turns:
 
 
 class SharedLooks:
-    """Results of slow looks that concurrent requests share, until they are `most_s` seconds old."""
+    """Results of slow checks that concurrent requests share, up to an age of `most_s` seconds."""
 
     def __init__(self, most_s: float) -> None:
         self._most_s = most_s
         self._locks = defaultdict[str, asyncio.Lock](asyncio.Lock)
-        self._found: dict[str, tuple[float, Any]] = {}
+        self._results: dict[str, tuple[float, Any]] = {}
 
-    async def get(self, name: str, look: Callable[[], T]) -> T:
-        """Return what a look found, or raise what it raised. `look` runs in a thread if no result
-        of this name is young enough; who waits meanwhile holds no thread.
+    async def get(self, name: str, check: Callable[[], T]) -> T:
+        """Return the result of a check, or raise its error. `check` runs in a thread if there is no
+        recent result of this name. Requests that wait for it hold no thread.
         """
         arrived = time.monotonic()
         async with self._locks[name]:
-            began, found = self._found.get(name, (-math.inf, None))
-            # a look that began after the request arrived is new enough, however long it took
+            began, result = self._results.get(name, (-math.inf, None))
+            # A check that began after the request arrived is recent enough, however long it took.
             if began < arrived and time.monotonic() - began > self._most_s:
                 began = time.monotonic()
-                found = await to_thread.run_sync(_outcome, look)
-                self._found[name] = began, found
-        if isinstance(found, Exception):
-            raise found.with_traceback(None)
-        return cast(T, found)
+                result = await to_thread.run_sync(_outcome, check)
+                self._results[name] = began, result
+        if isinstance(result, Exception):
+            raise result.with_traceback(None)
+        return cast(T, result)
 
 
 def _outcome(do: Callable[[], object]) -> object:
@@ -150,15 +150,15 @@ def _outcome(do: Callable[[], object]) -> object:
 
 
 class Gate:
-    """Lets a few pieces of heavy work run at once, some wait, and sends the rest away.
+    """A limit of concurrent heavy work: some of it runs, some waits, and the rest is refused.
 
     Parameters
     ----------
-    running : at once
-    waiting : at most, be it for their bodies or for their turn
-    longest_s : seconds to wait for a turn: an answer that comes later helps no robot
-    beside : of a tenant that run at once beside another; default: half
-    rests : whether tenants rest between turns: see TurnOrder
+    running : maximum number of calls that run
+    waiting : maximum number of requests that wait for their bodies or for a turn
+    longest_s : maximum wait for a turn, seconds; robots cannot use later answers
+    beside : maximum number of calls of one tenant while others wait; default: half
+    rests : whether tenants rest between turns; see TurnOrder
     """
 
     def __init__(
@@ -173,8 +173,8 @@ class Gate:
 
     @asynccontextmanager
     async def place(self) -> AsyncIterator[None]:
-        """Hold a place. Take it before reading the body: a rejected request has then spooled
-        nothing. Raise Busy if all are taken, and RateLimited if the tenant has its share.
+        """Hold a place. Take it before the body is read, so that refused requests spool nothing.
+        Raise Busy if all places are taken, and RateLimited if the tenant has reached its share.
         """
         tenant = current_tenant()
         if self._taken.total >= self._places:
@@ -187,21 +187,20 @@ class Gate:
             self._taken.give(tenant, 1)
 
     async def enter(self, do: Callable[[], T]) -> T:
-        """Take a place, and do the work when it is its turn; see `place` and `run`."""
+        """Take a place and run a function; see `place` and `run`."""
         async with self.place():
             return await self.run(do)
 
     async def run(self, do: Callable[[], T], *, patient: bool = False) -> T:
-        """Do it in a thread, off the event loop, when it is its turn; for who has a place.
+        """Run a function in a thread after waiting for a turn. The caller holds a place.
 
         Parameters
         ----------
-        do : the work
-        patient : wait for as long as it takes: much would have to be sent again
+        patient : whether to wait without a limit, because a large body would have to be sent again
 
         Raises
         ------
-        Busy : its turn did not come in time; nothing was begun.
+        Busy : If no turn becomes free in time; the function was not called.
         """
         tenant = current_tenant()
         await take_turn(self._turns, tenant, None if patient else self._longest_s)
@@ -212,7 +211,7 @@ class Gate:
 
 
 async def take_turn(turns: Turns, tenant: str, longest_s: float | None, weight: int = 1) -> int:
-    """Wait for a turn, but not for too long: see `Turns.acquire`; Busy where none came in time."""
+    """Wait for turns, see `Turns.acquire`. Raise Busy if none becomes free within `longest_s`."""
     try:
         with anyio.fail_after(longest_s):
             return await turns.acquire(tenant, weight)
@@ -224,30 +223,30 @@ async def take_turn(turns: Turns, tenant: str, longest_s: float | None, weight: 
 
 
 def too_many_requests(most: int) -> RateLimited:
-    """That a tenant has as many requests in progress as it may."""
+    """Return the error for a tenant that has reached its number of requests in progress."""
     return RateLimited(
         f"{most} requests of this key's tenant are in progress, which is the limit. Wait for "
-        "their answers."
+        "their responses."
     )
 
 
-#: Requests that a query counts for, and rows of a list that count for one more.
+#: Number of requests that one query counts as, and number of rows that count as one more request.
 QUERY_COST, ROWS_PER_COST = 5.0, 50
-#: Rows of a list that is asked for without a limit.
+#: Number of rows of a list without a limit in the request.
 _USUAL_ROWS = 100
 _QUERIES = re.compile(r"/(queries|queries/records|localize|localize/sequence|similarity)$")
 
 
 @dataclass(frozen=True)
 class RateState:
-    """How a caller stands after a request, as the RateLimit headers of the IETF draft tell it.
+    """Rate limit of a caller after a request, as in the RateLimit headers of the IETF draft.
 
     Parameters
     ----------
-    quota : requests that a rested caller may make at once
-    window_s : seconds after which an empty bucket is full again
-    left : requests that may be made now
-    wait_s : seconds until there is one more
+    quota : number of requests that a full bucket allows at once
+    window_s : time in seconds until an empty bucket is full
+    left : number of requests that are allowed now
+    wait_s : time in seconds until one more request is allowed
     allowed : whether this request was within the limit
     """
 
@@ -259,7 +258,7 @@ class RateState:
     allowed: bool
 
     def headers(self) -> list[tuple[bytes, bytes]]:
-        """Of draft-ietf-httpapi-ratelimit-headers-10."""
+        """Return the headers of draft-ietf-httpapi-ratelimit-headers-10."""
         return [
             (b"ratelimit-policy", f'"{self.name}";q={self.quota};w={self.window_s}'.encode()),
             (b"ratelimit", f'"{self.name}";r={self.left};t={self.wait_s}'.encode()),
@@ -267,15 +266,15 @@ class RateState:
 
 
 class TokenBucket:
-    """A bucket of tokens for each caller; may be used by several threads.
+    """A token bucket for each caller; thread-safe.
 
     Parameters
     ----------
-    name : told to callers
-    per_s : tokens that come back each second; 0 for no limit
-    burst : tokens of a full bucket
-    most : callers that are remembered; beyond, who was not seen for longest is forgotten
-    clock : seconds, never going back
+    name : name of the limit in responses
+    per_s : number of tokens that return per second; 0 for no limit
+    burst : number of tokens in a full bucket
+    most : number of callers in memory; the one that was not seen for the longest time is dropped
+    clock : monotonic clock, seconds
     """
 
     def __init__(
@@ -288,7 +287,7 @@ class TokenBucket:
         self._lock = threading.Lock()
 
     def take(self, caller: str, cost: float = 1.0) -> RateState | None:
-        """Take so many tokens, if they are there; None where nothing is limited."""
+        """Take tokens if there are enough; return None if there is no limit."""
         if self._per_s <= 0:
             return None
         with self._lock:
@@ -315,12 +314,12 @@ class TokenBucket:
 
     @property
     def name(self) -> str:
-        """What callers are told it is called."""
+        """Name of the limit in responses."""
         return self._name
 
     @property
     def what(self) -> str:
-        """What is limited, in words."""
+        """What is limited, as words in a sentence."""
         return self._name.replace("-", " ")
 
     def __len__(self) -> int:
@@ -328,8 +327,8 @@ class TokenBucket:
 
 
 class RateLimits:
-    """Rate limits of one service: requests of each tenant, with bursts of five seconds, and wrong
-    keys of each address.
+    """Rate limits of a service: of requests by tenant, with bursts of five seconds, and of wrong
+    keys by address.
     """
 
     def __init__(self, requests_per_s: float, failed_per_minute: float) -> None:
@@ -337,15 +336,15 @@ class RateLimits:
         self.failed_keys = TokenBucket("wrong-keys", failed_per_minute / 60, failed_per_minute)
 
 
-#: Refusals that a caller gets at once, then a second, and how late the others come.
+#: Refusals without a delay: at once, and per second; and the delay of all others, seconds.
 REFUSALS, REFUSALS_PER_S, REFUSAL_S = 20, 10.0, 1.0
-#: Refusals that are held back at once, of all callers: each holds a connection.
+#: Maximum number of delayed refusals of all callers. Each one holds a connection.
 _MOST_HELD_BACK = 100
 
 
 class RefusalDelays:
-    """Holds refusals back from callers who go on asking without a pause: each costs the same to
-    answer, and hundreds a second would cost others their time.
+    """Delays of refusals for callers that repeat their requests without a pause. Hundreds of
+    refusals per second would take the time of other callers.
     """
 
     def __init__(self) -> None:
@@ -353,7 +352,7 @@ class RefusalDelays:
         self._held_back = 0
 
     async def wait(self, whose: str) -> None:
-        """Wait before a refusal is sent to a tenant, or an address."""
+        """Wait before a refusal is sent to a tenant or an address."""
         state = self._bucket.take(whose)
         if state is None or state.allowed or self._held_back >= _MOST_HELD_BACK:
             return
@@ -365,16 +364,16 @@ class RefusalDelays:
 
 
 def page_rows(request: Request) -> int:
-    """Rows that a request asks for; 0 where its answer is no page."""
+    """Return the number of rows that a request asks for; 0 if the response is not a page."""
     model = getattr(request.scope.get("route"), "response_model", None)
     if not (isinstance(model, type) and issubclass(model, Page)):
         return 0
-    given = request.query_params.get("limit", "")
-    return int(given) if re.fullmatch(r"[0-9]{1,4}", given, re.ASCII) else _USUAL_ROWS
+    limit = request.query_params.get("limit", "")
+    return int(limit) if re.fullmatch(r"[0-9]{1,4}", limit, re.ASCII) else _USUAL_ROWS
 
 
 def request_cost(request: Request) -> float:
-    """What a request counts for: 1, a query more, and a list by the rows that it asks for."""
+    """Return the cost of a request: 1, more for a query, and more for a list with many rows."""
     if request.method == "POST" and _QUERIES.search(request.url.path):
         return QUERY_COST
     return 1 + page_rows(request) / ROWS_PER_COST
@@ -383,23 +382,22 @@ def request_cost(request: Request) -> float:
 def enforce_rate_limit(
     request: Request, bucket: TokenBucket, whose: str, cost: float = 1.0
 ) -> None:
-    """Count a request, before its body is read; RateLimited where there are too many."""
+    """Count a request before its body is read; raise RateLimited if there are too many."""
     state = bucket.take(whose, cost)
     request.state.rate = state
     if state is not None and not state.allowed:
         raise RateLimited(
-            f"Too many {bucket.what}: {state.quota} at once and then "
-            f"{state.quota / state.window_s:g} a second are allowed. Retry in "
-            f"{state.wait_s} s."
+            f"Too many {bucket.what}: the limit is {state.quota} at once, and then "
+            f"{state.quota / state.window_s:g} per second. Retry in {state.wait_s} s."
         )
 
 
 def network_of(address: str) -> str:
-    """Whose an address is: of IPv6, whoever has one has the 2^64 of its network."""
+    """Return the IPv4 address, or the /64 network of an IPv6 address, which has one owner."""
     try:
         found = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:
-        return "unknown"  # a socket without one: all of them together
+        return "unknown"  # all connections without an IP address together
     if isinstance(found, ipaddress.IPv6Address):
         if found.ipv4_mapped is not None:
             return str(found.ipv4_mapped)
@@ -407,49 +405,49 @@ def network_of(address: str) -> str:
     return str(found)
 
 
-#: Longest silence within a body, seconds.
+#: Maximum pause within a body, seconds.
 IDLE_S = 10.0
-#: Seconds that each MiB adds to the time for a body: 2 Mbit/s, a poor radio link.
+#: Seconds that each MiB adds to the time limit of a body: 2 Mbit/s, as on a poor radio link.
 S_PER_MIB = 4.0
 
 
 _IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
-#: Bytes of a body that are kept in memory until they are read; the rest waits on disk. Also
-#: those by which tenants are charged for that.
+#: Number of bytes of a body that stay in memory until they are read; the rest is spooled to disk.
+#: Tenants are charged for disk space in steps of this size.
 IN_MEMORY = 1 << 20
 
 
 class Broken(Exception):
-    """Stops the reading of a body; nobody but `RequestMiddleware` sees it."""
+    """Signal that stops the reading of a body; `RequestMiddleware` catches it."""
 
 
 class BodySpool:
-    """The temporary folder, where bodies wait to be read, and what each tenant holds of it."""
+    """Disk space of the temporary folder that the spooled bodies of each tenant take."""
 
     def __init__(self) -> None:
         self._held = Holdings()
 
     def require_room(self, tenant: str, size: int) -> None:
-        """See that a tenant may have a body of so many bytes here; RateLimited."""
+        """Raise RateLimited if a tenant may not spool a body of this size."""
         if size > IN_MEMORY and not self._held.allows(tenant, size - IN_MEMORY, self._room()):
             raise self._full(self._room())
 
     def take(self, tenant: str, size: int) -> None:
-        """Charge a tenant for bytes that are about to be written; RateLimited beyond its share."""
+        """Charge a tenant for bytes before they are written; raise RateLimited beyond its share."""
         room = self._room()
         if not self._held.take(tenant, size, room):
             raise self._full(room)
 
     def give(self, tenant: str, size: int) -> None:
-        """Take them off its account: they are removed."""
+        """Refund a tenant for bytes that were deleted."""
         self._held.give(tenant, size)
 
     def by_tenant(self) -> dict[str, int]:
-        """Bytes on disk of each tenant that has any."""
+        """Return the number of bytes on disk of each tenant, without zeros."""
         return self._held.by_tenant()
 
     def _room(self) -> int:
-        """Bytes that all bodies together may have."""
+        """Return the number of bytes that all bodies together may take."""
         found = os.statvfs(tempfile.gettempdir())
         return found.f_bavail * found.f_frsize + self._held.total
 
@@ -457,50 +455,50 @@ class BodySpool:
     def _full(room: int) -> RateLimited:
         return RateLimited(
             f"Bodies of this key's tenant would take more than {share(room) >> 20} MiB of the "
-            "service's temporary folder, which is its share. Wait for their answers, or send "
+            "service's temporary folder, which is its share. Wait for the responses, or send "
             "smaller bodies."
         )
 
 
 class RequestBody:
-    """The body of one request.
+    """The body of one request, read within limits of size and time.
 
-    The time for it grows with what has come, not with what was announced. Only time in which we
-    wait for the caller counts.
+    The time limit grows with the received bytes, not with the announced length. Only time spent
+    waiting for the client counts.
 
     Parameters
     ----------
-    receive : gives the next part
-    most : bytes
-    body_s : seconds for a body of hardly any bytes
+    receive : function that returns the next part
+    most : maximum size, bytes
+    body_s : time limit for an empty body, seconds
     """
 
     def __init__(self, receive: Receive, most: int, body_s: float) -> None:
         self._receive, self._most, self._body_s = receive, most, body_s
         self._waited_s, self._bytes, self._whole = 0.0, 0, False
-        #: Why no more of it is read.
+        #: Why the body is not read further.
         self.fault: SceneprintError | None = None
         self._spool: BodySpool | None = None
         self._tenant, self._charged = "", 0
 
     def charge(self, spool: BodySpool, tenant: str) -> None:
-        """Charge a tenant for what is written of it to disk, before it is."""
+        """Charge a tenant for the part of the body on disk, before it is written."""
         self._spool, self._tenant = spool, tenant
 
     def close(self) -> None:
-        """Give back what it took: it was read, or is read no more."""
+        """Refund the tenant, after the body was read or abandoned."""
         if self._spool is not None and self._charged:
             self._spool.give(self._tenant, self._charged)
             self._charged = 0
 
     @property
     def received(self) -> int:
-        """Bytes that have come."""
+        """Number of received bytes."""
         return self._bytes
 
     async def next(self) -> Message:
-        """Return the next part, and after the last one every further message; raise Broken, with
-        the reason in `fault`.
+        """Return the next part, and after the last part any further message. Raise Broken with the
+        reason in `fault`.
         """
         if self._whole:
             return await self._receive()
@@ -539,18 +537,18 @@ class RequestBody:
         )
         return SlowBody(
             f"The body arrived too slowly: {why}, after {self._bytes} bytes. The limit is "
-            f"{self._body_s:g} s plus {S_PER_MIB:g} s for each MiB. Send less at once, or use a "
+            f"{self._body_s:g} s plus {S_PER_MIB:g} s for each MiB. Send smaller bodies, or use a "
             "faster link."
         )
 
 
 def is_import(scope: Scope) -> bool:
-    """Whether the body of a request is an archive, which is written where it stays."""
+    """Return whether the body of a request is an archive, which is not spooled."""
     return scope["method"] == "POST" and _IMPORTS.fullmatch(scope["path"]) is not None
 
 
 def too_large(most: int) -> TooLarge:
-    """A body of more bytes than are taken."""
+    """Return the error for a body above the size limit."""
     return TooLarge(
         f"The body exceeds the limit of {most} bytes. Send the image at a lower resolution, or "
         "fewer frames at a time."

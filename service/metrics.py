@@ -1,7 +1,7 @@
-"""Figures for Prometheus.
+"""Metrics for Prometheus.
 
-What one process counts (requests, answers, streams) adds up over processes; what is read from the
-store (frames, jobs, indexes, disk) is the same in each of them.
+Counters of a process (requests, answers, streams) add up over processes. Gauges of the store
+(frames, jobs, indexes, disk) are the same in all processes.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from sceneprint.store import Database
 from sceneprint.store.store_counts import add_sample
 from sceneprint_client.api import Answer, FrameState, JobState
 
-# What this process counted in the last seconds, written to the database now and then.
+# Counts of this process in the last seconds, written to the database regularly.
 #
-# requests, answers  -->  Sampler  --flush-->  table `samples`  -->  GET /v1/stats of any process
+#     requests, answers  -->  Sampler  --flush-->  table `samples`  -->  GET /v1/stats
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ EVERY_S = 10.0
 
 
 class Sampler:
-    """Counts requests and answers; safe to share between threads."""
+    """Counter of requests and answers; thread-safe."""
 
     def __init__(self) -> None:
         self._process = f"{socket.gethostname()}:{os.getpid()}"
@@ -54,16 +54,16 @@ class Sampler:
             self._statuses[str(status)] += 1
 
     def answer(self, answer: Answer) -> None:
-        """Count a query that was answered."""
+        """Count the answer to a query."""
         with self._lock:
             self._queries[answer.status] += 1
             if "total" in answer.milliseconds:
                 self._latencies.add(answer.milliseconds["total"] / 1e3)
 
     def flush(self, database: Database) -> bool:
-        """Write down what was counted since the last time; whether anything was written.
+        """Store the counts since the last call; return whether anything was stored.
 
-        A store that is read-only, or has no turn for us, loses the sample and nothing else.
+        If the store is read-only or busy, the counts are lost.
         """
         with self._lock:
             data: dict[str, Any] = {
@@ -85,31 +85,31 @@ class Sampler:
 
 EVENTS = "/v1/events"
 _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
-#: Maps whose indexes have series of their own: those with the longest tails.
+#: Number of maps whose indexes have their own series: those with the longest tails.
 MOST_MAPS = 20
-#: Tenants with series of their own: the first that a process meets. All others are one, under a
-#: name that no tenant can have.
+#: Number of tenants with their own series, in the order in which the process meets them. All other
+#: tenants share one series, whose name no tenant can have.
 MOST_TENANTS, OTHERS = 50, "(others)"
 
 
 class TenantMetrics:
-    """What the tenants of keys ask of one service process, and have waiting in the store."""
+    """Metrics of the tenants of keys: their requests in one process, and their waiting jobs."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self._requests = Counter(
-            "sceneprint_tenant_requests", "Requests answered, of the tenants of keys.",
+            "sceneprint_tenant_requests", "Number of answered requests of each tenant.",
             ("tenant", "status"), registry=registry,
         )  # fmt: skip
         self._seconds = Counter(
-            "sceneprint_tenant_request_seconds", "Time that their requests took, but for streams.",
+            "sceneprint_tenant_request_seconds", "Time of the tenant's requests without streams.",
             ("tenant",), registry=registry,
         )  # fmt: skip
         self._now = {
             name: Gauge(f"sceneprint_tenant_{name}", text, ("tenant",), registry=registry)
             for name, text in (
-                ("requests_in_progress", "Requests that are being answered."),
-                ("spool_bytes", "Bodies of requests on disk."),
-                ("waiting_jobs", "Jobs that wait for a worker."),
+                ("requests_in_progress", "Number of requests in progress."),
+                ("spool_bytes", "Size of request bodies on disk."),
+                ("waiting_jobs", "Number of jobs that wait for a worker."),
             )
         }
         self._named: set[str] = set()
@@ -120,10 +120,10 @@ class TenantMetrics:
         self._requests.labels(name, str(status)).inc()
         self._seconds.labels(name).inc(seconds)
 
-    def tell(self, *now: Mapping[str, int]) -> None:
-        """Requests in progress, bytes on disk and jobs that wait, by tenant; NOBODY is left out."""
-        for gauge, by_tenant in zip(self._now.values(), now, strict=True):
-            gauge.clear()  # what a tenant no longer has
+    def update(self, *values: Mapping[str, int]) -> None:
+        """Set requests in progress, bytes on disk and waiting jobs by tenant, without NOBODY."""
+        for gauge, by_tenant in zip(self._now.values(), values, strict=True):
+            gauge.clear()  # drop tenants that have none left
             for tenant, number in by_tenant.items():
                 if tenant != NOBODY:
                     gauge.labels(self._name(tenant)).inc(number)
@@ -135,13 +135,13 @@ class TenantMetrics:
 
 
 class Metrics:
-    """What one service process counts."""
+    """Metrics of one service process."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.sampler = Sampler()
         self._requests = Counter(
-            "sceneprint_requests", "Requests answered.", ("method", "route", "status"),
+            "sceneprint_requests", "Number of answered requests.", ("method", "route", "status"),
             registry=self.registry,
         )  # fmt: skip
         self._seconds = Histogram(
@@ -149,11 +149,11 @@ class Metrics:
             buckets=_SECONDS, registry=self.registry,
         )  # fmt: skip
         self._received = Counter(
-            "sceneprint_received_bytes", "Bytes of bodies that were read.", ("route",),
+            "sceneprint_received_bytes", "Size of the received bodies.", ("route",),
             registry=self.registry,
         )  # fmt: skip
         self._answers = Counter(
-            "sceneprint_answers", "Queries by the status of their answer.", ("status",),
+            "sceneprint_answers", "Number of queries by status of the answer.", ("status",),
             registry=self.registry,
         )  # fmt: skip
         self._stages = Histogram(
@@ -161,15 +161,15 @@ class Metrics:
             buckets=_SECONDS, registry=self.registry,
         )  # fmt: skip
         self._lost = Counter(
-            "sceneprint_queries_lost", "Queries that could not be logged.",
+            "sceneprint_queries_lost", "Number of queries that could not be logged.",
             registry=self.registry,
         )  # fmt: skip
-        self._told_lost = 0
+        self._reported_lost = 0
         self._by_tenant = TenantMetrics(self.registry)
-        self._streams = self._gauge("event_streams", "Streams of events that are open.")
-        self._frames = self._gauge("frames", "Frames in each state.", "state")
-        self._jobs = self._gauge("jobs", "Jobs in each state.", "state")
-        self._maps = self._gauge("maps", "Maps.")
+        self._streams = self._gauge("event_streams", "Number of open event streams.")
+        self._frames = self._gauge("frames", "Number of frames in each state.", "state")
+        self._jobs = self._gauge("jobs", "Number of jobs in each state.", "state")
+        self._maps = self._gauge("maps", "Number of maps.")
         self._oldest = self._gauge(
             "oldest_waiting_seconds", "Age of the oldest waiting job of each kind.", "kind"
         )
@@ -182,16 +182,16 @@ class Metrics:
         self._tail = self._gauge(
             "index_tail_frames", "Indexed frames that the newest index lacks; of these maps.", "map"
         )
-        self._workers = self._gauge("workers", "Workers seen, by what they do.", "state")
+        self._workers = self._gauge("workers", "Number of busy and idle workers.", "state")
         self._began = self._gauge(
-            "workers_began", "Workers that began in the last hour: more than there are, or once "
-            "more than asked for, is that many replaced."
+            "workers_began", "Number of workers that started in the last hour. A number above that "
+            "of the configured workers means restarts."
         )  # fmt: skip
-        self._events = self._gauge("newest_event", "Number of the newest event: grows for ever.")
-        self._disk = self._gauge("disk_bytes", "Disk space taken by each part.", "part")
-        self._scrubbed = self._gauge("scrub_bytes", "Stored bytes that this scrub has read.")
-        self._damaged = self._gauge("scrub_damaged", "What this scrub found lost or damaged.")
-        self._free = self._gauge("disk_free_bytes", "Left on the disk of the data folder.")
+        self._events = self._gauge("newest_event", "Number of the newest event; it only grows.")
+        self._disk = self._gauge("disk_bytes", "Disk space of each part of the store.", "part")
+        self._scrubbed = self._gauge("scrub_bytes", "Size of the data that this scrub has read.")
+        self._damaged = self._gauge("scrub_damaged", "Lost and damaged objects in this scrub.")
+        self._free = self._gauge("disk_free_bytes", "Free space on the disk of the data folder.")
         self._gauge("build_info", "Version of the service.", "version", "python").labels(
             __version__, platform.python_version()
         ).set(1)
@@ -203,19 +203,19 @@ class Metrics:
         self, method: str, route: str, status: int, seconds: float, received: int = 0,
         tenant: str = NOBODY,
     ) -> None:  # fmt: skip
-        """Count a request; `route` is a pattern, so that series stay few."""
+        """Count a request. `route` is a pattern, which limits the number of series."""
         self._requests.labels(method, route, str(status)).inc()
         if tenant != NOBODY:
             self._by_tenant.request(tenant, status, 0.0 if route == EVENTS else seconds)
         if received:
             self._received.labels(route).inc(received)
-        if route != EVENTS:  # a stream takes as long as somebody listens
+        if route != EVENTS:  # a stream lasts as long as its client
             self._seconds.labels(route).observe(seconds)
         if route.startswith("/v1/"):
             self.sampler.request(status)
 
     def answer(self, answer: Answer) -> None:
-        """Count a query."""
+        """Count the answer to a query."""
         self._answers.labels(answer.status).inc()
         self.sampler.answer(answer)
         for stage, milliseconds in answer.milliseconds.items():
@@ -225,18 +225,18 @@ class Metrics:
         self, figures: Figures, streams: int, lost: int, held: Mapping[str, int],
         spool: Mapping[str, int],
     ) -> bytes:  # fmt: skip
-        """All figures in Prometheus' text format.
+        """Return all metrics in the text format of Prometheus.
 
         Parameters
         ----------
-        figures : of the store
-        streams : of events that are open
-        lost : queries since this process began
+        figures : statistics of the store
+        streams : number of open event streams
+        lost : number of queries lost since the start of the process
         held, spool : requests in progress, and bytes of bodies on disk, by tenant
         """
-        self._by_tenant.tell(held, spool, figures.waiting)
-        self._lost.inc(lost - self._told_lost)
-        self._told_lost = lost
+        self._by_tenant.update(held, spool, figures.waiting)
+        self._lost.inc(lost - self._reported_lost)
+        self._reported_lost = lost
         stats, workers = figures.stats, figures.stats.workers or []
         for state in FrameState:
             self._frames.labels(state).set(stats.frames.get(state, 0))
@@ -251,7 +251,7 @@ class Metrics:
             self._oldest.labels(waiting).set(age)
         self._oldest_frame.set(stats.oldest_waiting_s.get("sign", 0.0))
         for gauge in (self._version, self._tail):
-            gauge.clear()  # maps come and go
+            gauge.clear()  # drop deleted maps
         for index in stats.indexes[:MOST_MAPS]:
             self._version.labels(index.map).set(index.version or 0)
             self._tail.labels(index.map).set(index.tail)
@@ -263,5 +263,5 @@ class Metrics:
         self._disk.labels("database").set(stats.bytes.database or 0)
         self._disk.labels("blobs").set(stats.bytes.blobs)
         self._disk.labels("index").set(stats.bytes.index)
-        self._free.set(stats.bytes.free or 0)  # of the whole it is known
+        self._free.set(stats.bytes.free or 0)
         return generate_latest(self.registry)

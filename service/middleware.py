@@ -1,4 +1,4 @@
-"""Around every request: its id, whom it is for, its body, what its answer always says, its time."""
+"""Middleware of all requests: ids, checks of headers, body limits, response headers and logs."""
 
 from __future__ import annotations
 
@@ -40,27 +40,28 @@ from service.problems import problem, status_of
 log = logging.getLogger(__name__)
 
 _ID = re.compile(rb"[\w.-]{1,64}")
-#: What is counted by its name: a caller may invent others without end.
+#: Methods with their own metrics; a client may invent any number of others.
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
-#: As noted where the caller hung up before there was an answer.
+#: Status code in the log if the client disconnected before the response.
 _HUNG_UP = 499
-#: Refusals that come late to who does not stop.
+#: Status codes of responses that are delayed for clients that repeat their requests.
 _HELD_BACK = (401, 403, 429)
-#: Paths that machines request every few seconds, or anybody without a key: logged at DEBUG alone.
+#: Paths that are requested every few seconds or without a key. They are logged at level DEBUG.
 _PROBES = ("/healthz", "/readyz", "/metrics", "/openapi.json")
-#: Requests that are answered at once, those that wait or stream among them.
+#: Maximum number of concurrent requests, including those that wait or stream.
 _MOST_AT_ONCE = 900
 
 
 class RequestMiddleware:
-    """Gives each request an id, sends strangers away, stops bodies, guards answers, and notes it.
+    """Middleware that gives each request an id, refuses foreign requests, limits bodies, adds
+    headers to responses, and logs the request.
 
     Parameters
     ----------
-    app : the application
+    app : application
     settings : see Settings
-    origins : whose pages may ask
-    metrics : to count in
+    origins : origins whose pages may send requests
+    metrics : metrics of the process
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class RequestMiddleware:
         self._at_once = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Handle one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -82,10 +83,10 @@ class RequestMiddleware:
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers: dict[bytes, bytes] = dict(scope["headers"])
-        given = headers.get(b"x-request-id", b"")
-        request_id = given.decode() if _ID.fullmatch(given) else uuid.uuid4().hex
+        sent_id = headers.get(b"x-request-id", b"")
+        request_id = sent_id.decode() if _ID.fullmatch(sent_id) else uuid.uuid4().hex
         name_request(request_id)
-        set_tenant(NOBODY)  # until its key is known: see `auth.caller`
+        set_tenant(NOBODY)  # until the key is checked; see `auth.caller`
         set_actor(None)
         own: Headers = [(b"x-request-id", request_id.encode())]
         own += self._origins.headers(headers.get(b"origin"))
@@ -97,17 +98,17 @@ class RequestMiddleware:
         state.update(body=body, at_answer=at_answer, at_end=at_end)
         status, start = 0, time.perf_counter()
 
-        async def answered(message: Message) -> None:
+        async def send_message(message: Message) -> None:
             nonlocal status
             if body.fault is not None and status == 0:
-                return  # whatever the application makes of the broken body; ours follows
+                return  # the application's response to the broken body; ours follows
             if message["type"] == "http.response.start":
                 status = message["status"]
-                standing: RateState | None = state.get("rate")
-                said = [*message["headers"], *own]
-                said += [] if standing is None else standing.headers()
-                message["headers"] = said + security_headers(said)
-                _call(at_answer)  # the note has a turn of its own
+                rate: RateState | None = state.get("rate")
+                complete = [*message["headers"], *own]
+                complete += [] if rate is None else rate.headers()
+                message["headers"] = complete + security_headers(complete)
+                _call(at_answer)  # the audit line below takes a turn of its own
                 if status in _HELD_BACK and not self._alone:
                     whose = state.get("tenant") or network_of(address_of(Request(scope)))
                     await self._delays.wait(whose)
@@ -119,16 +120,16 @@ class RequestMiddleware:
         try:
             early = self._early(scope, headers)
             if isinstance(early, SceneprintError):
-                await _refusal(request_id, early)(scope, receive, answered)
+                await _refusal(request_id, early)(scope, receive, send_message)
             elif early is not None:
-                await early(scope, receive, answered)
+                await early(scope, receive, send_message)
             else:
-                await self._app(scope, body.next, answered)
+                await self._app(scope, body.next, send_message)
         except Broken:
             pass
         except ClientDisconnect:
-            status = _HUNG_UP  # nobody is left to be answered
-        except Exception:  # answered further out, with 500
+            status = _HUNG_UP
+        except Exception:  # the outer handler responds with 500
             self._note(scope, request_id, 500, time.perf_counter() - start, body.received)
             raise
         finally:
@@ -136,19 +137,19 @@ class RequestMiddleware:
             _call(at_answer + at_end)
         if body.fault is not None and status == 0:
             fault, body.fault = body.fault, None
-            await _refusal(request_id, fault)(scope, receive, answered)
+            await _refusal(request_id, fault)(scope, receive, send_message)
         self._note(scope, request_id, status, time.perf_counter() - start, body.received)
 
     def _early(
         self, scope: Scope, headers: dict[bytes, bytes]
     ) -> SceneprintError | Response | None:
-        """The answer to what needs no application; no body is read for it."""
+        """Return an early response or a refusal that needs no body; None to continue."""
         origin, length = headers.get(b"origin"), headers.get(b"content-length", b"")
         known = origin is not None and self._origins.allows(origin)
         if self._alone:
-            unwelcome = stranger(scope["headers"], self._origins.allows, scope["path"])
-            if unwelcome is not None:
-                return unwelcome
+            refusal = stranger(scope["headers"], self._origins.allows, scope["path"])
+            if refusal is not None:
+                return refusal
         if known and is_preflight(scope["method"], headers):
             return Response(status_code=204, headers=preflight_headers())
         if self._at_once > _MOST_AT_ONCE:
@@ -157,15 +158,15 @@ class RequestMiddleware:
             )
         if sum(name == b"authorization" for name, _ in scope["headers"]) > 1:
             return AmbiguousKey(
-                "The request has more than one Authorization header, so it is not clear whose it "
-                "is. Send one."
+                "The request has more than one Authorization header, so its key is ambiguous. "
+                "Send one."
             )
         encoding = headers.get(b"content-encoding", b"identity").strip().lower()
-        # an archive is compressed itself, and some say so here
+        # Archives are compressed files, and some clients say so in this header.
         if encoding not in (b"identity", b"") and not is_import(scope):
             return UnsupportedType(
-                f"The body has Content-Encoding {encoding.decode('latin-1')!r:.40}, and bodies are "
-                "read as they are. Send it uncompressed, without this header."
+                f"The body has Content-Encoding {encoding.decode('latin-1')!r:.40}, which is not "
+                "supported. Send the body uncompressed, without this header."
             )
         most = self._limit(scope)
         if length.isdigit() and (len(length) > 18 or int(length) > most):
@@ -173,7 +174,7 @@ class RequestMiddleware:
         return None
 
     def _limit(self, scope: Scope) -> int:
-        """Most bytes of the body: whole archives go to disk as they come."""
+        """Return the maximum size of the body, bytes. Imports have their own limit."""
         return self._most_of_import if is_import(scope) else self._most
 
     def _note(
@@ -181,7 +182,7 @@ class RequestMiddleware:
     ) -> None:
         route = getattr(scope.get("route"), "path", "other")
         if scope["path"].startswith("/v1/") and not route.startswith(("/v1", "other")):
-            route = f"/v1{route}"  # a router's own pattern lacks the prefix it is mounted under
+            route = f"/v1{route}"  # the router's pattern lacks the prefix of its mount point
         method = scope["method"] if scope["method"] in _METHODS else "other"
         tenant = scope["state"].get("tenant", NOBODY)
         self._metrics.request(method, route, status, seconds, received, tenant)
@@ -202,7 +203,7 @@ class RequestMiddleware:
 
     @staticmethod
     def _note_refusal(scope: Scope, request_id: str, status: int) -> None:
-        """Somebody tried what is not theirs to do: an operator may want to know who."""
+        """Log a refusal with its caller and address, for the operator."""
         client = scope.get("client")
         log.warning(
             "refused",
@@ -217,14 +218,14 @@ class RequestMiddleware:
         )
 
 
-def _call(whats: list[Callable[[], None]]) -> None:
-    """Call each, once."""
-    while whats:
-        whats.pop()()
+def _call(callbacks: list[Callable[[], None]]) -> None:
+    """Call each callback once."""
+    while callbacks:
+        callbacks.pop()()
 
 
 def _refusal(request_id: str, error: SceneprintError) -> Response:
-    """A refusal, after which what is still coming is not read."""
-    told = problem(request_id, type(error).__name__, status_of(error), str(error))
-    told.headers["Connection"] = "close"
-    return told
+    """Return an error response that closes the connection, because the body is not read."""
+    response = problem(request_id, type(error).__name__, status_of(error), str(error))
+    response.headers["Connection"] = "close"
+    return response

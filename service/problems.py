@@ -1,4 +1,4 @@
-"""Errors as problem documents (RFC 9457)."""
+"""Problem documents (RFC 9457) for all errors, and their status codes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from service.browser_security import security_headers
 
 log = logging.getLogger(__name__)
 
-#: The status of each error; of an error that is not here, that of its nearest base.
+#: Status code of each error class; other classes have that of their nearest base class.
 STATUSES: dict[type[errors.SceneprintError], int] = {
     errors.FrameError: 422,
     errors.NotFound: 404,
@@ -43,45 +43,46 @@ STATUSES: dict[type[errors.SceneprintError], int] = {
     errors.UnusableStore: 503,
     errors.SceneprintError: 500,
 }
-#: Seconds after which to come back: at once where others are in the way, later where a person is
-#: needed first.
+#: Seconds for the header Retry-After. They are short if load is the cause, and longer if a person
+#: must act first.
 RETRY_AFTER_S = {429: "1", 503: "1", 507: "30"}
 LATER_S: dict[type[errors.SceneprintError], str] = {
     errors.ReadOnlyStore: "60", errors.NewerSchema: "60",
 }  # fmt: skip
-#: What is told of a store that cannot be used: its errors name folders, which are the operator's.
-_LOG = "See its log under the request's id."
+#: Messages for clients if the store cannot be used. The messages of the errors name folders, which
+#: only the operator should see.
+_LOG = "Its log has the details under the id of the request."
 UNUSABLE: dict[type[errors.SceneprintError], str] = {
     errors.StoreFull: "The service's disk is full, so nothing was stored. Queries still work. "
     f"{_LOG} Free some space there, and send the request again.",
     errors.ReadOnlyStore: "The service's store is read-only, so nothing was stored. Queries "
     f"still work. {_LOG} Make the data folder writable there, and restart the service.",
     errors.NewerSchema: "A later version of sceneprint has migrated the service's store, so this "
-    f"process stored nothing. {_LOG} Stop it, and start the later version.",
+    f"process stored nothing. {_LOG} Stop the process, and start the later version.",
     errors.StoreLocked: "Another process has locked the service's store for too long, so "
     f"nothing was stored. Queries still work. {_LOG} Retry later.",
-    errors.StoreAway: "The service's database or object store does not answer. The request may "
+    errors.StoreAway: "The service's database or object store does not respond. The request may "
     f"or may not have been stored; it is safe to send it again. {_LOG} Retry later.",
     errors.UnusableStore: "The service cannot use its store at the moment, so nothing was "
-    "stored. See its log under the request's id. Retry later.",
+    f"stored. {_LOG} Retry later.",
 }
 MEDIA_TYPE = "application/problem+json"
 
 
 def status_of(error: errors.SceneprintError) -> int:
-    """The HTTP status of an error."""
+    """Return the HTTP status code of an error."""
     return next(STATUSES[kind] for kind in type(error).__mro__ if kind in STATUSES)
 
 
 def type_of(name: str) -> str:
-    """The type of a problem: the error's name in kebab-case."""
+    """Return the type of a problem: the name of the error in kebab case."""
     return f"/problems/{errors.kebab_case(name)}"
 
 
 def problem(
     request_id: str, name: str, status: int, detail: str, fields: Sequence[tuple[str, str]] = ()
 ) -> JSONResponse:
-    """A problem document as a response."""
+    """Return a problem document as a response."""
     document: dict[str, Any] = {
         "type": type_of(name),
         "title": errors.kebab_case(name).replace("-", " ").capitalize(),
@@ -97,17 +98,17 @@ def problem(
     return JSONResponse(document, status, headers, MEDIA_TYPE)
 
 
-#: Names of RFC 9110 that the standard library has from Python 3.13 on.
+#: Names of RFC 9110 that the standard library has since Python 3.13.
 _PHRASES = {413: "Content Too Large", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
 
 
 def phrase(status: int) -> str:
-    """The name of a status, the same with every version of Python."""
+    """Return the name of a status code, the same in all versions of Python."""
     return _PHRASES.get(status, HTTPStatus(status).phrase)
 
 
 def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Responses of these statuses for the OpenAPI document."""
+    """Return responses with these status codes for the OpenAPI document."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": phrase(status), "content": content}
@@ -116,7 +117,7 @@ def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def install(app: FastAPI) -> None:
-    """Let every error of an application leave it as a problem document."""
+    """Install exception handlers that turn every error into a problem document."""
 
     @app.exception_handler(errors.SceneprintError)
     async def _ours(request: Request, error: errors.SceneprintError) -> JSONResponse:
@@ -146,33 +147,33 @@ def install(app: FastAPI) -> None:
         detail = f"{request.method} {request.url.path}: {error.detail}. See /docs."
         answer = problem(_id(request), name, error.status_code, detail)
         answer.headers.update(error.headers or {})
-        if error.status_code == 405:  # Starlette names those of the first route alone
+        if error.status_code == 405:  # Starlette lists only the methods of the first route
             answer.headers["Allow"] = ", ".join(_allowed(app, request.url.path))
         return answer
 
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:
-        log.error("request broke down", exc_info=error, extra={"request_id": _id(request)})
+        log.error("unexpected error", exc_info=error, extra={"request_id": _id(request)})
         detail = (
             "The service failed to handle this request; nothing was partially written. Its log "
             "has the traceback under the request's id. Please report it."
         )
         answer = problem(_id(request), "InternalError", 500, detail)
-        # `RequestMiddleware` does not see this one
+        # `RequestMiddleware` does not see this response.
         for name, value in getattr(request.state, "headers", ()):
             answer.headers[name.decode()] = value.decode()
         for name, value in security_headers(answer.raw_headers):
             answer.headers[name.decode()] = value.decode()
-        answer.headers["Connection"] = "close"  # as uvicorn does, unsaid, after an exception
+        answer.headers["Connection"] = "close"  # uvicorn closes it after an exception
         return answer
 
 
 def _allowed(app: FastAPI, path: str) -> list[str]:
-    """Methods of a path: of `/v1/keys/me` its own, not those of `/v1/keys/{key_name}`."""
+    """Return the methods of a path. `/v1/keys/me` does not have those of `/v1/keys/{key_name}`."""
     paths = app.openapi()["paths"]
     found = [one for one in paths if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", one), path)]
     if not found:
-        return ["GET"]  # what is not in the document is read only
+        return ["GET"]  # paths outside the document are read-only
     return sorted(method.upper() for method in paths[min(found, key=lambda one: one.count("{"))])
 
 

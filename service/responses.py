@@ -1,4 +1,4 @@
-"""What is made of frames and answers, as answers to requests: who has it is told so with 304."""
+"""Responses with files and derived data, with ETags, content negotiation and byte ranges."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ from sceneprint.store.queue import JobFile
 from service.problems import declared, problem
 from service.running_service import Service
 
-# What a request asks of a representation: its type, and whether it is still the one it knows.
-#
-# Headers Accept, If-Match, If-None-Match (RFC 9110, sections 12.5.1, 13.1).
+# The headers Accept, If-Match and If-None-Match (RFC 9110, sections 12.5.1 and 13.1).
 
 _TAG = re.compile(r'(W/)?"([\x21\x23-\x7e\x80-\xff]*)"')
 _TYPE = re.compile(r"\s*([\w.+*-]+/[\w.+*-]+)\s*((?:;[^,]*)?)", re.ASCII)
@@ -44,13 +42,13 @@ def expected(request: Request) -> Collection[str] | None:
 
 
 def is_known(request: Request, tag: str) -> bool:
-    """Whether If-None-Match says that the caller has what this tag stands for."""
+    """Return whether If-None-Match names this entity tag, so that the client has the content."""
     header = ", ".join(request.headers.getlist("if-none-match")).strip()
     return header == "*" or any(one == tag for _, one in _TAG.findall(header))
 
 
 def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
-    """The media type that Accept likes best; the first where it likes none, or has no say."""
+    """Return the media type that Accept prefers; the first one if Accept prefers none of them."""
     ranges = []
     for kind, parameters in _TYPE.findall(", ".join(request.headers.getlist("accept"))[:1000]):
         quality = _QUALITY.search(parameters)
@@ -61,7 +59,7 @@ def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
 
 
 def _rated(offer: str, one: tuple[str, float]) -> tuple[int, float]:
-    """How closely a range of Accept speaks of a type, and how much it likes it."""
+    """Return how specific a range of Accept is for a media type, and its quality."""
     kind, quality = one
     if kind == offer:
         return 3, quality
@@ -79,7 +77,7 @@ def file_responses(
     """Responses of a route that sends files, for the OpenAPI document."""
     headers = {
         "ETag": {
-            "description": "Stands for these bytes: sent in If-None-Match, it saves them.",
+            "description": "Entity tag of the bytes. Send it in If-None-Match to avoid a download.",
             "schema": {"type": "string"},
         }
     }
@@ -88,12 +86,12 @@ def file_responses(
     done: dict[str, Any] = {"description": description, "headers": headers, "content": content}
     if model is not None:
         done["model"] = model
-    known = {"description": "As the caller has it: its If-None-Match names this ETag."}
-    return {200: done, 304: known, **declared(*statuses)}
+    unchanged = {"description": "Not modified: If-None-Match names this ETag."}
+    return {200: done, 304: unchanged, **declared(*statuses)}
 
 
 def tagged(output: Output[Any]) -> dict[str, str]:
-    """Its headers."""
+    """Return the headers of an output with its entity tag."""
     return {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
 
 
@@ -101,7 +99,7 @@ async def sent(
     request: Request, here: Service, output: Output[bytes], kind: str,
     name: str | None = None, **headers: str,
 ) -> Response:  # fmt: skip
-    """An output; made only where the caller does not have it yet, and when it is its turn."""
+    """Send an output. It is built only if the client does not have it, after a wait at the gate."""
     headers |= tagged(output)
     if is_known(request, output.tag):
         return Response(None, 304, headers)
@@ -112,14 +110,14 @@ async def sent(
 
 
 def safe(name: str) -> str:
-    """An id as a header may hold it."""
+    """Replace characters of an id that a header must not contain."""
     return "".join(one if one.isascii() and one.isprintable() and one not in '"\\/' else "_"
                    for one in name)  # fmt: skip
 
 
-# Files sent in parts, whole or a range of them: memory does not grow with their size.
+# Files sent in chunks, whole or in part, so that memory does not grow with their size.
 
-#: Bytes that are read at once.
+#: Number of bytes in one read.
 _CHUNK = 1 << 18
 _RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", re.IGNORECASE | re.ASCII)
 
@@ -127,21 +125,21 @@ _RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", re.IGNOREC
 def files(
     media_types: Sequence[str], description: str, *statuses: int
 ) -> dict[int | str, dict[str, Any]]:
-    """Responses of a route that sends such a file, for the OpenAPI document.
+    """Return the responses of a route that uses `send_file`, for the OpenAPI document.
 
     Parameters
     ----------
-    media_types, description : of the file: one of these types
-    statuses : of refusals beside 416
+    media_types : possible media types of the file
+    description : description of a successful response
+    statuses : status codes of errors other than 404 and 416
     """
     binary = {one: {"schema": {"type": "string", "format": "binary"}} for one in media_types}
-    tag = {"description": "Stands for these bytes.", "schema": {"type": "string"}}
+    tag = {"description": "Entity tag of the bytes.", "schema": {"type": "string"}}
     headers = {"ETag": tag, "Accept-Ranges": {"schema": {"type": "string"}}}
     return {
         200: {"description": description, "headers": headers, "content": binary},
-        206: {"description": "The range that was asked for.", "headers": headers,
-              "content": binary},
-        304: {"description": "As the caller has it: its If-None-Match names this ETag."},
+        206: {"description": "The requested range.", "headers": headers, "content": binary},
+        304: {"description": "Not modified: If-None-Match names this ETag."},
         **declared(404, 416, *statuses),
     }  # fmt: skip
 
@@ -149,26 +147,27 @@ def files(
 def send_file(
     request: Request, open_file: Callable[[], BinaryIO], media_type: str, tag: str, name: str
 ) -> Response:
-    """A file, or the one range of it that the request asks for (RFC 9110, section 14).
+    """Return a file, or the one range of it that the request names (RFC 9110, section 14).
 
-    It is opened at once: that it is removed meanwhile changes nothing.
+    The file is opened before this returns, so that deleting it afterwards does not matter.
 
     Parameters
     ----------
-    request : with Range, If-Range and If-None-Match
-    open_file : gives the file, which can be sought in
-    media_type, tag, name : of its content; its ETag; what to call it when it is saved
+    request : request with the headers Range, If-Range and If-None-Match
+    open_file : function that opens the file; the file must be seekable
+    tag : entity tag of the file
+    name : suggested name for saving the file
 
     Raises
     ------
-    OSError : it cannot be opened.
+    OSError : If the file cannot be opened.
     """
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
     if is_known(request, tag):
         return Response(None, 304, headers)
     file = open_file()
     size = file.seek(0, 2)
-    first, last = _wanted(request, tag, size)
+    first, last = _requested_range(request, tag, size)
     if first > last or first >= size > 0:
         file.close()
         refused = problem(
@@ -192,16 +191,16 @@ def send_file(
 def send_product_file(
     request: Request, here: Service, find: Callable[[], JobFile], name: str
 ) -> Response:
-    """Return a file that a job has made, or the range that the request names; see `send_file`.
+    """Return a file that a job has created, or the requested range of it; see `send_file`.
 
     Parameters
     ----------
-    find : returns the file; raises UnknownJob where the job was deleted
-    name : what to call the file when it is saved
+    find : function that returns the file; it raises UnknownJob if the job was deleted
+    name : suggested name for saving the file
 
     Raises
     ------
-    DamagedBlob : its bytes are lost.
+    DamagedBlob : If the bytes of the file are lost.
     """
     file, blobs = find(), here.context.store.blobs
     if is_known(request, file.blob) or blobs.condition(file.blob) == "sound":
@@ -209,13 +208,13 @@ def send_product_file(
             return send_file(
                 request, lambda: blobs.open(file.blob), file.media_type, file.blob, name
             )
-    find()  # the job may have been deleted meanwhile
-    raise DamagedBlob(f"{file.name} of the job is damaged. Delete its result, and begin it again.")
+    find()  # raises if the job has been deleted meanwhile
+    raise DamagedBlob(f"{file.name} of the job is damaged. Delete the job, and start it again.")
 
 
-def _wanted(request: Request, tag: str, size: int) -> tuple[int, int]:
-    """First and last byte; all of them where Range asks for several ranges, or is not understood,
-    or If-Range names another state of the file.
+def _requested_range(request: Request, tag: str, size: int) -> tuple[int, int]:
+    """Return the first and last byte of the range. It is the whole file if Range is invalid or
+    names several ranges, or if If-Range names another version of the file.
     """
     whole = 0, size - 1
     condition = request.headers.get("if-range")
@@ -224,7 +223,7 @@ def _wanted(request: Request, tag: str, size: int) -> tuple[int, int]:
     found = _RANGE.fullmatch(request.headers.get("range", ""))
     if found is None or not (found[1] or found[2]) or size == 0:
         return whole
-    if not found[1]:  # the last so many
+    if not found[1]:  # a suffix range: the last bytes
         return (size - min(int(found[2]), size), size - 1) if int(found[2]) else (size, size - 1)
     first = int(found[1])
     last = min(int(found[2]), size - 1) if found[2] else size - 1

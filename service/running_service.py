@@ -1,4 +1,4 @@
-"""What the routes of one running service share: the concerns that they call, gates and figures."""
+"""The state that all routes of a running service share: parts of the engine, gates and metrics."""
 
 from __future__ import annotations
 
@@ -33,40 +33,40 @@ from service.metrics import Metrics
 
 T = TypeVar("T")
 
-#: Uploads in progress at most, so that one wait for the disk is enough for all of them.
+#: Maximum number of uploads in progress. With 12, one wait for the disk serves all of them.
 UPLOADS = 12
-#: Threads that look keys up, beside those that all other work shares.
+#: Number of threads that look up keys, besides the shared threads.
 LOOKUPS = 4
-#: Turns of requests that work in shared threads, such as lists: they compete for one interpreter,
-#: so that one beside another tenant has one.
+#: Maximum number of concurrent requests in shared threads, such as lists, and the maximum of one
+#: tenant while others wait. They compete for one interpreter lock.
 READS, READS_BESIDE = 8, 1
-#: Maximum age of what `/readyz` says, seconds.
+#: Maximum age of the result of `/readyz`, seconds.
 READY_S = 1.0
 
 
 class Service:
-    """The concerns of the engine by their names, and what bounds the work of requests.
+    """Parts of the engine by name, and the limits of the work of requests.
 
     Parameters
     ----------
-    context : that the concerns are built from
-    metrics : of this process
+    context : context that the parts of the engine are built from
+    metrics : metrics of this process
 
     Attributes
     ----------
-    gate : turns of queries and other computations
-    upload_gate : turns of uploads and of edits of many frames, which wait for the disk and for
-        other writers, so that no query waits behind them
-    keys : whether callers must show a key
-    feed : the stream of events
-    limits : how often callers may send requests
-    places : number of requests in progress, of which a tenant may have three quarters
-    wait_s : seconds to wait for a turn
-    requests : that tenants have in progress
-    reads : turns of requests that work in shared threads
-    spool : bodies that are kept on disk until they are read
-    lookups : threads that look keys up
-    looks : at the state of the service, shared by those who ask for it
+    gate : limit of concurrent queries and other computations
+    upload_gate : limit of concurrent uploads and edits of many frames. They wait for the disk and
+        for other writers, so queries have a gate of their own
+    keys : whether requests need a key
+    feed : stream of events
+    limits : rate limits of requests
+    places : maximum number of requests in progress; a tenant may have three quarters of them
+    wait_s : maximum wait for a turn, seconds
+    requests : number of requests in progress of each tenant
+    reads : turns of requests in shared threads
+    spool : number of bytes on disk that wait to be read
+    lookups : threads that look up keys
+    looks : results of state checks that concurrent requests share
     """
 
     def __init__(self, context: Context, metrics: Metrics) -> None:
@@ -88,7 +88,7 @@ class Service:
 
         self.wait_s = settings.queue_timeout_s
         self.gate = Gate(settings.concurrent_requests, settings.queued_requests, self.wait_s)
-        # they mostly wait for the disk: the store bounds how many are decoded at once
+        # Uploads mostly wait for the disk; the store limits the number of concurrent decodings.
         self.upload_gate = Gate(
             max(UPLOADS, settings.concurrent_requests), settings.queued_requests, self.wait_s,
             max(settings.concurrent_requests // 2, 1), rests=True,
@@ -102,31 +102,32 @@ class Service:
         self.lookups, self.looks = CapacityLimiter(LOOKUPS), SharedLooks(READY_S)
 
     def find_key(self, secret: str) -> KeyRow | None:
-        """Return the key with a secret, also an expired one; None if there is none."""
+        """Return the key with a secret, even an expired one; None if it does not exist."""
         with self.context.store.database.read() as connection:
             found = find_key(connection, secret)
         if found is not None and (found.expires_at is None or found.expires_at > time.time()):
             self.key_uses.note(found)
         return found
 
-    async def run(self, do: Callable[..., T], *given: object, patient: bool = False) -> T:
-        """Do it in a shared thread, when it is the tenant's turn; not while a turn is held.
+    async def run(self, do: Callable[..., T], *arguments: object, patient: bool = False) -> T:
+        """Run a function in a shared thread after waiting for a turn of the tenant. Do not call
+        this while holding a turn.
 
         Parameters
         ----------
-        do, given : the work, and its arguments
-        patient : wait for as long as it takes
+        do, arguments : function and its arguments
+        patient : whether to wait without a limit
 
         Raises
         ------
-        Busy : its turn did not come in time; nothing was begun.
+        Busy : If no turn becomes free in time; the function was not called.
         """
         tenant = current_tenant()
-        if tenant == NOBODY:  # nobody to share with
-            return await to_thread.run_sync(do, *given)
+        if tenant == NOBODY:
+            return await to_thread.run_sync(do, *arguments)
         held = await take_turn(self.reads, tenant, None if patient else self.wait_s)
         try:
-            return await to_thread.run_sync(do, *given)
+            return await to_thread.run_sync(do, *arguments)
         finally:
             self.reads.release(tenant, held)
 

@@ -1,4 +1,4 @@
-"""Running the service: one process, a socket, and word when it is ready."""
+"""HTTP server: socket, TLS, and connections with time limits that uvicorn lacks."""
 
 from __future__ import annotations
 
@@ -35,33 +35,32 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
     from uvicorn.server import ServerState
 
-# Connections: none is kept by who neither speaks nor listens.
+# Connections, closed if the client neither sends nor reads.
 #
-# uvicorn lets the head of a request take any time, waits for ever for an answer to be read, and
-# counts silent connections like busy ones: a few callers could shut all others out.
+# uvicorn has no time limit for the head of a request and for a client that reads its response, and
+# counts silent connections as busy. A few clients could therefore lock all others out.
 
-#: Seconds in which the head of a request must be whole, counted from its first byte, or from when
-#: the connection was made.
+#: Time limit for the head of a request, seconds, from its first byte or the start of the
+#: connection.
 HEAD_S = 10.0
-#: Seconds between two looks at whether an answer is being read, and the fewest bytes between them.
+#: Interval of checks whether the client reads, seconds, and the minimum of bytes per interval.
 READING_S, READING_BYTES = 30.0, 30 << 10
-#: Connections of all callers; beyond, the one that has been silent for longest is closed.
+#: Maximum number of connections. Beyond it, the one that has been silent for longest is closed.
 MOST_CONNECTIONS = 1000
-#: Files that are open beside them: the database, uploads, blobs, indexes.
+#: Number of other open files, such as the database, uploads, blobs and indexes.
 OTHER_FILES = 256
 
 
 class Connection(H11Protocol):
-    """A connection that is closed where the caller keeps us waiting.
-
-    How long an answer takes to be made is not its concern.
+    """A connection that closes if the client is too slow. The time to compute a response does not
+    count.
     """
 
     _head: asyncio.TimerHandle | None = None
     _reading: asyncio.TimerHandle | None = None
     _unread_before = 0
     silent_since = 0.0
-    #: What carries the TLS of this connection, where it has any.
+    #: Transport below TLS; None without TLS.
     wire: asyncio.Transport | None = None
 
     @property
@@ -71,18 +70,18 @@ class Connection(H11Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether it is silent, and not being closed already."""
+        """Whether the connection is silent and not closing."""
         return self.silent and not self.transport.is_closing()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin; where there is no room, the connection that was silent for longest makes some."""
+        """Start. If there is no room, the connection that has been silent for longest is closed."""
         super().connection_made(transport)
         self.silent_since = time.monotonic()
         close_oldest(self.connections, self)
         self._time_head()
 
     def data_received(self, data: bytes) -> None:
-        """Read on."""
+        """Read data and restart the timer of the head."""
         super().data_received(data)
         self._time_head()
 
@@ -90,37 +89,37 @@ class Connection(H11Protocol):
         """Wait for the next request."""
         self.silent_since = time.monotonic()
         super().on_response_complete()
-        # TLS says nothing of what waits below it, and waits for the other side to agree to its end
+        # The TLS layer does not report its buffers, and waits for the client's close message.
         if self.wire is not None and (self._unread() > 0 or self.transport.is_closing()):
             self._time_reading()
 
     def shutdown(self) -> None:
-        """Stop, as the service does: what is in flight ends, what is idle is closed."""
+        """Finish the response in progress, or close an idle connection."""
         if self.wire is not None and self.idle:
             self.loop.call_later(FAREWELL_S, self.transport.abort)
         super().shutdown()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End."""
+        """Stop all timers."""
         for timer in (self._head, self._reading):
             if timer is not None:
                 timer.cancel()
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """So much of an answer waits to be read that no more is written until some is."""
+        """Start the timer for reading, because the buffer is full."""
         super().pause_writing()
         self._time_reading()
 
     def resume_writing(self) -> None:
-        """Enough was read."""
+        """Stop the timer for reading, because the client has read enough."""
         if self._reading is not None:
             self._reading.cancel()
             self._reading = None
         super().resume_writing()
 
     def timeout_keep_alive_handler(self) -> None:
-        """Close what was not used again; an answer that is still being read has its time."""
+        """Close an idle connection; a response in progress keeps its own time limit."""
         carried = 0 if self.wire is None else self.wire.get_write_buffer_size()
         if self.transport.get_write_buffer_size() + carried == 0:
             self.transport.abort()
@@ -128,20 +127,20 @@ class Connection(H11Protocol):
             self._time_reading()
 
     def send_400_response(self, msg: str) -> None:
-        """Refuse what is no HTTP in the form of all refusals."""
+        """Refuse a request that is not HTTP with a problem document."""
         from service.problems import problem
 
         if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
-            self.transport.abort()  # in the middle of an answer
+            self.transport.abort()  # a response is in progress
             return
         request_id = uuid.uuid4().hex
-        detail = f"{msg} Its head is not HTTP/1.1, or longer than 16 KiB. Check the sender."
-        told = problem(request_id, "BadRequest", 400, detail)
-        headers = [*told.raw_headers, (b"x-request-id", request_id.encode())]
+        detail = f"{msg} Its head is not HTTP/1.1, or longer than 16 KiB. Check the client."
+        response = problem(request_id, "BadRequest", 400, detail)
+        headers = [*response.raw_headers, (b"x-request-id", request_id.encode())]
         headers += [(b"connection", b"close"), (b"cache-control", b"no-store")]
         for event in (
             h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
-            h11.Data(data=bytes(told.body)),
+            h11.Data(data=bytes(response.body)),
             h11.EndOfMessage(),
         ):
             self.transport.write(self.conn.send(event) or b"")
@@ -150,7 +149,7 @@ class Connection(H11Protocol):
             self._time_reading()
 
     def _time_head(self) -> None:
-        """Have the next head timed while none is being answered; each byte is not a new start."""
+        """Start the timer of the next head, unless it runs or a response is in progress."""
         if not self.silent:
             if self._head is not None:
                 self._head.cancel()
@@ -162,85 +161,85 @@ class Connection(H11Protocol):
         if self._reading is not None:
             self._reading.cancel()
         self._unread_before = self._unread()
-        self._reading = self.loop.call_later(READING_S, self._look)
+        self._reading = self.loop.call_later(READING_S, self._check_reading)
 
-    def _look(self) -> None:
-        """Whether some of the answer was read since the last look."""
+    def _check_reading(self) -> None:
+        """Abort the connection if the client has read too little since the last check."""
         self._reading = None
         if not (self.silent or self.flow.write_paused):
-            return  # it was read, and the next request came
+            return  # the response was read, and the next request has arrived
         unread, silent_s = self._unread(), time.monotonic() - self.silent_since
         if unread == 0 and not self.transport.is_closing() and silent_s < self.timeout_keep_alive:
-            return  # all of it was read, and `timeout_keep_alive_handler` is still to come
+            return  # everything was read; `timeout_keep_alive_handler` closes the connection
         if unread > self._unread_before - READING_BYTES:
             self.transport.abort()
         else:
             self._time_reading()
 
     def _unread(self) -> int:
-        """Bytes of answers that the other side has not taken yet: ours, and the kernel's."""
+        """Return the number of unread bytes in our buffers and in those of the kernel."""
         carried = 0 if self.wire is None else self.wire.get_write_buffer_size()
-        known = self.transport.get_extra_info("socket")
+        handle = self.transport.get_extra_info("socket")
         try:
-            (kernel,) = struct.unpack("i", fcntl.ioctl(known, termios.TIOCOUTQ, bytes(4)))
+            (kernel,) = struct.unpack("i", fcntl.ioctl(handle, termios.TIOCOUTQ, bytes(4)))
         except (OSError, TypeError):  # closed meanwhile
             kernel = 0
         return self.transport.get_write_buffer_size() + carried + int(kernel)
 
 
 def close_oldest(connections: Iterable[object], new: object) -> None:
-    """Where there is no room for a new connection, close the one that was silent for longest."""
-    known = [one for one in connections if isinstance(one, Connection | Handshake)]
-    if len(known) <= room():
+    """If there is no room for a new connection, close the one that has been silent for longest."""
+    all_ours = [one for one in connections if isinstance(one, Connection | Handshake)]
+    if len(all_ours) <= room():
         return
-    waiting = [one for one in known if one is not new and one.idle]
+    waiting = [one for one in all_ours if one is not new and one.idle]
     if waiting:
         min(waiting, key=lambda one: one.silent_since).transport.abort()
 
 
-# TLS. asyncio would make a connection of ours only after the handshake: until then nobody would
-# count it, and it could take a minute.
+# TLS. asyncio creates a connection only after the handshake, which may take a minute, so
+# unfinished handshakes would not be counted.
 
-#: Seconds that the other side may take to agree to the end of an idle connection.
+#: Time for the client to confirm the end of an idle connection, seconds.
 FAREWELL_S = 2.0
-#: asyncio would end a connection that is being closed while its last answer is still being read:
-#: `Connection` looks itself whether it is.
+#: Shutdown timeout of asyncio, which must not end a connection whose last response is still being
+#: read: `Connection` has its own time limit.
 NEVER_S = 86_400.0
-#: Bytes of an answer that wait to be encrypted before no more are written, as without TLS.
+#: Number of bytes that wait for encryption before writing pauses, as without TLS.
 UNENCRYPTED_BYTES = 64 << 10
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:
-    """Return the TLS context of the service, or None for plain HTTP; raise InvalidRequest if
-    certificate or key cannot be read, or do not match.
+    """Return the TLS context of the service, or None for plain HTTP. Raise InvalidRequest if the
+    certificate or key cannot be read, or they do not match.
     """
     if settings.tls_cert is None or settings.tls_key is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.options |= ssl.OP_NO_RENEGOTIATION  # it costs us more than whoever asks for it
+    context.options |= ssl.OP_NO_RENEGOTIATION  # it costs the server more than the client
     context.set_alpn_protocols(["http/1.1"])
     try:
-        # an encrypted key would be asked for on the terminal
+        # Without a password function, OpenSSL would ask on the terminal for an encrypted key.
         context.load_cert_chain(settings.tls_cert, settings.tls_key, password=lambda: "")
     except (OSError, ValueError) as error:  # SSLError is an OSError
         reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
         raise InvalidRequest(
             f"The certificate {settings.tls_cert} and the key {settings.tls_key} cannot be used "
             f"({reason}). Set SCENEPRINT_TLS_CERT to a PEM file with the certificate and its "
-            "chain, and SCENEPRINT_TLS_KEY to one with its key, not encrypted."
+            "chain, and SCENEPRINT_TLS_KEY to a PEM file with its unencrypted key."
         ) from error
     return context
 
 
 class Handshake(asyncio.Protocol):
-    """A connection whose TLS is not agreed on yet, counted and timed like any other.
+    """A connection during the TLS handshake, counted and timed like any other.
 
     Parameters
     ----------
     context : see `tls_context`
-    server_state : of uvicorn, which has all connections
-    more : what uvicorn makes connections with
+    server_state : state of uvicorn with the set of all connections
+    more : other arguments for connections from uvicorn
     """
 
     transport: asyncio.Transport
@@ -249,43 +248,43 @@ class Handshake(asyncio.Protocol):
     def __init__(self, context: ssl.SSLContext, *, server_state: ServerState, **more: Any) -> None:
         self._context, self._state, self._more = context, server_state, more
         self._connections: set[Any] = server_state.connections
-        self._early = bytearray()  # what came between the end of the handshake and our hearing it
+        self._early = bytearray()  # data that arrived between the end of the handshake and our code
         self._lost = False
 
     @property
     def idle(self) -> bool:
-        """Whether it is not being closed already."""
+        """Whether the connection is not closing."""
         return not self.transport.is_closing()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin."""
+        """Start the handshake."""
         self.transport, self.silent_since = transport, time.monotonic()
-        transport.pause_reading()  # start_tls reads on
+        transport.pause_reading()  # start_tls resumes it
         self._connections.add(self)
         close_oldest(self._connections, self)
         self._task = asyncio.get_running_loop().create_task(self._agree())
 
     def data_received(self, data: bytes) -> None:
-        """Keep what the connection will read."""
+        """Buffer data for the connection."""
         self._early += data
 
     def connection_lost(self, _exc: Exception | None) -> None:
-        """End."""
+        """Mark the connection as lost."""
         self._lost = True
         self._connections.discard(self)
 
     def shutdown(self) -> None:
-        """Stop, as the service does."""
+        """Abort the handshake."""
         self.transport.abort()
 
     async def _agree(self) -> None:
-        """Agree on TLS, and hand over to a connection."""
+        """Do the handshake, and pass the transport to a connection."""
         try:
             secured = await asyncio.get_running_loop().start_tls(
                 self.transport, self, self._context, server_side=True,
                 ssl_handshake_timeout=HEAD_S, ssl_shutdown_timeout=NEVER_S,
             )  # fmt: skip
-        except OSError:  # no TLS, none of ours, too slow, or gone
+        except OSError:  # no TLS, no common protocol, timeout or disconnect
             self.transport.abort()
             return
         finally:
@@ -303,7 +302,7 @@ class Handshake(asyncio.Protocol):
 
 
 def room() -> int:
-    """Connections that may be open at once."""
+    """Return the maximum number of open connections."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
         return MOST_CONNECTIONS
@@ -311,7 +310,7 @@ def room() -> int:
 
 
 def make_room() -> None:
-    """Let this process have as many files open as all connections need, if it may."""
+    """Raise this process's limit of open files to that of all connections, if permitted."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MOST_CONNECTIONS + OTHER_FILES
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -321,20 +320,20 @@ def make_room() -> None:
 
 log = logging.getLogger(__name__)
 
-#: Seconds after which a thread that computes lets another go on. The event loop waits for each of
-#: a dozen in turn, and answers nobody meanwhile; a query, which leaves the interpreter a hundred
-#: times, waits each time that it comes back.
+#: Interval after which a computing thread releases the interpreter, seconds. The event loop waits
+#: for each of a dozen threads in turn and answers nothing meanwhile; a query releases the
+#: interpreter a hundred times and waits each time to get it back.
 SWITCH_S = 0.0001
-#: Seconds that requests in flight may take after the signal to stop.
+#: Time for requests in progress after the signal to stop, seconds.
 GRACE_S = 20
 
 
 def listen(settings: Settings) -> socket.socket:
-    """Open a socket on the address of the settings; raise UnusableStore if the address is taken or
-    not of this machine.
+    """Open a socket on the address of the settings. Raise UnusableStore if the address is in use or
+    does not belong to this machine.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    # the protocol named, or asyncio leaves Nagle on and every answer waits 40 ms for an ACK
+    # With the protocol argument, asyncio disables Nagle's algorithm, which delays responses 40 ms.
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -353,15 +352,16 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
 
     Parameters
     ----------
-    ready : called once it answers, with its address, and whether its store is read-only
+    ready : function that is called at the start, with the address, and whether the store is
+        read-only
 
     Raises
     ------
-    InvalidRequest : there is no certificate where the settings name one.
-    UnusableStore, NewerSchema : the store cannot be opened, or the address not listened on.
+    InvalidRequest : If the certificate or the key cannot be used.
+    UnusableStore, NewerSchema : If the store cannot be opened or the address is not available.
     """
     context = tls_context(settings)
-    listening = listen(settings)  # first: where it is refused, no data folder is made
+    listening = listen(settings)  # first, so that a failure does not create a data folder
     try:
         read_only = _require_store(settings)
     except BaseException:
@@ -379,16 +379,16 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     app = Front(settings, lambda: _load(settings), lambda: server.handle_exit(signal.SIGTERM, None))
     config = uvicorn.Config(
         app,
-        log_config=None,  # ours is JSON
-        access_log=False,  # `RequestMiddleware` writes one line a request
+        log_config=None,  # our logs are JSON
+        access_log=False,  # `RequestMiddleware` logs requests
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         timeout_keep_alive=30,
-        # which has the limits that uvicorn lacks
+        # our classes have the time limits that uvicorn lacks
         http=Connection if context is None else secured(context),
         ws="none",
         h11_max_incomplete_event_size=16 << 10,
-        proxy_headers=False,  # uvicorn would believe X-Forwarded-For of whoever is on this machine
+        proxy_headers=False,  # uvicorn would trust X-Forwarded-For from any local process
     )
     raise_descriptors()
     sys.setswitchinterval(SWITCH_S)
@@ -396,7 +396,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     server = _Server(config, lambda: ready(url, read_only), lambda: _close_feed(app))
     try:
         server.run(sockets=[listening])
-    except KeyboardInterrupt:  # uvicorn raises the signal again by which `Front` stopped it
+    except KeyboardInterrupt:  # uvicorn repeats the signal with which `Front` stopped it
         if app.error is None:
             raise
     finally:
@@ -406,9 +406,9 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
 
 
 def _require_store(settings: Settings) -> bool:
-    """See that the store can be opened, before anything is answered; whether it is read-only.
+    """Return whether the store is read-only; raise an error if it cannot be opened.
 
-    The application opens it once more: uvicorn would make a traceback of what cannot be opened.
+    The application opens the store again, but there uvicorn would print a traceback.
     """
     store = open_patiently(lambda: open_store(settings.database, settings.served_blobs))
     try:
@@ -418,12 +418,12 @@ def _require_store(settings: Settings) -> bool:
 
 
 def secured(context: ssl.SSLContext) -> type[asyncio.Protocol]:
-    """What uvicorn makes of a connection, where it speaks TLS."""
+    """Return the factory of TLS connections for uvicorn."""
     return cast("type[asyncio.Protocol]", partial(Handshake, context))
 
 
 def _load(settings: Settings) -> FastAPI:
-    """The application; all that is imported stays, and need not be looked through ever again."""
+    """Return the application. Imported objects are excluded from garbage collection."""
     from service.app import create_app
 
     app = create_app(settings)
@@ -438,7 +438,7 @@ def _close_feed(front: Front) -> None:
 
 
 class _Server(uvicorn.Server):
-    """A server that says when it has started, and when it is about to stop."""
+    """A server that reports its start and the beginning of its shutdown."""
 
     def __init__(
         self, config: uvicorn.Config, started: Callable[[], None], stopping: Callable[[], None]
@@ -447,12 +447,12 @@ class _Server(uvicorn.Server):
         self._started, self._stopping = started, stopping
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, and say so."""
+        """Start, and report it."""
         await super().startup(sockets)
         if self.started:
             self._started()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop; streams of events would else be waited for like any other answer."""
+        """Close event streams, which would otherwise delay the shutdown, and stop."""
         self._stopping()
         await super().shutdown(sockets)

@@ -1,8 +1,8 @@
-"""The door of the service: it answers `/healthz` at once, while the application is loaded.
+"""Startup of the service: it answers `/healthz` at once, while the application loads.
 
-uvicorn  -->  Front  -->  the application, as soon as it is there
+    uvicorn  -->  Front  -->  the application, once it is loaded
 
-All other requests wait for it, a second or so.
+All other requests wait until the application is loaded, approximately one second.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 class Front:
-    """An ASGI application that loads another in a thread. If that fails, it calls `failed`, and
-    `error` says why.
+    """An ASGI application that loads another one in a thread. If that fails, it calls `failed`, and
+    `error` has the cause.
     """
 
     def __init__(
@@ -33,12 +33,12 @@ class Front:
         self._load, self._failed = load, failed
         self._alone = not settings.asks_for_keys
         self._loaded, self._stop = asyncio.Event(), asyncio.Event()
-        #: The application, once it answers; and why there is none.
+        #: The application once it is loaded, and the error if loading failed.
         self.app: FastAPI | None = None
         self.error: Exception | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The life of the service, or one request."""
+        """Handle the lifespan of the service or one request."""
         if scope["type"] == "lifespan":
             await self._live(receive, send)
             return
@@ -52,7 +52,7 @@ class Front:
         await self.app(scope, receive, send)
 
     def _is_harmless(self, scope: Scope) -> bool:
-        """Whether a request asks for `/healthz`, and not from a page of others."""
+        """Return whether a request is for `/healthz` and does not come from a foreign web page."""
         asks = scope["path"] == "/healthz" and scope["method"] in ("GET", "HEAD")
         headers = scope["headers"]
         if not asks or any(name == b"origin" for name, _ in headers):
@@ -60,7 +60,7 @@ class Front:
         return not self._alone or stranger(headers, lambda _: False) is None
 
     async def _live(self, receive: Receive, send: Send) -> None:
-        """Run the application until told to stop."""
+        """Run the application until the server stops it."""
         await receive()
         running = asyncio.create_task(self._run())
         await send({"type": "lifespan.startup.complete"})
@@ -84,7 +84,7 @@ class Front:
 
 
 async def _answer(scope: Scope, send: Send) -> None:
-    """What the application answers to `/healthz`."""
+    """Send the application's response to `/healthz`."""
     body = json.dumps({"status": "ok", "version": __version__}, separators=(",", ":")).encode()
     headers: Headers = [
         (b"content-length", str(len(body)).encode()),

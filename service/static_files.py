@@ -1,7 +1,7 @@
-"""Static files as they are sent, compressed once: the page `/docs`, and the OpenAPI document.
+"""Static files, compressed once: the page `/docs` and the OpenAPI document.
 
-`/docs` is Swagger UI on the service's own OpenAPI document, with nothing from elsewhere: its files
-are those that the package fastapi-offline brings along.
+`/docs` is Swagger UI for the service's own OpenAPI document. All its files come from the package
+fastapi-offline, so the page needs no network.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from starlette.exceptions import HTTPException
 
 from service.responses import is_known
 
-#: Media types by suffix; files of no other are sent.
+#: Media types by suffix. Files with other suffixes are not served.
 KINDS = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -35,13 +35,13 @@ KINDS = {
 
 @dataclass(frozen=True)
 class StaticFile:
-    """A file as it is sent.
+    """A file in memory, with its compressed form.
 
     Parameters
     ----------
-    kind : its media type
-    plain, packed : its bytes, as they are and through gzip
-    tag : stands for them
+    kind : media type of the file
+    plain, packed : content of the file, uncompressed and compressed with gzip
+    tag : entity tag of the content
     """
 
     kind: str
@@ -51,30 +51,28 @@ class StaticFile:
 
 
 def read_file(path: Path) -> StaticFile:
-    """A file of the disk, of a suffix in `KINDS`."""
+    """Read a file whose suffix is in `KINDS`."""
     return pack_file(path.suffix, path.read_bytes())
 
 
 def pack_file(suffix: str, plain: bytes) -> StaticFile:
-    """Bytes as a file of a suffix in `KINDS`."""
+    """Return bytes as a static file with a suffix of `KINDS`."""
     tag = hashlib.sha256(plain).hexdigest()[:20]
     return StaticFile(KINDS[suffix], plain, gzip.compress(plain, 9, mtime=0), tag)
 
 
 def answer_file(request: Request, file: StaticFile, policy: str | None = None) -> Response:
-    """Answer with a file, or with 304 where the caller has it.
+    """Return a response with a file, or 304 if the client has it.
 
     Parameters
     ----------
-    request : whose `If-None-Match` and `Accept-Encoding` count
-    file : that is sent
-    policy : its content security policy; default: the one that allows nothing
+    policy : content security policy of the file; default: the policy that allows nothing
     """
     packs = "gzip" in request.headers.get("accept-encoding", "")
     tag = f"{file.tag}-gzip" if packs else file.tag
     headers = {
         "ETag": f'"{tag}"',
-        "Cache-Control": "no-cache",  # asked again each time: another version may serve by now
+        "Cache-Control": "no-cache",  # clients revalidate, because an update may change the file
         "Vary": "Accept-Encoding",
     }
     if policy is not None:
@@ -87,12 +85,12 @@ def answer_file(request: Request, file: StaticFile, policy: str | None = None) -
     return Response(file.packed if packs else file.plain, headers=headers)
 
 
-#: Scripts and documents are the service's own; Swagger UI writes styles and draws its icons.
+#: Scripts and documents are those of the service. Swagger UI adds inline styles and data images.
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
-# addresses are relative: a proxy may serve all of it below a prefix
+# Addresses are relative, because a proxy may serve the pages below a prefix.
 _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -121,8 +119,8 @@ _LIBRARY = ("swagger-ui.css", "swagger-ui-bundle.js")
 
 
 def routes(document: Callable[[], dict[str, Any]]) -> APIRouter:
-    """Return the routes of the page, its files and the OpenAPI document, which the first request
-    for it makes.
+    """Return the routes of the page `/docs`, its files and the OpenAPI document, which is built on
+    the first request.
     """
     router = APIRouter(include_in_schema=False)
     rendered: list[StaticFile] = []
@@ -153,7 +151,7 @@ def routes(document: Callable[[], dict[str, Any]]) -> APIRouter:
 
 @cache
 def _file(name: str) -> StaticFile:
-    """A file by its name, packed when it is first asked for: the library is 1.5 MB."""
+    """Return a file by its name. It is packed on first use, because the library has 1.5 MB."""
     if name == "index.html":
         return pack_file(".html", _PAGE.encode())
     if name == "start.js":

@@ -172,7 +172,7 @@ def test_signatures_of_two_models_do_not_mix(
     other = tmp_path / "other.safetensors"
     save_model(replace(small_model, quantiser_step=0.004), other)
     done = run("sign", rooms / "room-000", "--model", other, "--out", out, expect=2)
-    assert "holds signatures of another model" in done.stderr
+    assert "contains signatures of another model" in done.stderr
     assert tree_hash(out) == before
 
 

@@ -133,6 +133,6 @@ def test_a_map_in_one_file_leads_to_a_pose(said: Callable[[str, int], list[str]]
             place = [float(one) for one in lines[1].split()[1:4]]
             assert place == pytest.approx([4.436, 13.913, 0.854], abs=0.1)
             continue
-        lines = [line for line in lines if not line.startswith("weak here: ")]
+        lines = [line for line in lines if not line.startswith("weak area: ")]
         assert [NUMBER.sub("#", line) for line in lines] \
             == [NUMBER.sub("#", line) for line in expected]  # fmt: skip

@@ -1,1 +1,1 @@
-"""The processes that sign frames."""
+"""Worker processes, which sign frames and run other jobs."""

@@ -1,4 +1,4 @@
-"""`python -m worker`: worker processes, by the settings of the environment."""
+"""`python -m worker`: run worker processes with settings from the environment."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from worker.supervisor import run
 
 
 def main() -> int:
-    """Work until told to stop; errors are one line and exit code 2."""
+    """Run workers until a signal ends them. Errors are printed in one line, with exit code 2."""
     log_as_json()
     try:
         settings = Settings()
-        require_writable(settings)  # what is wrong is said once, and not by every worker
+        require_writable(settings)  # reports errors once, instead of in every worker
         run(settings)
     except (SceneprintError, ValidationError) as error:
         print(f"worker: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201

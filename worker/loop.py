@@ -1,4 +1,4 @@
-"""One worker process: claim, sign, store, again; and what it leaves behind when it dies."""
+"""One worker process: its loop over jobs, and the traces that survive its death."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ from sceneprint.store.wakeup import Listening, process_name
 
 log = logging.getLogger(__name__)
 
-#: Shortest pause before another look at a queue that had nothing, and the longest: for jobs
-#: that no wakeup announces, such as those that another machine queued.
+#: Minimum and maximum pause between two reads of an empty queue, seconds. Wake-ups usually end the
+#: pause earlier, but not for jobs that another machine has queued.
 SHORTEST_S, LONGEST_S = 0.05, 2.0
-#: Seconds between two looks at the indexes, and after one for which there was no memory.
+#: Interval of housekeeping, and the pause after a lack of memory, seconds.
 UPKEEP_S, POOR_S = 5.0, 300.0
-#: A robot that waits for an answer goes before a frame that waits to be signed.
+#: Increment of the process's niceness. Queries of robots have precedence over signing.
 NICENESS = 5
-#: Seconds to wait where the database does not answer.
+#: Pause after an error of the database, seconds.
 TROUBLE_S = 2.0
-#: Seconds between two lines of the log that say that this version may not write any more.
+#: Interval of log lines that report a newer schema, seconds.
 OUTDATED_S = 60.0
 
 
 def work(settings: Settings, parent: int, trace: Trace) -> None:
-    """Work until told to stop, or until the process that started this one is gone.
+    """Work until a signal ends the process, or until its parent process has ended.
 
-    SIGTERM and SIGINT let the frame in hand be finished first. An error that nobody raised on
-    purpose ends the process too, in good order: the next try has a fresh one.
+    After SIGTERM or SIGINT, the current frame is finished first. An unexpected error also ends the
+    process in an orderly way, so that the next attempt has a new process.
 
     Parameters
     ----------
-    parent : process id of the one that started this
-    trace : for what it reads when this process dies
+    parent : process id of the parent
+    trace : memory that the parent reads when this process has died
     """
     log_as_json()
     os.nice(NICENESS)
@@ -58,13 +58,13 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
     trace.watch()
     stop = StopSignal()
 
-    def may_go_on(seconds: float) -> bool:
+    def should_continue(seconds: float) -> bool:
         stop.wait(seconds)
         return not stop.asked and os.getppid() == parent
 
     with ExitStack() as stack:
-        try:  # without an end: its place would be given to another that waits
-            context = stack.enter_context(open_context(settings, math.inf, may_go_on))
+        try:  # it waits without a limit, because a replacement would only wait as well
+            context = stack.enter_context(open_context(settings, math.inf, should_continue))
         except StoreAway:
             return
         listener = stack.enter_context(context.bell.listen())
@@ -78,11 +78,11 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
     log.info("worker stopped", extra={"worker": worker.name})
     if worker.unsound:
         logging.shutdown()
-        os._exit(0)  # at once: taking it down in order takes a second, and may crash
+        os._exit(0)  # an orderly shutdown takes a second and may crash
 
 
 class Worker:
-    """Does the work of one process."""
+    """The work of one process."""
 
     def __init__(
         self, context: Context, listener: Listening, trace: Trace, stop: StopSignal
@@ -92,21 +92,21 @@ class Worker:
         self._scrub = Scrub(context.settings, context.store)
         self._listener, self._trace, self._stop = listener, trace, stop
         self.name = process_name()
-        self.unsound = False  # an error came that nobody raised on purpose
-        # frames first: where publishing kills every worker, each still signs for a while
+        self.unsound = False  # whether an unexpected error has occurred
+        # Frames come first: if publishing kills workers, each of them still signs for a while.
         self._upkeep_at = time.monotonic() + UPKEEP_S
         starter = multiprocessing.parent_process()
         self._wakers = (stop.descriptor, -1 if starter is None else int(starter.sentinel))
 
     def turn(self) -> None:
-        """Do a job, look after the indexes if it is time, or wait where there is none to do."""
+        """Run a job, run housekeeping if it is due, or wait for a job."""
         try:
-            found = self._work()
+            was_busy = self._work()
             if time.monotonic() > self._upkeep_at and not self.unsound:
-                found = self._publish() or found
-            if not found:
+                was_busy = self._publish() or was_busy
+            if not was_busy:
                 self._listener.wait(self._pause(), *self._wakers)
-        except NewerSchema as error:  # nothing but another version can go on
+        except NewerSchema as error:  # only a later version can continue
             log.error("store migrated by a later version", extra={"error": str(error)})
             self._stop.wait(OUTDATED_S)
         except SceneprintError as error:
@@ -114,7 +114,7 @@ class Worker:
             self._stop.wait(TROUBLE_S)
 
     def _work(self) -> bool:
-        """Do a job; whether there was one."""
+        """Run a job; return whether there was one."""
         claimed = self._jobs.claim(self.name)
         if claimed is None:
             return False
@@ -122,8 +122,8 @@ class Worker:
             self._jobs.put_back(claimed)
             return True
         held = claimed.job
-        asked = held.data or {}
-        with of_request(asked.get("request_id")), self._trace.job(held.id, held.token, self._job_s):
+        data, limit_s = held.data or {}, self._job_s
+        with of_request(data.get("request_id")), self._trace.job(held.id, held.token, limit_s):
             self._jobs.run(claimed, self._break)
         return True
 
@@ -131,51 +131,50 @@ class Worker:
         self.unsound = True
 
     def _publish(self) -> bool:
-        """Look after the indexes, and scrub until somebody rings; whether somebody did."""
-        self._upkeep_at = time.monotonic() + UPKEEP_S  # also where it fails: frames go first
-        rung = False
+        """Run housekeeping and the scrub until a wake-up; return whether there was one."""
+        self._upkeep_at = time.monotonic() + UPKEEP_S  # even after an error: frames come first
+        woken = False
 
         def is_quiet() -> bool:
-            nonlocal rung
-            rung = self._listener.wait(0.0)
-            return not rung
+            nonlocal woken
+            woken = self._listener.wait(0.0)
+            return not woken
 
         try:
             self._housekeeping.run()
             self._scrub.run(is_quiet)
-        except MemoryError:  # the next process would have no more
+        except MemoryError:  # a new process would not have more
             log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_MEMORY_BYTES")
             self._upkeep_at = time.monotonic() + POOR_S
-        return rung
+        return woken
 
     def _pause(self) -> float:
-        """Seconds until there may be something to do, if nobody rings."""
+        """Return the pause without a wake-up, seconds."""
         due_s = self._jobs.due_in_s()
         left = LONGEST_S if due_s is None else min(due_s, LONGEST_S)
         left = min(left, self._upkeep_at - time.monotonic())
-        return max(left, SHORTEST_S * random.uniform(1, 2))  # not all workers at the same moment
+        return max(left, SHORTEST_S * random.uniform(1, 2))  # spreads the reads of workers
 
 
-# The job that a worker was at, and where in the code it was when it died.
+# Traces: the current job of a worker, and the traceback of its death.
 #
-# A worker that crashes, or hangs in code that never gives the interpreter back, can tell nobody.
-# Python's faulthandler still writes its tracebacks, to memory that outlives the process; who
-# started the worker reads them there.
+# A worker that crashes, or hangs in code that never releases the interpreter, cannot report it.
+# Python's faulthandler can still write tracebacks to shared memory, which the parent reads.
 
-#: Bytes of a traceback that are kept, from its end; and the most that its first line has.
+#: Maximum size of a traceback, of which the end is kept, and of its first line, bytes.
 KEPT, HEAD = 20_000, 200
-#: How faulthandler begins where the time was over.
+#: First words of faulthandler's output after a timeout.
 _TIMEOUT = "Timeout ("
 
 
 @dataclass(frozen=True)
 class Left:
-    """What a dead worker left.
+    """Trace of a dead worker.
 
     Parameters
     ----------
-    job_id, token : of the claim it was at; None where it was at none
-    text : traceback of all its threads, or nothing
+    job_id, token : claim of the current job; None and 0 without a job
+    text : traceback of all threads, or ""
     """
 
     job_id: str | None
@@ -184,12 +183,12 @@ class Left:
 
     @property
     def too_long(self) -> bool:
-        """Whether it was ended as its job took too long."""
+        """Whether the worker was ended because its job exceeded the time limit."""
         return self.text.startswith(_TIMEOUT)
 
 
 class Trace:
-    """Memory that a worker and who started it share; given to the worker as an argument."""
+    """Memory that a worker shares with its parent, passed to the worker as an argument."""
 
     def __init__(self) -> None:
         self._descriptor = os.memfd_create("sceneprint-trace")
@@ -201,39 +200,39 @@ class Trace:
         self._descriptor = state.detach()
 
     def watch(self) -> None:
-        """Note where this process is when it crashes."""
+        """Write a traceback if this process crashes."""
         faulthandler.enable(self._descriptor)
 
     @contextmanager
     def job(self, job_id: str, token: int, limit_s: float) -> Iterator[None]:
-        """Note which job this process is at; it ends if it takes longer than that."""
+        """Record the current job; the process ends if the job exceeds `limit_s`."""
         self._begin(f"{job_id} {token}\n")
-        # from a thread of C: it needs no turn of the interpreter
+        # The timer runs in a C thread, which does not need the interpreter.
         faulthandler.dump_traceback_later(limit_s, exit=True, file=self._descriptor)
         try:
             yield
         except SceneprintError:
             self._end()
             raise
-        except BaseException:  # this process ends of it, and the job is still held
+        except BaseException:  # it ends this process, and the job is still claimed
             faulthandler.cancel_dump_traceback_later()
             os.write(self._descriptor, traceback.format_exc().encode())
             raise
         self._end()
 
     def left(self) -> Left:
-        """What is written, once the worker is dead."""
+        """Return the trace after the worker has died."""
         size = os.fstat(self._descriptor).st_size
         head = os.pread(self._descriptor, HEAD, 0).partition(b"\n")[0]
         start = max(len(head) + 1, size - KEPT)
         text = os.pread(self._descriptor, KEPT, start).decode(errors="replace")
         job_id, _, token = head.decode(errors="replace").partition(" ")
-        if not token.isdigit():  # it crashed while it was at none
+        if not token.isdigit():  # it crashed without a job
             return Left(None, 0, os.pread(self._descriptor, KEPT, 0).decode(errors="replace"))
         return Left(job_id, int(token), text)
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Release the memory."""
         os.close(self._descriptor)
 
     def _begin(self, head: str) -> None:

@@ -1,4 +1,4 @@
-"""Several worker processes: started, replaced when they end, stopped together."""
+"""Supervisor of worker processes: starts them, replaces those that end, and stops them."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from worker.loop import Left, Trace, work
 
 log = logging.getLogger(__name__)
 
-#: Seconds that a frame in hand may take after the signal to stop.
+#: Time for the current frame after the signal to stop, seconds.
 GRACE_S = 20.0
-#: Seconds before a worker is replaced that died of no job, so that one that cannot start does
-#: not spin.
+#: Pause before the replacement of a worker that died without a job, seconds, so that a worker that
+#: cannot start does not spin.
 RESTART_S = 1.0
-#: What comes from outside, and says nothing of the job that was in hand.
+#: Signals from outside, which do not mean that the current job is at fault.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class Post:
-    """A worker's place: the process that has it, or the time when another gets it."""
+    """A slot for a worker: its process, or the time from which it may be replaced."""
 
     def __init__(self) -> None:
         self.worker: SpawnProcess | None = None
@@ -40,7 +40,7 @@ class Post:
         self.free_at = 0.0
 
     def end(self) -> tuple[int, int, Left]:
-        """Process id, exit code and remains of a worker that is over; the place is free."""
+        """Return process id, exit code and trace of a worker that has ended, and free the slot."""
         assert self.worker is not None
         self.worker.join()
         pid, code = self.worker.pid or 0, self.worker.exitcode or 0
@@ -52,11 +52,11 @@ class Post:
 
 
 class Supervisor:
-    """Keeps a number of workers running, as the settings say."""
+    """A group of worker processes of constant size."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        # spawned, never forked: a forked child inherits threads' locks and dies in OpenMP
+        # Forked children would inherit locks of threads and crash in OpenMP.
         self._context = multiprocessing.get_context("spawn")
         self._posts: list[Post] = []
 
@@ -67,9 +67,9 @@ class Supervisor:
             self._fill(post)
 
     def watch(self, stop: threading.Event) -> None:
-        """Replace workers that end until told to stop; then stop them all."""
+        """Replace workers that end until `stop` is set; then stop all of them."""
         try:
-            with _readable(stop) as told:
+            with _readable(stop) as stopped:
                 while not stop.is_set():
                     now = time.monotonic()
                     for post in self._posts:
@@ -77,14 +77,14 @@ class Supervisor:
                             self._fill(post)
                     free = [post.free_at - now for post in self._posts if post.worker is None]
                     busy = {post.worker.sentinel: post for post in self._posts if post.worker}
-                    for one in wait([told, *busy], min(free, default=None)):
+                    for one in wait([stopped, *busy], min(free, default=None)):
                         if isinstance(one, int) and one in busy:
                             self._replace(busy[one])
-        finally:  # also where none can be started: the others are not left behind
+        finally:  # even if a worker cannot start, so that no others stay behind
             self.stop()
 
     def stop(self) -> None:
-        """Let every worker finish its frame, and end those that do not."""
+        """Let every worker finish its frame, and kill those that take too long."""
         posts = [(post, post.worker) for post in self._posts if post.worker is not None]
         for _, worker in posts:
             worker.terminate()
@@ -121,7 +121,7 @@ class Supervisor:
         self._report(code, left)
 
     def _report(self, code: int, left: Left) -> None:
-        """Take the job that a dead worker was at, rather than wait for its lease."""
+        """Record the failure of a dead worker's job, instead of waiting for its lease."""
         if left.job_id is None:
             return
         error = _cause(code, left, self._settings.job_timeout_s)
@@ -131,13 +131,13 @@ class Supervisor:
             store = open_store(self._settings.database, self._settings.blobs)
             with closing(store):
                 worker_died(store, left.job_id, left.token, error, text, counts=counts)
-        except SceneprintError as trouble:  # its lease will end it
+        except SceneprintError as trouble:  # the lease will expire
             log.error("store unreachable", extra={"error": str(trouble)})
 
 
 def _cause(code: int, left: Left, job_s: float) -> str:
     if left.too_long:
-        return f"its worker ran longer than {job_s:g} s and was stopped"
+        return f"its worker exceeded {job_s:g} s and was stopped"
     if code == -signal.SIGKILL:
         return "its worker was killed by signal 9 (possibly out of memory)"
     if code < 0:
@@ -147,29 +147,28 @@ def _cause(code: int, left: Left, job_s: float) -> str:
 
 @contextmanager
 def _readable(event: threading.Event) -> Iterator[int]:
-    """A descriptor that is readable once the event is set: what waits for processes waits for it.
-
-    The event is set in the end, by whom ever: the thread that waits for it is not left behind.
+    """Yield a descriptor that becomes readable once the event is set, to wait for both processes
+    and the event. The event is always set at the end, so that its thread ends.
     """
-    told, tell = os.pipe()
+    reader, writer = os.pipe()
 
     def pass_on() -> None:
         event.wait()
-        os.close(tell)
+        os.close(writer)
 
-    passing = threading.Thread(target=pass_on, name="stop", daemon=True)
-    passing.start()
+    thread = threading.Thread(target=pass_on, name="stop", daemon=True)
+    thread.start()
     try:
-        yield told
+        yield reader
     finally:
-        if not event.is_set():  # a handler of signals may be about to, and its lock is not its own
+        if not event.is_set():  # the lock of the event is not reentrant for signal handlers
             event.set()
-        passing.join()
-        os.close(told)
+        thread.join()
+        os.close(reader)
 
 
 def run(settings: Settings) -> None:
-    """Keep workers running until SIGINT or SIGTERM."""
+    """Run workers until SIGINT or SIGTERM."""
     stop = threading.Event()
 
     def end(_number: int, _frame: FrameType | None) -> None:

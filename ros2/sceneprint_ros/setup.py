@@ -1,4 +1,4 @@
-"""How colcon builds and installs the package."""
+"""Package definition for colcon."""
 
 from setuptools import setup
 
@@ -14,11 +14,11 @@ setup(
         (f"share/{NAME}/launch", ["launch/relocaliser.launch.py", "launch/nav2.launch.py"]),
         (f"share/{NAME}/config", ["config/relocaliser.yaml"]),
     ],
-    install_requires=["setuptools"],  # and sceneprint-client, which rosdep does not know: README.md
+    install_requires=["setuptools"],  # rosdep does not know sceneprint-client; see README.md
     zip_safe=True,
     maintainer="sceneprint maintainers",
     maintainer_email="maintainers@sceneprint.example",
-    description="Finds where a robot is in a map of sceneprint",
+    description="Localises a robot in a sceneprint map",
     license="Apache-2.0",
     entry_points={"console_scripts": [f"relocaliser = {NAME}.relocaliser_node:main"]},
 )

@@ -1,4 +1,4 @@
-"""The `sceneprint` command: its parser, and the numbers that its options take."""
+"""The `sceneprint` command: its parser, and types for its options."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from sceneprint import __version__
 from sceneprint.errors import SceneprintError
 from sceneprint.process import read_secret_files
 
-#: Exit code of a command that was asked for something it cannot do.
+#: Exit code of a command whose arguments or preconditions are wrong.
 USAGE = 2
 
 
-#: The module of each command in this package and its line in `sceneprint --help`, in the order of
-#: that help. `add_NAME` of the module adds the options, and the docstring of the function that
-#: they are for is the command's description.
+#: Module in this package and line of help of each command, in the order of `sceneprint --help`.
+#: The module has `add_NAME`, which adds the options. The docstring of the function that runs the
+#: command is its description.
 COMMANDS = {
     "serve": ("serve", "run the HTTP service and its workers"),
     "work": ("serve", "run workers without the HTTP service"),
@@ -34,7 +34,7 @@ COMMANDS = {
     "audit": ("admin", "print or export the audit log"),
     "maps": ("inventory", "list, create, edit or delete the maps of a service"),
     "upload": ("upload", "upload depth frames, point clouds or a whole map to a map of a service"),
-    "spool": ("spool", "keep frames on disk while there is no service, and upload them later"),
+    "spool": ("spool", "store frames on disk while no service is reachable, and upload them later"),
     "query": ("query", "find frames of the same place in a map"),
     "localize": ("query", "find the pose of a frame in a map"),
     "queries": ("inventory", "list the latest queries and their outcomes"),
@@ -42,21 +42,21 @@ COMMANDS = {
     "frames": ("inventory", "list frames of a map, download their files, edit metadata"),
     "sessions": ("sessions", "list, rename, tag or delete the sessions of a map"),
     "jobs": ("inventory", "list, retry or cancel the jobs of a service"),
-    "bag": ("bag", "show what a recording of ROS holds"),
+    "bag": ("bag", "show the contents of a ROS recording"),
     "doctor": ("doctor", "check this machine, the data folder and the service"),
     "migrate": ("storage", "create the database's schema, or upgrade it to this version's"),
     "fsck": ("storage", "check and repair database, blobs and indexes, or erase deleted frames"),
     "reencode": ("storage", "switch a map to another model"),
     "snapshot": ("storage", "back up database and blobs as a bundle, while the service runs"),
     "restore": ("storage", "verify a bundle and restore it to a data folder or a database"),
-    "pull": ("storage", "copy maps of a service to this machine, to localise without network"),
+    "pull": ("storage", "copy maps of a service to this machine, to localise without a network"),
     "sign": ("sign", "sign depth frames and point clouds"),
     "completion": ("completion", "print a script that completes commands in a shell"),
 }
 
 
 class Command(NamedTuple):
-    """The function that adds the options of a command, as `MODULE:FUNCTION`, and a line of help."""
+    """A command: the function that adds its options, as `MODULE:FUNCTION`, and a line of help."""
 
     function: str
     line: str
@@ -69,10 +69,10 @@ def own_command(name: str) -> Command:
 
 
 def all_commands() -> dict[str, Command]:
-    """Return all commands by their names, without importing the module of any.
+    """Return all commands by their names without importing their modules.
 
-    Other distributions, such as sceneprint-lab, add theirs as entry points. The package of their
-    modules has the lines of help in its `COMMANDS`.
+    Other distributions, such as sceneprint-lab, add commands as entry points. The package of their
+    modules has the lines of help in `COMMANDS`.
     """
     found = {name: own_command(name) for name in COMMANDS}
     for one in entry_points(group="sceneprint.commands"):
@@ -82,12 +82,12 @@ def all_commands() -> dict[str, Command]:
 
 
 def parser(name: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser of one command, or of all.
+    """Return the parser of one command or of all commands.
 
     Parameters
     ----------
-    name : of the command whose options are known; no module of another one is imported. With None,
-        all options are known, and with a name that is no command's, none
+    name : command whose module is imported and whose options are added; None adds those of all
+        commands, and an unknown name adds none
     """
     top = argparse.ArgumentParser(
         prog="sceneprint",
@@ -95,7 +95,7 @@ def parser(name: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    # to look for entry points takes as long as all the rest of a small command's parser
+    # Searching for entry points takes as long as the rest of a small command's parser.
     found = {name: own_command(name)} if name in COMMANDS else all_commands()
     for each, (function, line) in found.items():
         command = commands.add_parser(each, help=line)
@@ -106,13 +106,13 @@ def parser(name: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; errors are one line on standard error and exit code 2."""
-    for stream in (sys.stdout, sys.stderr):  # file names may hold what a terminal cannot show
+    """Run one command. Errors are printed in one line on standard error, with exit code 2."""
+    for stream in (sys.stdout, sys.stderr):  # file names may contain unprintable characters
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     command = "sceneprint"
     arguments = sys.argv[1:] if arguments is None else arguments
-    # httpx imports rich and click for a command of its own, which takes longer than all else here
+    # httpx imports rich and click for its own command, which takes longer than everything else.
     sys.modules.setdefault("httpx._main", None)  # type: ignore[arg-type]
     try:
         options = parser(arguments[0] if arguments else "").parse_args(arguments)
@@ -121,9 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(options.run(options))
     except SceneprintError as error:
         return _refuse(command, str(error))
-    except UnicodeEncodeError as error:  # of an argument: what we print ourselves is escaped
+    except UnicodeEncodeError as error:  # from an argument; our own output is escaped
         return _refuse(command, f"{error.object!a:.80} is not valid UTF-8. Use another name.")
-    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+    except BrokenPipeError:  # the reader, such as `head`, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
@@ -146,16 +146,16 @@ def _refuse(command: str, message: str) -> int:
     return USAGE
 
 
-# Numbers on the command line, checked where they are read.
+# Types of options.
 
 
 def whole_number(text: str) -> int:
-    """A whole number from 0 up."""
+    """Return an integer of at least 0."""
     return _at_least(text, 0)
 
 
 def positive(text: str) -> int:
-    """A whole number from 1 up."""
+    """Return an integer of at least 1."""
     return _at_least(text, 1)
 
 
@@ -165,12 +165,12 @@ def _at_least(text: str, least: int) -> int:
     except ValueError:
         number = least - 1
     if number < least:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer of at least {least}")
     return number
 
 
 def number_within(text: str, allowed: Callable[[float], bool], what: str) -> float:
-    """Return a number that is allowed, which NaN is not; `what` says which those are."""
+    """Return a number that is allowed; `what` describes allowed numbers. NaN is never allowed."""
     try:
         number = float(text)
     except ValueError:
@@ -186,7 +186,7 @@ def positive_number(text: str) -> float:
 
 
 def metres(text: str) -> float:
-    """A positive distance."""
+    """Return a positive distance in metres."""
     return number_within(text, lambda number: 0 < number <= 1e4, "a distance of up to 10000 m")
 
 
@@ -194,7 +194,7 @@ _SECONDS = {"m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
 
 
 def duration(text: str) -> timedelta:
-    """A duration such as 12h."""
+    """Return a duration such as 12h."""
     found = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a duration such as 12h, 30d or 8w")

@@ -1,4 +1,4 @@
-"""`sceneprint keys` and `audit`: who may use a service, and who changed what."""
+"""`sceneprint keys` and `audit`: keys, tenants and the audit log."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sceneprint.store.audit_log import AuditFilter
     from sceneprint_client.api.admin import AuditLine, Key, MadeKey, Scope
 
-#: Remaining lifetime below which the list warns that a key expires.
+#: Remaining lifetime below which the list warns about the expiry of a key.
 SOON = timedelta(days=7)
 
 
@@ -56,12 +56,12 @@ def add_keys(command: argparse.ArgumentParser) -> None:
     command.add_argument("--scope", choices=SCOPES, help="scope of the new key (default: admin)")
     command.add_argument(
         "--map", action="append", metavar="MAP",
-        help="map that the key is valid for; repeatable (default: all maps and everything outside "
+        help="map for which the key is valid; repeatable (default: all maps and everything outside "
         "of maps)",
     )  # fmt: skip
     command.add_argument(
         "--tenant", metavar="TENANT",
-        help="tenant that the new key belongs to (default: one with the name of the key)",
+        help="tenant of the new key (default: a tenant with the name of the key)",
     )  # fmt: skip
     command.add_argument(
         "--expires", type=duration, metavar="TIME",
@@ -78,10 +78,9 @@ def add_keys(command: argparse.ArgumentParser) -> None:
 
 
 def run_keys(options: argparse.Namespace) -> int:
-    """Create, list, rotate or revoke API keys, and the tenants that they belong to. A service
-    needs keys once it listens beyond its own machine. The secret of a key is printed once; only
-    its hash is stored. The requests of a tenant's keys are limited together, and tenants take
-    turns at the workers.
+    """Create, list, rotate or revoke API keys, and manage their tenants. A service requires keys if
+    it listens beyond its own machine. The secret of a key is printed once; only its hash is stored.
+    All keys of a tenant share its limits, and tenants take turns at the workers.
     """
     from sceneprint.engine.admin.operations import (
         create_key,
@@ -94,9 +93,9 @@ def run_keys(options: argparse.Namespace) -> int:
     own = ("scope", "map", "tenant", "expires")
     foreign = [name for name in own if getattr(options, name) is not None]
     if foreign and options.create is None:
-        raise InvalidRequest(f"--{foreign[0]} applies to a new key only. Use it with --create.")
+        raise InvalidRequest(f"--{foreign[0]} applies only to a new key. Use it with --create.")
     if options.overlap is not None and options.rotate is None:
-        raise InvalidRequest("--overlap applies to a rotation only. Use it with --rotate.")
+        raise InvalidRequest("--overlap applies only to a rotation. Use it with --rotate.")
     with acting_as(COMMAND), open_command_store(settings_of(options)) as store:
         if options.list:
             _print_keys(store)
@@ -131,7 +130,7 @@ def _print_secret(key: MadeKey) -> None:
 
 
 def _print_keys(store: Store) -> None:
-    """Print all keys, and below which of them expire soon."""
+    """Print all keys, followed by a warning about those that expire soon."""
     from sceneprint.engine.admin.operations import list_keys
 
     now, cursor, soon = datetime.now(UTC), None, []
@@ -146,9 +145,7 @@ def _print_keys(store: Store) -> None:
             break
     if soon:
         names = ", ".join(soon)
-        print_error(
-            f"expiring within {SOON.days} days: {names}. Create keys in their place with --create."
-        )
+        print_error(f"expiring within {SOON.days} days: {names}. Create new keys with --create.")
 
 
 def _print_tenants(store: Store) -> None:
@@ -178,9 +175,9 @@ def _key_line(key: Key) -> str:
     return text
 
 
-# `sceneprint audit`: the audit log.
+# `sceneprint audit`.
 
-#: Facility `log audit`, severity `notice`, as RFC 5424 numbers them.
+#: Priority of RFC 5424 for the facility `log audit` and the severity `notice`.
 _PRIORITY = 13 * 8 + 5
 
 
@@ -192,7 +189,9 @@ def add_audit(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument("--map", metavar="MAP", help="only entries about this map")
     command.add_argument(
-        "--action", metavar="TEXT", help="only actions that begin so, such as `key.` or `refused`"
+        "--action",
+        metavar="TEXT",
+        help="only actions with this prefix, such as `key.` or `refused`",
     )
     command.add_argument(
         "--since", type=duration, metavar="DURATION", help="only entries of the last 12h, 30d or 8w"
@@ -222,7 +221,7 @@ def run_audit(options: argparse.Namespace) -> int:
     from sceneprint.store.audit_log import AuditFilter
 
     if options.output is not None and options.format is None:
-        raise InvalidRequest("--output needs --format. Choose jsonl or syslog.")
+        raise InvalidRequest("--output requires --format. Specify jsonl or syslog.")
     since = None if options.since is None else time.time() - options.since.total_seconds()
     wanted = AuditFilter(options.actor, options.map, options.action, since)
     settings = existing_store(options)
@@ -251,14 +250,14 @@ def _newest(audit: Audit, wanted: AuditFilter, left: int) -> Iterator[AuditLine]
 
 def _audit_line(one: AuditLine) -> str:
     who = "no key" if one.actor is None else one.actor
-    whence = "" if one.address is None else f" from {one.address}"
+    origin = "" if one.address is None else f" from {one.address}"
     operation = one.data.get("operation") if one.action == "refused" else None
     what = " ".join(part for part in (one.action, operation, one.map, one.target) if part)
-    return one_line(f"{one.at:%Y-%m-%dT%H:%M:%SZ}  {who}{whence}  {what}")
+    return one_line(f"{one.at:%Y-%m-%dT%H:%M:%SZ}  {who}{origin}  {what}")
 
 
 def _syslog_message(one: AuditLine) -> str:
-    """Return a message of RFC 5424 whose text is the JSON line."""
+    """Return a message of RFC 5424 with the line as JSON."""
     at = one.at.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     host = socket.gethostname() or "-"
     return f"<{_PRIORITY}>1 {at} {host} sceneprint - audit - {one.model_dump_json()}"

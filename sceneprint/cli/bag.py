@@ -1,4 +1,4 @@
-"""`sceneprint bag`, and the options of all commands that read recordings of ROS."""
+"""`sceneprint bag`, and the options of all commands that read ROS recordings."""
 
 from __future__ import annotations
 
@@ -24,44 +24,44 @@ _DEFAULT = RecordingOptions()
 
 
 def add_recording_options(command: argparse.ArgumentParser) -> None:
-    """Add `--topic` and the other options of recordings."""
+    """Add `--topic` and the other options for recordings."""
     group = command.add_argument_group(
-        "recordings of ROS", f"for {titles_of('recording', last='or')} files, and rosbag2 folders"
+        "ROS recordings", f"for {titles_of('recording', last='or')} files, and rosbag2 folders"
     )
     for option, metavar, text in (
         ("--topic", "NAME", "topic of depth images or points (default: the only one)"),
         ("--camera-info", "NAME",
-         "topic of the depth images' camera (default: the one beside them)"),
+         "topic of the depth camera's calibration (default: the one beside the images)"),
         ("--pose-frame", "FRAME",
-         "frame that poses lead to (default: map, else odom, else the topmost frame)"),
+         "parent frame of poses (default: map, else odom, else the topmost frame)"),
         ("--sensor-frame", "FRAME",
-         "frame of the sensor, of points that are in the frame of the world (default: the only one "
-         "at the end of the transforms below it)"),
+         "frame of the sensor, for points in the world frame (default: the only leaf of the "
+         "transforms below it)"),
     ):  # fmt: skip
         group.add_argument(option, metavar=metavar, help=text)
     group.add_argument(
         "--depth-scale", type=positive_number, metavar="UNITS",
-        help="stored units per metre of 16-bit depth images, also of folders (default: as "
-        "intrinsics.json says, else 1000, millimetres)",
+        help="stored units per metre of 16-bit depth images, also in folders (default: as in "
+        "intrinsics.json, else 1000, millimetres)",
     )  # fmt: skip
     for option, default, metavar, text in (
         ("--keyframe-m", _DEFAULT.keyframe_m, "METRES",
-         "take a frame this far from the last one taken; 0 takes every frame (default: 0.3)"),
+         "minimum distance between frames; 0 takes every frame (default: 0.3)"),
         ("--keyframe-deg", _DEFAULT.keyframe_deg, "DEGREES",
-         "or turned by this much (default: 15)"),
+         "or minimum rotation between frames (default: 15)"),
         ("--keyframe-s", _DEFAULT.keyframe_s, "SECONDS",
-         "without poses, take a frame this long after the last one taken (default: 0.5)"),
+         "minimum time between frames without poses (default: 0.5)"),
     ):  # fmt: skip
         group.add_argument(option, type=_from_zero, default=default, metavar=metavar, help=text)
 
 
 def _from_zero(text: str) -> float:
-    return number_within(text, lambda number: 0 <= number < math.inf, "a number from 0 up")
+    return number_within(text, lambda number: 0 <= number < math.inf, "a number of at least 0")
 
 
 @contextmanager
 def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]:
-    """Yield the options of recordings, and show a bar while they are read."""
+    """Yield the options for recordings, and show a progress bar while a recording is read."""
     names = (
         "topic", "camera_info", "pose_frame", "keyframe_m", "keyframe_deg", "keyframe_s",
         "sensor_frame", "depth_scale",
@@ -72,19 +72,19 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
 
 
 def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSequence:
-    """Return a sequence whose depth images have this scale, if one is stated.
+    """Return a sequence with this depth scale, or unchanged if there is none.
 
     Raises
     ------
-    InvalidRequest : it is of points, or of another system, which says the scale itself.
+    InvalidRequest : If the frames are clouds, or their files define the unit.
     """
-    if scale is None or sequence.layout is Layout.RECORDING:  # whose reader knows it
+    if scale is None or sequence.layout is Layout.RECORDING:  # recordings have their own option
         return sequence
     if sequence.layout.is_export or any(one.camera is None for one in sequence.frames):
         raise InvalidRequest(
-            f"--depth-scale is for depth images, and {sequence.name} says its unit itself. Leave "
-            "it out.",
-            (("depth_scale", "not of these files"),),
+            f"--depth-scale is for depth images without a unit, but {sequence.name} defines its "
+            "unit. Omit the option.",
+            (("depth_scale", "not allowed for these files"),),
         )
     frames = tuple(
         replace(one, camera=replace(one.camera, depth_scale=scale))
@@ -97,9 +97,8 @@ def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSeque
 def sequences_at(
     path: Path, options: argparse.Namespace, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences at a path, and print what was left out of a recording.
-
-    Takes `camera` and raises as `find_sequences`.
+    """Return the sequences at a path, and print notes on omitted data. The parameter `camera` and
+    the errors are those of `find_sequences`.
     """
     with recording_options(options) as recording:
         found = find_sequences(path, recording, camera)
@@ -109,7 +108,7 @@ def sequences_at(
 
 
 def print_note(sequence: FrameSequence) -> None:
-    """Print what was left out of a recording on standard error."""
+    """Print the note on omitted data of a recording on standard error."""
     if sequence.note:
         print_error(f"{one_line(str(sequence.folder))}: {sequence.note}")
 
@@ -125,18 +124,18 @@ def add_bag(command: argparse.ArgumentParser) -> None:
 
 
 def run_bag(options: argparse.Namespace) -> int:
-    """List the topics of a recording of ROS (an MCAP file, a rosbag2 folder or database, or a ROS 1
-    bag), and which frames, camera and poses would be taken. Exit code 1 if none.
+    """List the topics of a ROS recording (an MCAP file, a rosbag2 folder or database, or a ROS 1
+    bag), and the frames, camera and poses that an upload would use. The exit code is 1 without any.
     """
     outlines: list[BagOutline] = []
     for path in find_recordings(options.path) or [options.path]:
         with recording_options(options) as recording:
             outlines.append(bag_outline(path, recording))
-        print("\n".join(_lines(path, outlines[-1])))
+        print("\n".join(_outline_lines(path, outlines[-1])))
     return 0 if all(one.sequences for one in outlines) else 1
 
 
-def _lines(path: Path, outline: BagOutline) -> list[str]:
+def _outline_lines(path: Path, outline: BagOutline) -> list[str]:
     seconds = max(outline.end_ns - outline.start_ns, 0) * 1e-9
     count = sum(one.count for one in outline.topics)
     lines = [
@@ -150,7 +149,7 @@ def _lines(path: Path, outline: BagOutline) -> list[str]:
         rate = f"{one.count / seconds:.1f} Hz" if seconds > 0 and one.count > 1 else ""
         uses = frames.get(one.name, "")
         if outline.chosen is not None and one.name == outline.chosen.topic.name:
-            uses += ", taken"
+            uses += ", used"
         if one.name == outline.camera:
             uses = "camera"
         lines.append(
@@ -158,8 +157,8 @@ def _lines(path: Path, outline: BagOutline) -> list[str]:
             f"{rate:>9}  {uses}".rstrip()
         )
     if not outline.sequences:
-        return [*lines, f"nothing would be taken: {one_line(outline.problem)}"]
-    lines += [line for sequence in outline.sequences for line in _taken(sequence)]
+        return [*lines, f"no frame can be used: {one_line(outline.problem)}"]
+    lines += [line for sequence in outline.sequences for line in _sequence_lines(sequence)]
     return lines if outline.range is None else [*lines, str(outline.range)]
 
 
@@ -175,8 +174,7 @@ def _span(outline: BagOutline) -> str:
     return f"{seconds:.1f} s from {start:%Y-%m-%dT%H:%M:%SZ}"
 
 
-def _taken(sequence: FrameSequence) -> list[str]:
-    """Return lines on the frames that would be taken."""
+def _sequence_lines(sequence: FrameSequence) -> list[str]:
     first = sequence.frames[0]
     lines = [sequence.note] if sequence.note else []
     if first.camera is not None:
@@ -193,5 +191,5 @@ def _taken(sequence: FrameSequence) -> list[str]:
         lines.append(f"mounting: at {x:.3f} {y:.3f} {z:.3f} m in {one_line(base.base_frame)}")
     sensors = (one.camera or one.cloud for one in sequence.frames)
     ups = sum(sensor is not None and sensor.up is not None for sensor in sensors)
-    lines.append(f"up: of {ups} of {len(sequence.frames)} frames")
+    lines.append(f"up: known for {ups} of {len(sequence.frames)} frames")
     return lines

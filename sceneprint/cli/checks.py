@@ -1,4 +1,4 @@
-"""Checks of `sceneprint doctor`: their records, and those of a running service."""
+"""Checks of a running service for `sceneprint doctor`."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 
 Verdict = Literal["ok", "note", "WRONG"]
 
-#: Free space below which uploads are soon refused, and below which it is time to look, bytes.
+#: Free space below which uploads are soon refused, and below which a note appears, bytes.
 LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
-#: Largest difference of clocks that is not worth a note, seconds.
+#: Maximum difference of clocks without a note, seconds.
 APART_S = 2.0
 
 
 @dataclass(frozen=True)
 class Check:
-    """What one look has shown.
+    """Result of one check.
 
     Parameters
     ----------
-    verdict : ok; note: something optional is missing, or will be made when it is needed; WRONG:
-        something needed is not there
-    subject : what was looked at
-    text : what is there, and what to do
+    verdict : ok; note: something optional is missing, or is created on first use; WRONG: something
+        required is missing
+    subject : name of what was checked
+    text : the finding and advice
     """
 
     verdict: Verdict
@@ -43,36 +43,36 @@ class Check:
 
 def disk_check(subject: str, free: int) -> Check:
     """Check that a disk with `free` bytes has room for more frames."""
-    text = f"{free / 1e9:.1f} GB free; a frame takes about 0.25 MB"
+    text = f"{free / 1e9:.1f} GB free; a frame takes approximately 0.25 MB"
     if free < LEAST_FREE:
         return Check("WRONG", subject, f"{text}. Free some space, or uploads will be rejected.")
     return Check("note" if free < LITTLE_FREE else "ok", subject, text)
 
 
 def seconds_apart(before: float, there: float, after: float) -> float:
-    """Return by how much two clocks differ at least, seconds.
+    """Return the minimum difference of two clocks, seconds.
 
     Parameters
     ----------
-    before, after : of this clock, when the other one was asked and when its answer was there
-    there : what the other one said
+    before, after : times of this clock before and after the other clock was read
+    there : time of the other clock
     """
     return max(before - there, there - after, 0.0)
 
 
-# Checks of a running service, by its own answers.
+# Checks of a running service, by its responses.
 
-#: Age of a waiting job at which missing workers are a problem, seconds.
+#: Age of a waiting job above which missing workers are an error, seconds.
 LONGEST_S = 60.0
-#: Most names that a line has.
+#: Maximum number of names in a line.
 _MOST_NAMES = 5
 
 
 def service_checks(client: Client, url: str) -> Iterator[Check]:
-    """Yield checks of a service that answers at `url`; SceneprintError if it ceases to answer."""
+    """Yield checks of a service at `url`; raise SceneprintError if it stops responding."""
     try:
         status = client.status()
-    except KeyRequired as error:  # one that is not known
+    except KeyRequired as error:  # the key is unknown
         yield Check("WRONG", "service", f"{url}: {error}")
         return
     except SceneprintError as error:
@@ -84,11 +84,11 @@ def service_checks(client: Client, url: str) -> Iterator[Check]:
     try:
         stats = client.stats(minutes=1)
     except KeyRequired:
-        text = f"{url} requires a key; pass one with --key to see workers, queue and disk"
+        text = f"{url} requires a key; pass one with --key to check workers, queue and disk"
         yield Check("note", "workers", text)
         return
     except Forbidden:
-        text = "the service shows them only to a key for all maps; pass one with --key"
+        text = "the service shows them only to a key for all maps; pass such a key with --key"
         yield Check("note", "workers", text)
     else:
         yield clock_check(before, stats.at.timestamp(), time.time())
@@ -102,7 +102,7 @@ def service_checks(client: Client, url: str) -> Iterator[Check]:
 
 
 def version_check(url: str, status: Status) -> Check:
-    """Check that the service has the version of this command."""
+    """Compare the versions of the service and of this command."""
     text = f"{url} answers, version {status.version}"
     if status.frames is not None:
         text += f", {sum(status.frames.values())} frames"
@@ -112,45 +112,45 @@ def version_check(url: str, status: Status) -> Check:
 
 
 def ready_check(status: Status) -> Check:
-    """Check that the service takes uploads."""
+    """Check that the service accepts uploads."""
     if status.read_only:
-        text = "read-only: it answers queries and rejects uploads. Make its data folder writable"
+        text = "read-only: it answers queries but refuses uploads. Make its data folder writable"
         return Check("note", "ready", f"{text}.")
-    return Check("ok", "ready", "takes uploads and answers queries")
+    return Check("ok", "ready", "accepts uploads and answers queries")
 
 
 def clock_check(before: float, there: float, after: float) -> Check:
-    """Compare the clocks of this machine and of the service, but for the time of the request."""
+    """Compare the clocks of this machine and of the service."""
     apart = seconds_apart(before, there, after)
     text = f"the service's clock differs from this machine's by {apart:.1f} s"
     if apart > APART_S:
-        text += ": times that robots send are wrong. Synchronize both with a time server."
+        text += ": capture times from robots are wrong. Synchronize both with a time server."
         return Check("note", "service clock", text)
     return Check("ok", "service clock", text)
 
 
 def store_check(stats: Stats) -> Check:
-    """Return the sizes of the database, the blobs and the indexes."""
+    """Report the sizes of the database, the blobs and the indexes."""
     sizes = stats.bytes
-    # which database it is, no answer of the service tells
+    # A response does not show the address of the database.
     place = "database" if sizes.database is None else f"database of {sizes.database / 1e6:.1f} MB"
     text = f"{place}, blobs of {sizes.blobs / 1e6:.1f} MB, indexes of {sizes.index / 1e6:.1f} MB"
     return Check("ok", "store", text)
 
 
 def scrub_check(stats: Stats) -> Check:
-    """Return the findings of the scrub, which reads all stored bytes."""
+    """Report the progress of the scrub, which reads all stored bytes."""
     seen = stats.scrub
     if seen is None:
-        return Check("note", "scrub", "no stored bytes have been read to check them yet")
-    ended = "the first is under way"
+        return Check("note", "scrub", "no stored data has been verified yet")
+    ended = "the first pass is running"
     if seen.finished_at is not None:
-        ended = f"the last ended {seen.finished_at:%Y-%m-%dT%H:%M:%SZ}"
+        ended = f"the last pass ended {seen.finished_at:%Y-%m-%dT%H:%M:%SZ}"
     text = f"{seen.blobs} blobs of {seen.bytes / 1e6:.1f} MB read, {ended}"
     if seen.damaged:
         text += (
-            f"; {seen.damaged} lost or damaged: derived data is made again, and `sceneprint fsck` "
-            "names uploads to send again"
+            f"; {seen.damaged} lost or damaged: derived data is rebuilt, and `sceneprint fsck` "
+            "lists uploads to send again"
         )
         return Check("note", "scrub", text)
     return Check("ok", "scrub", f"{text}, none damaged")
@@ -162,27 +162,27 @@ def worker_check(stats: Stats, *, read_only: bool) -> Check:
     busy = sum(one.job_id is not None for one in workers)
     if workers or read_only:
         run = "1 worker runs" if len(workers) == 1 else f"{len(workers)} workers run"
-        return Check("ok", "workers", f"{run}, {busy} at a job")
-    text = "none runs, so frames are stored, but not signed. Start some with `sceneprint work`"
+        return Check("ok", "workers", f"{run}, {busy} busy")
+    text = "none runs, so frames are stored but not signed. Start workers with `sceneprint work`"
     if max(stats.oldest_waiting_s.values(), default=0.0) > LONGEST_S:
-        return Check("WRONG", "workers", f"{text}, and see their log.")
+        return Check("WRONG", "workers", f"{text}, and read their log.")
     return Check("note", "workers", f"{text}, or wait if the service has just started.")
 
 
 def queue_check(stats: Stats) -> Check:
-    """Count the jobs that wait and those that failed for good."""
+    """Count the jobs that wait and those that have failed permanently."""
     jobs = "1 job" if stats.waiting == 1 else f"{stats.waiting} jobs"
     text = f"{jobs} waiting, {stats.jobs.get('running', 0)} running"
     if stats.oldest_waiting_s:
         text += f", the oldest for {max(stats.oldest_waiting_s.values()):.0f} s"
     dead = stats.jobs.get("dead", 0)
     if dead:
-        text += f"; {dead} failed for good: `sceneprint jobs --state dead` says why"
+        text += f"; {dead} failed in every attempt: `sceneprint jobs --state dead` shows why"
     return Check("note" if dead else "ok", "queue", text)
 
 
 def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
-    """List the models of the maps; an older model of a preset is a note."""
+    """List the models of the maps, with a note about outdated presets."""
     presets = {one.name: one for one in models if one.preset}
     by_model: dict[str, list[str]] = defaultdict(list)
     older = []
@@ -197,8 +197,8 @@ def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
         name, preset = older[0]
         count = "1 map has" if len(older) == 1 else f"{len(older)} maps have"
         text += (
-            f"; {count} an older model than this version brings: `sceneprint reencode {name} "
-            f"--model {preset.name}` changes it"
+            f"; {count} an older model than this version contains: `sceneprint reencode {name} "
+            f"--model {preset.name}` updates it"
         )
     return Check("note" if older else "ok", "models", text)
 

@@ -1,4 +1,4 @@
-"""`sceneprint completion`: a script that completes commands and options in a shell."""
+"""`sceneprint completion`: a script for the completion of commands and options in a shell."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def add_completion(command: argparse.ArgumentParser) -> None:
 
 
 def run_completion(options: argparse.Namespace) -> int:
-    """Print a script that completes commands and options. Put `source <(sceneprint completion
-    bash)` into ~/.bashrc, or the same with zsh into ~/.zshrc.
+    """Print a script that completes commands and options. Add `source <(sceneprint completion
+    bash)` to ~/.bashrc, or the same with zsh to ~/.zshrc.
     """
     found = [(name, one) for name, _, one in subcommands(parser())]
-    # the kinds of a command come before the command, whose pattern they match as well
+    # Subcommands come first, because the pattern of their command also matches them.
     cases = [f'    "{name} "*) words="{" ".join(_words(one))}" ;;' for name, one in found[::-1]]
     commands = " ".join(name for name, _ in found if " " not in name)
     if options.shell == "zsh":
@@ -42,7 +42,7 @@ def run_completion(options: argparse.Namespace) -> int:
 def subcommands(
     above: argparse.ArgumentParser,
 ) -> Iterator[tuple[str, str, argparse.ArgumentParser]]:
-    """Yield the name, the line of help and the parser of each command, and of its kinds."""
+    """Yield the name, the line of help and the parser of each command and subcommand."""
     for action in above._actions:
         if isinstance(action, argparse._SubParsersAction):
             lines = {one.dest: one.help or "" for one in action._choices_actions}

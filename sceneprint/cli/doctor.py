@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sceneprint.store import Database
     from sceneprint.store.database import SchemaRange
 
-# Checks of the database, which is only ever read.
+# Checks of the database, which is only read.
 
 _CHECK = "Check SCENEPRINT_DATABASE_URL, or the data folder."
 
@@ -55,10 +55,10 @@ def database(settings: Settings) -> Check:
 
     try:
         url = make_url(settings.database)
-    except ValueError:  # what looks like the port may be half of a password, and is not shown
+    except ValueError:  # the text after the colon may be part of a password, so it is not shown
         return _wrong(
             "SCENEPRINT_DATABASE_URL: the port is not a number. Correct it; in a password, "
-            "write @ : and / as %40 %3A and %2F."
+            "write @, : and / as %40, %3A and %2F."
         )
     except SQLAlchemyError:
         return _wrong(f"cannot be opened (not an SQLAlchemy URL). {_CHECK}")
@@ -79,7 +79,7 @@ def database(settings: Settings) -> Check:
 
 
 def _sqlite_file(settings: Settings, url: URL) -> Check:
-    """Check a file, opened so that SQLite writes nothing, not even beside it."""
+    """Check an SQLite file, opened in a way that writes nothing."""
     from sqlalchemy import NullPool, create_engine
 
     from sceneprint.store.database import schema_range_of
@@ -88,15 +88,15 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
     if path is None:
         return _wrong("is an in-memory database, which processes cannot share. Name a file.")
     if not path.exists():
-        # the data folder is created with the file, another one is not
+        # Only the data folder is created automatically.
         if settings.database_url is not None and not path.parent.is_dir():
             return _wrong(f"the folder of {path} does not exist. Create it, or name another file.")
         return Check("ok", "database", f"none yet; the first use creates {path}")
     wal, shm = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
-    if wal.exists() and not shm.exists():  # reading it would create the latter
+    if wal.exists() and not shm.exists():  # reading it would create the shm file
         text = f"{path} was not closed cleanly; the next use recovers it"
         return Check("note", "database", text)
-    # without a log nobody writes, and the file is complete; with one, its index is not renewed
+    # Without a write-ahead log the file is complete; with one, the shared memory is only read.
     how = "readonly_shm=1" if wal.exists() else "immutable=1"
 
     def connect() -> sqlite3.Connection:
@@ -108,7 +108,7 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
             found = _schema_check(schema_range_of(connection), repr(engine.url))
     finally:
         engine.dispose()
-    # a folder that is not writable is a finding of its own
+    # A folder that is not writable is reported by its own check.
     writable = os.access(path, os.W_OK) or not os.access(path.parent, os.W_OK)
     if found.verdict != "WRONG" and not writable:
         return _wrong(
@@ -138,7 +138,7 @@ def _schema_check(found: SchemaRange | None, place: str) -> Check:
     if found.revision == head:
         return Check("ok", "database", shown)
     if found.allows(head):
-        text = f"{shown} of a later version, which this one may still use. Upgrade this one too."
+        text = f"{shown} of a later version, which this version can still use. Upgrade this one."
         return Check("note", "database", text)
     return _wrong(
         f"{shown}: it was written by a later version of sceneprint. Use that version, or another "
@@ -150,11 +150,11 @@ def _wrong(text: str) -> Check:
     return Check("WRONG", "database", text)
 
 
-# Checks of object stores: a small object is written, read and removed.
+# Checks of object stores, which write, read and delete a small object.
 
 
 def object_stores(settings: Settings) -> Iterator[Check]:
-    """Yield checks of the object stores of blobs and of indexes, if there are any."""
+    """Yield checks of the configured object stores of blobs and of indexes."""
     from sceneprint.store.blobs.object_client import VARIABLES, check_objects, open_objects
 
     blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()
@@ -172,13 +172,13 @@ def object_stores(settings: Settings) -> Iterator[Check]:
             continue
         begin = VARIABLES[url.partition(":")[0].lower()]
         of = f", with credentials from {begin}... in the environment" if begin else ""
-        text = f"{objects.url}: written, read and removed in {seconds:.2f} s{of}"
+        text = f"{objects.url}: written, read and deleted in {seconds:.2f} s{of}"
         yield Check("ok", subject, text)
 
 
 # Checks of a database server, which is only read.
 
-#: Settings that an acknowledged commit needs to survive the loss of power.
+#: Settings without which acknowledged commits do not survive a loss of power.
 _DURABLE = ("fsync", "full_page_writes")
 _SETTINGS = """
 SELECT current_setting('server_version') AS version,
@@ -196,7 +196,7 @@ SELECT current_setting('server_version') AS version,
 
 
 def server(settings: Settings) -> Iterator[Check]:
-    """Yield checks of the database server; none of SQLite."""
+    """Yield checks of the database server; SQLite has none."""
     from sceneprint.store.database import reach_database
 
     database = reach_database(settings.database)
@@ -219,14 +219,14 @@ def _server_settings(database: Database, settings: Settings) -> Iterator[Check]:
         after = time.time()
     text = f"PostgreSQL {values['version']}, {values['encoding']}"
     if values["standby"]:
-        text += "; it is a read-only standby. Name the primary."
+        text += "; it is a read-only standby. Use the address of the primary."
         yield Check("WRONG", "database server", text)
         return
     yield Check("ok", "database server", text)
     yield _durability(values)
     yield _connections(values, settings)
     apart = seconds_apart(before, there, after)
-    text = f"the server's clock differs from this host's by {apart:.1f} s"
+    text = f"the server's clock differs from this machine's by {apart:.1f} s"
     if apart > APART_S:
         verdict: Verdict = "WRONG" if apart > settings.job_lease_s else "note"
         yield Check(verdict, "clock", f"{text}. Synchronize both with a time server.")
@@ -238,7 +238,7 @@ def _durability(values: Mapping[str, object]) -> Check:
     off = [name for name in _DURABLE if values[name] == "off"]
     if off:
         text = (
-            f"{', '.join(off)} off: acknowledged data may be lost when the server's host fails. "
+            f"{', '.join(off)} off: acknowledged data may be lost if the server's host fails. "
             "Turn it on."
         )
         return Check("WRONG", "durability", text)
@@ -247,11 +247,9 @@ def _durability(values: Mapping[str, object]) -> Check:
         text += "; synchronous_commit is local, so commits do not wait for a standby. Turn it on."
         return Check("note", "durability", text)
     if values["standbys"]:
-        text += f", and of the host: commits wait for a standby ({values['standbys']})"
+        text += f", and loss of the host: commits wait for a standby ({values['standbys']})"
     else:
-        text += (
-            "; commits do not wait for a standby, so the last ones may be lost with the host's disk"
-        )
+        text += "; commits do not wait for a standby, so the last ones are lost if the disk fails"
     if values["checksums"] == "off":
         text += "; data_checksums are off, so a damaged page may go unnoticed"
         return Check("note", "durability", text)
@@ -262,8 +260,8 @@ def _connections(values: Mapping[str, object], settings: Settings) -> Check:
     from sceneprint.store.postgres.connection import MOST
 
     most, taken = int(str(values["connections"])), int(str(values["taken"]))
-    # a worker takes one for its work, one for its lease, one to be woken, and three that last for
-    # locks of blobs and indexes; a service as many as it answers at once, and those that last
+    # A worker uses one for its work, one for its lease, one for wake-ups and three for locks of
+    # blobs and indexes. A service uses one per concurrent request and three permanent ones.
     wanted = (
         6 * settings.workers
         + min(settings.concurrent_requests + settings.queued_requests, MOST)
@@ -280,9 +278,9 @@ def _connections(values: Mapping[str, object], settings: Settings) -> Check:
 
 # Checks of this machine, which change nothing.
 
-#: The oldest SQLite that the store can use (UPDATE ... RETURNING).
+#: Oldest SQLite version that the store can use (UPDATE ... RETURNING).
 OLDEST_SQLITE = (3, 35, 0)
-#: System libraries that open3d loads, and the Debian packages that contain them.
+#: System libraries that open3d loads, and their Debian packages.
 OPEN3D_LIBRARIES = {
     "libGL.so.1": "libgl1",
     "libEGL.so.1": "libegl1",
@@ -294,7 +292,7 @@ OPEN3D_LIBRARIES = {
 
 def machine(settings: Settings) -> Iterator[Check]:
     """Yield checks of this machine, and of the folders and the database of the settings."""
-    version = ".".join(map(str, sys.version_info[:3]))  # an older than 3.11 cannot install this
+    version = ".".join(map(str, sys.version_info[:3]))
     yield Check("ok", "python", f"{version}, sceneprint {__version__}")
     yield _sqlite_version()
     yield _kernels()
@@ -325,17 +323,17 @@ def _kernels() -> Check:
         return Check("ok", "kernels", f"compiled, in {folder}")
     if folder and _may_write(Path(folder)):
         return Check(
-            "note", "kernels", "not compiled yet; the first use compiles for about half a minute"
+            "note", "kernels", "not compiled yet; the first use compiles for half a minute"
         )
     text = (
-        f"{folder or 'no folder'} is not writable, so every process compiles for about a minute. "
+        f"{folder or 'no folder'} is not writable, so every process compiles for a minute. "
         "Set NUMBA_CACHE_DIR to a writable folder."
     )
     return Check("note", "kernels", text)
 
 
 def _decoders(settings: Settings) -> Check:
-    """Start a decoder, and check how it is confined."""
+    """Start a decoder, and check its confinement."""
     if settings.decoders == 0:
         text = "uploads are decoded in service and workers (SCENEPRINT_DECODERS is 0)"
         return Check("note", "decoders", text)
@@ -348,7 +346,7 @@ def _decoders(settings: Settings) -> Check:
     finally:
         pool.close()
     if found is None:
-        text = "none can be started, so every upload gets 503; the log of the service says why"
+        text = "no decoder can be started, so uploads get 503; the log of the service says why"
         return Check("WRONG", "decoders", text)
     if not found.seccomp:
         text = f"{found.text}. This kernel has no seccomp filter: confine the service itself"
@@ -381,25 +379,25 @@ def _folder(data_dir: Path) -> Iterator[Check]:
     there = nearest_folder(data_dir)
     why = _unwritable(data_dir)
     if why == errno.ENOSPC:
-        text = f"{data_dir} is on a full disk. Free some space: until then, uploads fail."
+        text = f"{data_dir} is on a full disk, so uploads fail. Free some space."
         yield Check("WRONG", "data folder", text)
     elif why is not None and (data_dir / "sceneprint.db").is_file():
         text = (
             f"{data_dir} is read-only ({os.strerror(why)}): `sceneprint serve` can answer "
-            "queries from it but cannot accept uploads. Make it writable, or name another with "
-            "--data."
+            "queries from it but cannot accept uploads. Make it writable, or use another folder "
+            "with --data."
         )
         yield Check("WRONG", "data folder", text)
     elif why is not None:
         text = (
-            f"{data_dir} is not writable ({os.strerror(why)}). Check its permissions, or name "
-            "another with --data."
+            f"{data_dir} is not writable ({os.strerror(why)}). Check its permissions, or use "
+            "another folder with --data."
         )
         yield Check("WRONG", "data folder", text)
     else:
         text = f"{data_dir} is writable" if there == data_dir else f"{data_dir} can be created"
         if data_dir == default_data_dir():
-            text += ": the default, --data names another"
+            text += ", the default of --data"
         yield Check("ok", "data folder", text)
     mode = public_mode(data_dir)
     if mode is not None:
@@ -412,9 +410,9 @@ def _folder(data_dir: Path) -> Iterator[Check]:
 
 
 def _open3d() -> Check:
-    needed = "only reconstructions and baselines need it"
+    purpose = "only reconstructions and baselines need it"
     if find_spec("open3d") is None:
-        return Check("note", "open3d", f"not installed; {needed}: pip install open3d")
+        return Check("note", "open3d", f"not installed; {purpose}: pip install open3d")
     missing = []
     for library, package in OPEN3D_LIBRARIES.items():
         try:
@@ -423,7 +421,7 @@ def _open3d() -> Check:
             missing.append(package)
     if missing:
         packages = " ".join(missing)
-        text = f"lacks system libraries; {needed}: apt-get install {packages}"
+        text = f"lacks system libraries; {purpose}: apt-get install {packages}"
         return Check("note", "open3d", text)
     return Check("ok", "open3d", "installed, with its system libraries")
 
@@ -434,10 +432,10 @@ def _may_write(folder: Path) -> bool:
 
 
 def _unwritable(folder: Path) -> int | None:
-    """Return the `errno` of creating a file there; None if it succeeds."""
-    try:  # permissions do not show read-only disks, and do not bind root; leaves no trace
+    """Return the `errno` of creating a file in a folder; None if it succeeds."""
+    try:  # permissions do not show read-only disks, and do not apply to root
         with tempfile.TemporaryFile(dir=nearest_folder(folder)) as file:
-            file.write(b"x")  # a full disk may still have room for a name
+            file.write(b"x")  # a full disk may still have room for an empty file
             file.flush()
         return None
     except OSError as error:
@@ -452,12 +450,12 @@ def add_doctor(command: argparse.ArgumentParser) -> None:
 
 
 def run_doctor(options: argparse.Namespace) -> int:
-    """Check this machine, the data folder and the service, and suggest fixes. With --url alone, ask
-    that service: version, store, workers, queue, disk, clock and models. Changes nothing. Exit code
-    2 if something required is missing; missing optional parts are noted.
+    """Check this machine, the data folder and the service, and suggest fixes. With --url alone,
+    check only that service: version, store, workers, queue, disk, clock and models. Nothing is
+    changed. The exit code is 2 if something required is missing; optional parts are only noted.
     """
     settings, wrong = settings_of(options), 0
-    # with the address of a service alone, this machine does not matter
+    # With only the address of a service, this machine does not matter.
     stores = {"data_dir", "database_url", "blob_url"} & settings.model_fields_set
     here = machine(settings) if options.url is None or stores else ()
     for finding in (*here, *_service(options)):
@@ -468,20 +466,20 @@ def run_doctor(options: argparse.Namespace) -> int:
 
 
 def _service(options: argparse.Namespace) -> Iterator[Check]:
-    """Yield checks of the service; that none runs is wrong only if the options name one."""
+    """Yield checks of the service. A missing service is wrong only if the options name it."""
     from sceneprint_client import Client
 
     url = options.url or DEFAULT_URL
     try:
         with Client(url, options.key) as client:
             if not client.healthy():
-                text = f"no service answers at {url}; `sceneprint serve` starts one"
+                text = f"no service responds at {url}; `sceneprint serve` starts one"
                 yield Check("WRONG" if options.url else "note", "service", text)
             elif options.url is None:
                 found = version_check(url, client.status())
                 text = (
-                    f"{found.text}. Its data folder may be another: `sceneprint doctor --url "
-                    f"{url}` asks the service itself"
+                    f"{found.text}. It may use another data folder: `sceneprint doctor --url "
+                    f"{url}` checks the service itself"
                 )
                 yield Check(found.verdict, "service", text)
             else:

@@ -1,7 +1,7 @@
-"""Files that `sceneprint upload` sends whole: archives of sequences, and maps that are one file.
+"""Uploads of whole files: archives of sequences, and maps in one file.
 
 files  --import_archives-->  frames, counted
-files  --import_maps-->  views of each, and where other views are found
+files  --import_maps-->  rendered views, and the result of test views
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sceneprint_client.api import Job, Progress
     from sceneprint_client.api.base import Direction
 
-#: Seconds without a frame signed after which no worker is believed to be there.
+#: Time without progress after which no worker seems to be running, seconds.
 STALL_S = 120.0
 
 
@@ -47,7 +47,7 @@ class Patience:
 
     Parameters
     ----------
-    limit_s : seconds from now; None: as long as it moves
+    limit_s : time limit, seconds; None: no limit while there is progress
     """
 
     def __init__(self, limit_s: float | None) -> None:
@@ -56,16 +56,16 @@ class Patience:
 
     @property
     def left_s(self) -> float:
-        """Return the seconds that are left, unless something moves meanwhile."""
+        """Remaining time without further progress, seconds."""
         until = self._moved + STALL_S if self._until is None else self._until
         return max(until - time.monotonic(), 0.0)
 
     def note_progress(self) -> None:
-        """Note that something moved."""
+        """Restart the limit of time without progress."""
         self._moved = time.monotonic()
 
     def is_over(self, client: Client) -> bool:
-        """Return whether to give up; a service that still starts is waited for."""
+        """Return whether to give up. A service that is still starting extends the limit."""
         if self.left_s > 0:
             return False
         if self._until is None and is_starting(client):
@@ -75,29 +75,29 @@ class Patience:
 
 
 def why_unsigned(client: Client, jobs: Iterable[str]) -> str:
-    """Return why jobs have not ended, by what the service counts now."""
+    """Return why jobs have not ended, from the statistics of the service."""
     from sceneprint_client.api import JobState
 
     try:
         stats = client.stats(minutes=1)
         own = sum(job.state is JobState.QUEUED for job in client.wait(jobs, timeout_s=0.0))
-    except SceneprintError:  # a key for some maps alone may not see them
+    except SceneprintError:  # the key may not read all maps
         return waiting_reason(None)
     return waiting_reason(stats, own)
 
 
 def is_starting(client: Client) -> bool:
-    """Return whether the service still compiles kernels, so that no worker has begun."""
+    """Return whether the service still compiles kernels, before any worker runs."""
     try:
         client.status()
     except Busy:
-        print_error("the service compiles its kernels, once after an installation")
+        print_error("the service is compiling its kernels, once after an installation")
         return True
     return False
 
 
 def _options_of(options: argparse.Namespace, file: str, **more: Any) -> ImportOptions:
-    """Return the options of the import of a file; InvalidRequest where they do not fit it."""
+    """Return the options for importing a file; raise InvalidRequest if they are not valid."""
     return checked(
         ImportOptions, f"The metadata of {file}", robot=options.robot, session=options.session,
         tags=options.tag, parent_frame=options.parent_frame, with_poses=not options.no_pose,
@@ -107,25 +107,25 @@ def _options_of(options: argparse.Namespace, file: str, **more: Any) -> ImportOp
     )  # fmt: skip
 
 
-# Archives given to `sceneprint upload`: sent whole, and waited for until all frames are taken.
+# Archives, sent whole; their imports are awaited.
 
-#: What the bar calls the phases of the import of a map.
+#: Descriptions of the phases of a map import in the progress bar.
 _PHASES = {
     "read": "read", "choose": "choose viewpoints", "render": "render views", "sign": "sign views",
-    "test": "look up other views",
+    "test": "query test views",
 }  # fmt: skip
-#: Bytes that tell whether a file is an archive, and seconds between two looks at an import.
+#: Number of bytes that identify an archive, and interval of the checks of an import, seconds.
 _HEAD, _PAUSE_S = 512, 2.0
 
 
 def is_archive_file(path: Path) -> bool:
-    """Return whether a path is a file that begins as an archive does, and no export with frames."""
+    """Return whether a path is an archive file, and not an export that contains frames."""
     try:
         if not path.is_file() or is_export(path):
             return False
         with path.open("rb") as file:
             return is_archive(file.read(_HEAD))
-    except OSError:  # whoever reads it says so
+    except OSError:  # reported when the file is read
         return False
 
 
@@ -134,13 +134,15 @@ def import_archives(
 ) -> bool:
     """Send archives and count their frames; return whether all imports ended in time."""
     for path in archives:
-        said = _options_of(options, path.name, name=path.name.partition(".")[0][:64] or "import")
+        import_options = _options_of(
+            options, path.name, name=path.name.partition(".")[0][:64] or "import"
+        )
         with path.open("rb") as file:
-            job = client.import_archive(options.map, file, said)
+            job = client.import_archive(options.map, file, import_options)
         if options.no_wait:
             print(f"{path.name}: received; import {job.job_id} adds its frames")
             continue
-        job = _waited(client, options, path.name, job)
+        job = _wait_for_import(client, options, path.name, job)
         _count(client, options.map, job, tally)
         if not job.state.over:
             _report_late(client, options, path.name, job)
@@ -156,13 +158,13 @@ def import_archives(
 
 def _report_late(client: Client, options: argparse.Namespace, name: str, job: Job) -> None:
     print_error(
-        f"{name}: import {job.job_id} did not end within {options.timeout or STALL_S:g} s, and "
-        f"goes on when a worker is free. {why_unsigned(client, [job.job_id])}"
+        f"{name}: import {job.job_id} did not end within {options.timeout or STALL_S:g} s; it "
+        f"continues when a worker is free. {why_unsigned(client, [job.job_id])}"
     )
 
 
-def _waited(client: Client, options: argparse.Namespace, name: str, job: Job) -> Job:
-    """Return an import once it is over, or as it is when nothing moved for long."""
+def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job: Job) -> Job:
+    """Return the job of an import when it has ended or the time limit is over."""
     from sceneprint_client.api import JobState
 
     patience, seen = Patience(options.timeout), job.progress
@@ -171,7 +173,7 @@ def _waited(client: Client, options: argparse.Namespace, name: str, job: Job) ->
             client.wait([job.job_id], timeout_s=_PAUSE_S)
             job = client.job(job.job_id)
             if job.progress is not None:
-                _show(bar, name, job.progress)
+                _show_progress(bar, name, job.progress)
             if job.progress != seen or job.state == JobState.RUNNING:
                 seen = job.progress
                 patience.note_progress()
@@ -180,8 +182,8 @@ def _waited(client: Client, options: argparse.Namespace, name: str, job: Job) ->
     return job
 
 
-def _show(bar: tqdm[Any], name: str, progress: Progress) -> None:
-    """Let a bar show how far an import has come; of a map, in its phase."""
+def _show_progress(bar: tqdm[Any], name: str, progress: Progress) -> None:
+    """Show the progress of an import in a bar; for a map, the progress of its phase."""
     done, total = progress.done, progress.total
     if progress.phase is not None:
         steps = {"render": progress.rendered, "sign": progress.signed, "test": progress.tested}
@@ -201,33 +203,33 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
             tally.refuse(item.name, "refused" if item.problem is None else item.problem.detail)
             continue
         state = FrameState.RECEIVED
-        if item.status == 200:  # it may be over long since
+        if item.status == 200:  # the frame may have been signed long ago
             try:
                 state = client.frame(map_name, item.frame_id).state
-            except UnknownFrame:  # deleted meanwhile
+            except UnknownFrame:  # it was deleted meanwhile
                 continue
         added = Added(frame_id=item.frame_id, job_id=item.job_id, state=state, reason=None)
         tally.count(item.name, added, item.status == 202)
 
 
-# Maps that are one file: `sceneprint upload --as-map`.
+# Maps in one file: `sceneprint upload --as-map`.
 
-#: Units of a metre by their names.
+#: Number of units per metre.
 _UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
-#: Bytes of a file of points that are too many for one scan.
+#: Size of a file of points above which it is probably not one scan, bytes.
 _SCAN_BYTES = 24 << 20
-#: Weak areas that are printed.
+#: Maximum number of printed weak areas.
 _MOST_WEAK = 5
 
 
 def axis_or_up(text: str) -> Axis | list[float]:
-    """Return an axis of a file, or up in the axes of a sensor."""
+    """Return an axis of a file, or the up vector in the axes of a sensor."""
     axis = next((one for one in get_args(Axis) if one == text), None)
     return up_of(text) if axis is None else axis
 
 
 def _fields(read: Callable[[str], dict[str, float]]) -> Callable[[str], dict[str, float]]:
-    """Return a function that reads comma-separated numbers as argparse wants it."""
+    """Return a parser of comma-separated numbers that raises errors for argparse."""
 
     def fields(text: str) -> dict[str, float]:
         try:
@@ -244,80 +246,80 @@ def add_map_options(command: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--as-map", action="store_true",
         help=f"PATH is a cloud or mesh of a whole place ({titles_of('map', last='or')}): "
-        "views of it are rendered, and become the frames of the map. --up takes the axis of the "
-        "file that points up: x, y, z or, as in --up=-y, its opposite",
+        "rendered views of it become frames of the map. --up is the axis of the file that points "
+        "up: x, y, z, or the opposite as in --up=-y",
     )  # fmt: skip
     group.add_argument(
         "--height", type=positive_number, action="append", default=[], metavar="M",
-        help="height of the robot's sensor above the floor, metres; repeatable (default: some "
-        "that are usual for such a sensor)",
+        help="height of the robot's sensor above the floor, metres; repeatable (default: usual "
+        "heights of such sensors)",
     )  # fmt: skip
     group.add_argument(
         "--units", type=lambda text: _UNITS.get(text) or positive_number(text), metavar="N",
-        help="unit of the file: m, cm, mm, ft, or how many are a metre (default: as the file "
-        "says, else estimated)",
+        help="unit of the file: m, cm, mm, ft, or the number of units per metre (default: the "
+        "file's own, else an estimate)",
     )  # fmt: skip
     group.add_argument(
         "--offset", type=_fields(offset_fields), metavar="X,Y,Z",
-        help="metres that are taken off the coordinates of the file (default: none, or where it "
-        "lies more than a kilometre from its origin, its middle)",
+        help="metres to subtract from the coordinates of the file (default: none, but the centre "
+        "of a file that is more than a kilometre from its origin)",
     )  # fmt: skip
     group.add_argument(
         "--camera", type=_fields(camera_fields), metavar="FX,FY,CX,CY,WIDTH,HEIGHT",
-        help="depth camera of the robot, pixels (default: a usual one)",
+        help="depth camera of the robot, pixels (default: a typical one)",
     )  # fmt: skip
 
 
 def check_map_options(options: argparse.Namespace) -> None:
-    """See that options are of the kind of upload; InvalidRequest where they are not."""
+    """Raise InvalidRequest if the options do not match the kind of upload."""
     is_whole = options.as_map or any(map(is_archive_file, options.paths))
     for name, kind, place in (
         ("depth_scale", "depth images and recordings",
-         'it as "depth_scale" into intrinsics.json'),
+         'the value as "depth_scale" into intrinsics.json'),
         ("row", ".bin files", 'the names as "row" into clouds.json'),
     ):  # fmt: skip
         if getattr(options, name) is not None and is_whole:
             raise InvalidRequest(
-                f"--{name.replace('_', '-')} is for {kind}, and not for a map or an archive. In an "
+                f"--{name.replace('_', '-')} is for {kind}, not for maps and archives. In an "
                 f"archive, put {place}.",
-                ((name, "of a map or an archive"),),
+                ((name, "not allowed for a map or an archive"),),
             )
     if options.as_map:
         folders = [str(path) for path in options.paths if path.is_dir()]
         if folders:
             raise DatasetError(
-                f"{folders[0]}: A map is one file, and this is a folder. Name the file, or leave "
-                "--as-map out to upload the frames in it."
+                f"{folders[0]}: a map is one file, but this is a folder. Specify the file, or omit "
+                "--as-map to upload the frames in the folder."
             )
         return
     for name in ("height", "units", "offset", "camera"):
         if getattr(options, name):
             raise InvalidRequest(
-                f"--{name} is for a map that is one file. Add --as-map, or leave it out.",
+                f"--{name} is only for maps in one file. Add --as-map, or omit the option.",
                 ((name, "without --as-map"),),
             )
     if isinstance(options.up, str):
         raise InvalidRequest(
-            f"--up {options.up} is an axis of a file, for --as-map. Give three numbers: up in the "
-            "axes of the sensor.",
+            f"--up {options.up} is an axis of a file, for --as-map. Specify three numbers: the up "
+            "vector in the axes of the sensor.",
             (("up", "an axis without --as-map"),),
         )
 
 
 def import_maps(client: Client, options: argparse.Namespace) -> int:
-    """Send maps and say what became of each; returns 2 where one was not imported."""
+    """Send maps and print their results; return 2 if an import failed."""
     code = 0
     for path in options.paths:
-        said = _options_of(
+        import_options = _options_of(
             options, path.name, **{"as": "map"}, name=path.name[-64:].lstrip("."),
             heights=options.height, units_per_metre=options.units, offset=options.offset,
             camera=options.camera,
         )  # fmt: skip
-        job = client.import_map(options.map, path, said)
+        job = client.import_map(options.map, path, import_options)
         if options.no_wait:
             print(f"{path.name}: received; import {job.job_id} renders its views")
             continue
-        job = _waited(client, options, path.name, job)
+        job = _wait_for_import(client, options, path.name, job)
         if not job.state.over:
             _report_late(client, options, path.name, job)
             return 2
@@ -330,32 +332,32 @@ def import_maps(client: Client, options: argparse.Namespace) -> int:
 
 
 def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
-    """Say in sentences what became of a map that is one file."""
-    how = {"stated": "as you said", "file": "from the file", "estimated": "estimated"}
+    """Return the lines that describe the result of a map import."""
+    how = {"stated": "as specified", "file": "from the file", "estimated": "estimated"}
     unit = next((u for u, n in _UNITS.items() if math.isclose(n, result.units_per_metre)), None)
     unit = unit or f"{result.units_per_metre:g} per metre"
     r = result
     refused = f" {r.refused} views were refused." if r.refused else ""
     lines = [
         f"{name}: {r.views} views are in map {map_name} and see {r.seen:.0%} of its surface. Their "
-        f"poses lead to {r.parent_frame}.{refused}",
+        f"parent frame is {r.parent_frame}.{refused}",
         f"units: {unit} ({how.get(r.units_from, r.units_from)}); up: {_axis(r.up)} "
         f"({how.get(r.up_from, r.up_from)})",
     ]
     if any(offset := (r.offset.x, r.offset.y, r.offset.z)):
-        stated = ",".join(f"{x:.12g}" for x in offset)  # as --offset takes it
-        lines.append(f"offset: {stated} m; add it to a pose for the file's coordinates")
+        stated = ",".join(f"{x:.12g}" for x in offset)  # in the format of --offset
+        lines.append(f"offset: {stated} m; add it to poses to get coordinates of the file")
     lines += r.notes
     if r.coverage is not None:
         lines.append(
-            f"Of {r.tested} other views of this file {r.coverage:.0%} are found in the map: "
+            f"Of {r.tested} test views of this file, {r.coverage:.0%} are found in the map: "
             f"{r.found} found, {r.ambiguous} ambiguous, {r.not_found} not found, {r.wrong} wrong. "
-            "Real frames are found less often: try some."
+            "Real frames are found less often; try some."
         )
     for area in r.weak[:_MOST_WEAK]:
         at = _numbers(area.centre.x, area.centre.y, area.centre.z)
         lines.append(
-            f"weak here: {at}, {area.width_m:g} m wide ({area.found} of {area.views} found)"
+            f"weak area: {at}, {area.width_m:g} m wide ({area.found} of {area.views} found)"
         )
     if len(r.weak) > _MOST_WEAK:
         lines.append(f"and {len(r.weak) - _MOST_WEAK} more weak areas")
@@ -363,7 +365,7 @@ def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
 
 
 def _axis(up: Direction) -> str:
-    """Return the axis that a direction is along, or its numbers."""
+    """Return the axis of a direction, or its numbers if it is along none."""
     for axis, value in zip("xyz", (up.x, up.y, up.z), strict=True):
         if abs(value) > 0.9999:
             return axis if value > 0 else f"-{axis}"
@@ -375,10 +377,10 @@ def _numbers(x: float, y: float, z: float) -> str:
 
 
 def hint_at_maps(paths: list[Path]) -> None:
-    """Say of files of points that are too large for one scan how a map is uploaded."""
+    """Print a hint for files of points that are too large for one scan."""
     for path in paths:
         if path.is_file() and is_cloud(path.name) and path.stat().st_size > _SCAN_BYTES:
             print_error(
-                f"{path.name} is large for one scan. If it holds a whole place, upload it with "
+                f"{path.name} is large for one scan. If it contains a whole place, upload it with "
                 "--as-map."
             )

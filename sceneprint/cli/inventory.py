@@ -1,4 +1,4 @@
-"""`sceneprint maps`, `frames`, `queries` and `jobs`: what a service holds."""
+"""`sceneprint maps`, `frames`, `queries` and `jobs`: contents of a service."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sceneprint_client.api import Frame, Job, Map
     from sceneprint_client.api.results import QueryRecord
 
-#: Options that take a file for a part of one frame.
+#: Options that write one part of a frame to a file.
 _FILES = ("cloud", "preview", "patches", "signature", "upload")
 
 
@@ -40,9 +40,9 @@ def add_frames(command: argparse.ArgumentParser) -> None:
     ):
         group.add_argument(option, action="append", metavar=metavar, help=text)
     group.add_argument(
-        "--name", metavar="PREFIX", help="original file name starts with this; case matters"
+        "--name", metavar="PREFIX", help="prefix of the original file name, case-sensitive"
     )
-    group.add_argument("--find", metavar="PREFIX", help="id, file name or session starts with this")
+    group.add_argument("--find", metavar="PREFIX", help="prefix of the id, file name or session")
     group.add_argument("--state", choices=[str(state) for state in FrameState])
     group.add_argument("--parent-frame", metavar="NAME", help="parent frame of the poses")
     for option, text in (
@@ -93,26 +93,26 @@ def _add_files(group: Any) -> None:
 
 
 def run_frames(options: argparse.Namespace) -> int:
-    """List the frames of a map in order of upload, those of one session in the order they were
-    taken, or write the trajectory of a session. With FRAME: show that frame, download its files,
+    """List the frames of a map in the order of their upload (of one session, in the order of
+    capture), or write the trajectory of a session. With FRAME, show that frame, download its files,
     or edit its metadata.
     """
     of_one = [name for name in (*_FILES, "edit") if getattr(options, name) is not None]
     if options.frame_id is None and of_one:
-        raise InvalidRequest(f"--{of_one[0]} applies to one frame. Give its id after the map.")
+        raise InvalidRequest(f"--{of_one[0]} applies to one frame. Add its id after the map.")
     one_session = len(options.session or ()) == 1
     if options.trajectory is not None and not one_session:
-        raise InvalidRequest("--trajectory needs a session. Name it with --session.")
+        raise InvalidRequest("--trajectory requires a session. Add --session NAME.")
     if options.trajectory is not None and options.mcap is not None:
-        raise InvalidRequest("--trajectory writes no scene. Run the command once for each.")
+        raise InvalidRequest("--trajectory does not write a scene. Run the command twice.")
     check_scene(options)
     with open_client(options) as client, open_scene(options, client) as scene:
         if options.frame_id is not None:
-            frame = _one(client, options)
+            frame = _show_one(client, options)
             if scene is not None:
                 scene.add_frame(frame)
         elif options.trajectory is not None:
-            _trajectory(client, options)
+            _write_trajectory(client, options)
         else:
             found = client.frames(
                 options.map, None if options.state is None else FrameState(options.state),
@@ -134,19 +134,18 @@ def run_frames(options: argparse.Namespace) -> int:
 
 
 def _show_frames(scene: Scene, frames: list[Frame]) -> None:
-    """Write the scene of listed frames; InvalidRequest if none has a pose."""
+    """Write the scene of listed frames; raise InvalidRequest if none has a pose."""
     posed = [one for one in frames if one.pose is not None]
     if not posed:
         raise InvalidRequest(
-            "No listed frame has a pose, so a scene has no place for them. Name one FRAME."
+            "No listed frame has a pose, so the scene would be empty. Specify one FRAME."
         )
     if len(posed) < len(frames):
         print_error(f"{len(frames) - len(posed)} frames without a pose are not shown")
     scene.add_frames(posed)
 
 
-def _one(client: Client, options: argparse.Namespace) -> Frame:
-    """Show, download or edit one frame."""
+def _show_one(client: Client, options: argparse.Namespace) -> Frame:
     of = options.map, options.frame_id
     frame = client.frame(*of) if options.edit is None else client.edit_frame(*of, options.edit)
     readers = {
@@ -166,9 +165,9 @@ def _one(client: Client, options: argparse.Namespace) -> Frame:
     return frame
 
 
-def _trajectory(client: Client, options: argparse.Namespace) -> None:
+def _write_trajectory(client: Client, options: argparse.Namespace) -> None:
     if len(options.robot or ()) > 1:
-        raise InvalidRequest("--trajectory accepts one robot only. Give --robot once.")
+        raise InvalidRequest("--trajectory accepts only one robot. Specify --robot once.")
     text = client.trajectory_text(
         options.map, options.session[0], robot=(options.robot or [None])[0],
         parent_frame=options.parent_frame, captured_after=options.after,
@@ -217,7 +216,7 @@ def _changes(text: str) -> dict[str, Any]:
     return changes
 
 
-# `sceneprint queries`: the queries of robots and their outcomes.
+# `sceneprint queries`.
 
 
 def add_queries(command: argparse.ArgumentParser) -> None:
@@ -228,12 +227,10 @@ def add_queries(command: argparse.ArgumentParser) -> None:
         help="only queries with this outcome; repeatable: matches any",
     )  # fmt: skip
     command.add_argument("--robot", metavar="NAME", help="only queries of this robot")
-    command.add_argument(
-        "--kept", action="store_true", help="only queries whose answers somebody keeps"
-    )
+    command.add_argument("--kept", action="store_true", help="only queries with kept answers")
     for option, text in (
-        ("--since", "only queries that came at or after this time: 2026-11-16T09:30:00Z"),
-        ("--until", "only queries that came before this time"),
+        ("--since", "only queries at or after this time: 2026-11-16T09:30:00Z"),
+        ("--until", "only queries before this time"),
     ):
         command.add_argument(option, type=_time, metavar="TIME", help=text)
     command.add_argument(
@@ -245,7 +242,7 @@ def add_queries(command: argparse.ArgumentParser) -> None:
 
 
 def run_queries(options: argparse.Namespace) -> int:
-    """List the latest queries of a map, or of all maps, newest first, with their times, outcomes,
+    """List the latest queries of a map or of all maps, newest first, with their times, outcomes,
     robots, and poses or reasons.
     """
     with open_client(options) as client:
@@ -255,8 +252,8 @@ def run_queries(options: argparse.Namespace) -> int:
         )  # fmt: skip
         print_rows(
             islice(found, options.limit), _query_line, as_json=options.json,
-            header=f"{'query':32}  {'came':19}  status          ms  map  robot/session  where or "
-            "why", none="no queries match",
+            header=f"{'query':32}  {'time':19}  status          ms  map  robot/session  pose or "
+            "reason", none="no queries match",
         )  # fmt: skip
     return 0
 
@@ -277,7 +274,7 @@ def _query_line(one: QueryRecord) -> str:
     )
 
 
-# `sceneprint jobs`: the jobs of a service.
+# `sceneprint jobs`.
 
 
 def add_jobs(command: argparse.ArgumentParser) -> None:
@@ -291,7 +288,7 @@ def add_jobs(command: argparse.ArgumentParser) -> None:
     choice.add_argument(
         "--state", choices=[str(state) for state in JobState], help="list only jobs in this state"
     )
-    command.add_argument("--json", action="store_true", help="print JSON, tracebacks included")
+    command.add_argument("--json", action="store_true", help="print JSON, including tracebacks")
     add_service_options(command)
     command.set_defaults(run=run_jobs)
 
@@ -315,7 +312,7 @@ def run_jobs(options: argparse.Namespace) -> int:
 
 
 def _retry_dead(client: Client, *, as_json: bool) -> int:
-    """Retry the dead jobs, but for those that a later job of the same frame followed; return 2 if
+    """Retry the dead jobs, except those that a later job of the same frame replaced; return 2 if
     one cannot be retried.
     """
     again, refused = 0, 0
@@ -341,9 +338,9 @@ def _job_line(job: Job) -> str:
     )
 
 
-# `sceneprint maps`: the maps of a service.
+# `sceneprint maps`.
 
-#: The text that removes a limit.
+#: Value of an option that removes a limit.
 NONE = "none"
 
 
@@ -353,7 +350,7 @@ def add_maps(command: argparse.ArgumentParser) -> None:
     choice.add_argument(
         "--create", metavar="NAME", help="create a map; its name may contain a-z, 0-9, - and _"
     )
-    choice.add_argument("--edit", metavar="NAME", help="edit title, limits or up of a map")
+    choice.add_argument("--edit", metavar="NAME", help="edit title, limits or up vector of a map")
     choice.add_argument("--delete", metavar="NAME", help="delete a map with all its frames")
     command.add_argument("--title", help="human-readable title of the map")
     command.add_argument(
@@ -369,8 +366,8 @@ def add_maps(command: argparse.ArgumentParser) -> None:
         )
     command.add_argument(
         "--up", metavar="X,Y,Z", type=lambda text: NONE if text == NONE else up_of(text),
-        help="up in the parent frames of the poses, 0,0,1 where z points up; "
-        f"`{NONE}` to learn it from frames",
+        help="up vector in the parent frames of the poses, such as 0,0,1; "
+        f"`{NONE}` to estimate it from frames",
     )  # fmt: skip
     command.add_argument("--yes", action="store_true", help="confirm a deletion")
     command.add_argument("--json", action="store_true", help="print JSON")
@@ -379,8 +376,8 @@ def add_maps(command: argparse.ArgumentParser) -> None:
 
 
 def run_maps(options: argparse.Namespace) -> int:
-    """List the maps of a service, or create, edit or delete one. Only operators can set quotas:
-    that needs a key with `admin` for `*`.
+    """List the maps of a service, or create, edit or delete one. Quotas require a key with `admin`
+    for `*`.
     """
     names = ("title", "quota_frames", "quota_bytes", "retention_days", "up")
     fields = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
@@ -414,7 +411,7 @@ def _limit(kind: type[int] | type[float]) -> Any:
     def read(text: str) -> float | str:
         return NONE if text == NONE else kind(text)
 
-    read.__name__ = "number"  # argparse puts it into its message
+    read.__name__ = "number"  # argparse shows it in its message
     return read
 
 
@@ -427,7 +424,7 @@ def _edit(client: Client, name: str, changes: dict[str, Any], *, confirmed: bool
             raise InvalidRequest(
                 f"This would permanently delete the {preview.overdue} frames of map {name} that "
                 f"are older than {preview.retention_days:g} days. Nothing was changed. Add --yes "
-                "to go ahead."
+                "to confirm."
             )
     return client.edit_map(name, changes)
 
@@ -437,14 +434,14 @@ def _delete(client: Client, name: str, *, confirmed: bool) -> None:
     if not confirmed:
         raise InvalidRequest(
             f"This would permanently delete map {name} and its {n_frames} frames. Add --yes to "
-            "go ahead."
+            "confirm."
         )
     client.delete_map(name)
     print(f"deleted map {name} and its {n_frames} frames")
 
 
 def _notes(one: Map) -> list[str]:
-    """Return notes on the quotas, the retention and the parent frames of a map."""
+    """Return notes on poses, quotas, retention and up vector of a map."""
     parts = []
     if one.frames.get("indexed") and not one.posed_frames:
         parts.append("no poses")

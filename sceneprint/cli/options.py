@@ -1,4 +1,4 @@
-"""Options that many commands share: services, filters, queries, data folders and their values."""
+"""Options that several commands share: services, filters, queries and data folders."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from sceneprint.store import Store
     from sceneprint_client import Client
 
-# Which frames of a map a command searches.
+# Filters of frames.
 
 
 def add_filter_options(command: argparse.ArgumentParser) -> None:
-    """Add `--robot` and the other options of a filter; all that are there must hold."""
+    """Add `--robot` and the other options of a filter."""
     group = command.add_argument_group(
         "filter",
         "search only frames that match all of these; frames without the value are excluded",
@@ -47,8 +47,8 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--region", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1",
-        help="box that contains the pose, in metres (write --region=-1,... if it starts with a "
-        "minus)",
+        help="box that contains the pose, in metres (write --region=-1,... if the first number is "
+        "negative)",
     )  # fmt: skip
     group.add_argument(
         "--region-frame", metavar="NAME", help="parent frame of the box and of the poses"
@@ -59,16 +59,16 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
 
 
 def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the filter that the options describe, as JSON has it; None if there is none.
+    """Return the filter of the options as JSON; None without a filter.
 
     Raises
     ------
-    InvalidRequest : one of --region and --region-frame without the other.
+    InvalidRequest : If only one of --region and --region-frame is present.
     """
     region = None
     if (options.region is None) != (options.region_frame is None):
         raise InvalidRequest(
-            "A box needs a parent frame. Give --region and --region-frame together."
+            "A box requires a parent frame. Specify --region and --region-frame together."
         )
     if options.region is not None:
         least, most = options.region
@@ -81,11 +81,11 @@ def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
     return {name: value for name, value in fields.items() if value is not None} or None
 
 
-# Values of options, read from text.
+# Types of options.
 
 
 def numbers_of(text: str, count: int, what: str) -> list[float]:
-    """Return comma-separated numbers; `what` describes them in the error if they are not."""
+    """Return comma-separated numbers; `what` describes the expected text in the error."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -101,7 +101,7 @@ def _box(text: str) -> tuple[dict[str, float], ...]:
 
 
 def base_of(text: str) -> GivenBase:
-    """Return the mounting pose of a sensor, written as seven numbers."""
+    """Return the mounting pose of a sensor from seven numbers."""
     what = "seven comma-separated numbers: metres and a unit quaternion"
     numbers = numbers_of(text, 7, what)
     translation, rotation = zip("xyz", numbers, strict=False), zip("xyzw", numbers[3:], strict=True)
@@ -109,12 +109,12 @@ def base_of(text: str) -> GivenBase:
         return GivenBase.model_validate(
             {"translation": dict(translation), "rotation": dict(rotation)}
         )
-    except ValueError as error:  # of pydantic
+    except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not {what}") from error
 
 
 def mounting_of(options: argparse.Namespace) -> GivenBase | None:
-    """Return the mounting pose of `--base`, in the frame of `--base-frame`."""
+    """Return the mounting pose of `--base` in the frame of `--base-frame`."""
     base: GivenBase | None = options.base
     if base is None or options.base_frame is None:
         return base
@@ -122,16 +122,16 @@ def mounting_of(options: argparse.Namespace) -> GivenBase | None:
 
 
 def up_of(text: str) -> list[float]:
-    """Return three numbers; the record of the frame checks that their length is 1."""
+    """Return three numbers; the record of the frame checks that they are a unit vector."""
     return numbers_of(text, 3, "three comma-separated numbers")
 
 
 def add_up_option(command: argparse.ArgumentParser, read: Callable[[str], object] = up_of) -> None:
-    """Add `--up`, whose text `read` takes."""
+    """Add `--up`, whose value `read` parses."""
     command.add_argument(
         "--up", type=read, metavar="X,Y,Z",
-        help="up in the sensor's axes, a unit vector, as 0,-1,0 for a camera held level (write "
-        "--up=-1,0,0 if it starts with a minus)",
+        help="unit vector up in the sensor's axes, such as 0,-1,0 for a level camera (write "
+        "--up=-1,0,0 if the first number is negative)",
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ _A_PRIOR = (
 
 
 def prior_of(text: str) -> dict[str, Any]:
-    """Return a prior as JSON has it, from JSON or the name of a file."""
+    """Return a prior as JSON, from JSON text or from a file."""
     document = text
     if not text.lstrip().startswith("{"):
         try:
@@ -150,17 +150,17 @@ def prior_of(text: str) -> dict[str, Any]:
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else "it is not text"
             raise argparse.ArgumentTypeError(
-                f"{text}: cannot be read ({why}). Give JSON, or a file of it, such as {_A_PRIOR}"
+                f"{text}: cannot be read ({why}). Pass JSON or a file, such as {_A_PRIOR}"
             ) from error
     try:
         prior = json.loads(document)
     except ValueError as error:
         raise argparse.ArgumentTypeError(
-            f"the prior is not JSON ({error}). Give an object such as {_A_PRIOR}"
+            f"the prior is not JSON ({error}). Pass an object such as {_A_PRIOR}"
         ) from error
     if not isinstance(prior, dict):
         raise argparse.ArgumentTypeError(
-            f"the prior is not a JSON object. Give one such as {_A_PRIOR}"
+            f"the prior is not a JSON object. Pass an object such as {_A_PRIOR}"
         )
     try:
         checked(Prior, "The prior", **prior)
@@ -170,7 +170,7 @@ def prior_of(text: str) -> dict[str, Any]:
 
 
 def add_signing_options(command: argparse._ActionsContainer) -> None:
-    """Add `--priority` and `--if-novel`, of frames that are uploaded."""
+    """Add `--priority` and `--if-novel` for uploaded frames."""
     from sceneprint_client.api.base import NOVEL
 
     command.add_argument(
@@ -179,14 +179,15 @@ def add_signing_options(command: argparse._ActionsContainer) -> None:
     )  # fmt: skip
     command.add_argument(
         "--if-novel", nargs="?", type=_share, const=True, metavar="D",
-        help="keep a frame only if its place is new to the map: the nearest frame is farther "
-        f"than D, as a share of the distance of unrelated frames (without a number: {NOVEL:g})",
+        help="keep a frame only if its place is new to the map, that is if the nearest frame is "
+        "farther than D, a share of the distance of unrelated frames (D without a value: "
+        f"{NOVEL:g})",
     )  # fmt: skip
 
 
 def _priority(text: str) -> int:
     if text.removeprefix("-") not in {str(number) for number in range(MOST_PRIORITY + 1)}:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from -10 to 10")
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer from -10 to 10")
     return int(text)
 
 
@@ -196,7 +197,7 @@ def _share(text: str) -> float:
     except InvalidRequest:
         share = None
     if share is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to 1")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and up to 1")
     return share
 
 
@@ -207,16 +208,16 @@ def add_data_option(command: argparse.ArgumentParser) -> None:
     """Add `--data`."""
     command.add_argument(
         "--data", type=Path, metavar="DIR",
-        help="data folder, with database and blobs (default: the user's data folder)",
+        help="data folder with database and blobs (default: the user's data folder)",
     )  # fmt: skip
 
 
 def settings_of(options: argparse.Namespace) -> Settings:
-    """Return the settings of the environment, with those of the options in their place.
+    """Return the settings of the environment, overridden by the options.
 
     Raises
     ------
-    InvalidRequest : a value is not valid.
+    InvalidRequest : If a value is not valid.
     """
     from pydantic import ValidationError
 
@@ -233,7 +234,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0])
-        # a URL may hold a password, and the error from pydantic quotes it as well
+        # A URL may contain a password, which the error of pydantic also quotes.
         secret = name.endswith("_url")
         value = "not usable" if secret else f"{first['input']!r:.60}"
         raise InvalidRequest(
@@ -243,22 +244,22 @@ def settings_of(options: argparse.Namespace) -> Settings:
 
 
 def existing_store(options: argparse.Namespace) -> Settings:
-    """Return the settings of a store that exists: a mistyped --data would create an empty one.
+    """Return the settings of an existing store, so that a mistyped --data creates none.
 
     Raises
     ------
-    UnusableStore : the data folder has no database.
+    UnusableStore : If the data folder has no database.
     """
     settings = settings_of(options)
     if settings.database_url is None and not (settings.data_dir / "sceneprint.db").is_file():
         raise UnusableStore(
-            f"{settings.data_dir}: there is no database here. Name the data folder with --data."
+            f"{settings.data_dir}: there is no database here. Specify the data folder with --data."
         )
     return settings
 
 
 def open_command_store(settings: Settings) -> AbstractContextManager[Store]:
-    """Open the store of some settings, and create it if it is missing."""
+    """Open the store of the settings, creating it if it is missing."""
     from sceneprint.store import open_store
 
     return closing(open_store(settings.database, settings.blobs))
@@ -277,14 +278,14 @@ def add_service_options(command: argparse.ArgumentParser) -> None:
 
 
 def open_client(options: argparse.Namespace) -> Client:
-    """Return a client of the service that the options name; Unreachable if `--url` is none."""
+    """Return a client of the service in the options; raise Unreachable if `--url` is invalid."""
     from sceneprint_client import Client
 
     return Client(options.url or DEFAULT_URL, options.key)
 
 
 def add_seed_option(command: argparse.ArgumentParser) -> None:
-    """Add `--seed`, of the random choices of a validation."""
+    """Add `--seed`, the seed of the random choices of a validation."""
     command.add_argument(
         "--seed", type=whole_number, default=0, metavar="S", help="random seed (default: 0)"
     )
@@ -294,7 +295,7 @@ def add_query_options(command: argparse.ArgumentParser) -> None:
     """Add `--k` and the other options of a query, with the filter."""
     command.add_argument(
         "--k", type=positive, default=5, metavar="K",
-        help="largest number of accepted matches to list; the pose does not depend on it "
+        help="maximum number of accepted matches to list; the pose does not depend on it "
         "(default: 5)",
     )  # fmt: skip
     command.add_argument("--exact", action="store_true", help="compare every frame of the map")
@@ -313,34 +314,33 @@ def add_query_options(command: argparse.ArgumentParser) -> None:
         )
     command.add_argument(
         "--confidence", type=float, default=0.99, metavar="P",
-        help="least probability of a pose that is found, 0.5 to 0.999 (default: 0.99)",
+        help="minimum probability of a found pose, 0.5 to 0.999 (default: 0.99)",
     )  # fmt: skip
     command.add_argument(
         "--deadline-ms", type=positive, metavar="MS",
-        help="start no candidate that would finish after this time",
+        help="skip candidates that would finish after this time",
     )  # fmt: skip
     command.add_argument(
-        "--explain", action="store_true", help="explain at which stage each frame dropped out"
+        "--explain", action="store_true", help="explain at which stage each frame was dropped"
     )
     command.add_argument(
         "--explain-frame", metavar="FRAME",
-        help="explain at which stage this frame of the map dropped out",
+        help="explain at which stage this frame of the map was dropped",
     )  # fmt: skip
     command.add_argument(
         "--no-keep", action="store_true", help="do not store the answer for `GET /v1/queries/ID`"
     )
     command.add_argument(
         "--prior", type=prior_of, metavar="FILE|JSON",
-        help="what you believe of the pose: JSON, or a file of it, with `pose` (its "
-        "`parent_frame` is needed) and `covariance` (36 numbers) or `deviation_m` and "
-        "`deviation_deg` (default: 0.3 m, 10 deg)",
+        help="expected pose: JSON, or a file with JSON, with `pose` (including `parent_frame`) and "
+        "`covariance` (36 numbers) or `deviation_m` and `deviation_deg` (default: 0.3 m, 10 deg)",
     )  # fmt: skip
     add_up_option(command)
     add_filter_options(command)
 
 
 def query_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of a query, as `Client.query` takes them."""
+    """Return the fields of a query for `Client.query`."""
     names = (
         "k", "exact", "seed", "candidates", "confidence", "deadline_ms", "explain",
         "explain_frame", "prior",
@@ -361,16 +361,16 @@ def _assignment(text: str) -> tuple[str, str]:
     return name, value
 
 
-# Signals that end a command as Ctrl-C does, so that it removes its temporary files.
+# Signals that end a command like Ctrl-C, so that it deletes its temporary files.
 
 _ENDING = (signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt for SIGTERM and SIGHUP; in the main thread only.
-
-    Once: `make` and a closed terminal send several, and the removal must not be cut short.
+    """Raise KeyboardInterrupt for the first SIGTERM or SIGHUP, in the main thread only. Further
+    signals are ignored: `make` and a closed terminal send several, which would interrupt the
+    cleanup.
     """
 
     def end(_number: int, _frame: FrameType | None) -> None:
@@ -378,7 +378,7 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    # `nohup` ignores SIGHUP on purpose
+    # `nohup` ignores SIGHUP on purpose.
     caught = [one for one in _ENDING if signal.getsignal(one) is signal.SIG_DFL]
     for number in caught:
         signal.signal(number, end)

@@ -1,4 +1,4 @@
-"""What commands print: single lines, tables or JSON, and progress bars."""
+"""Output of commands: single lines, tables, JSON and progress bars."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Row = TypeVar("Row", bound="BaseModel")
 
 
 def one_line(text: str) -> str:
-    """Return a text without line breaks and escapes."""
+    """Return a text without line breaks and control characters."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def percent(confidence: float) -> str:
-    """Return a confidence for people, rounded down, so that none looks better than it is."""
+    """Return a confidence as a percentage, rounded down."""
     return f"{math.floor(1000 * min(confidence, 0.999)) / 10:.1f} %"
 
 
@@ -44,14 +44,14 @@ def source_label(record: Any) -> str:
 def print_rows(
     rows: Iterable[Row], line: Callable[[Row], str], *, header: str, none: str, as_json: bool
 ) -> None:
-    """Print records as they come: as a table, or each as a line of JSON.
+    """Print records while they arrive, as a table or as one line of JSON each.
 
     Parameters
     ----------
-    rows : of one kind
-    line : returns the line of a record in the table
+    rows : records of one class
+    line : function that returns the line of a record in the table
     header : first line of the table
-    none : text in place of a table without rows
+    none : text that replaces an empty table
     as_json : whether to print JSON
     """
     empty = True
@@ -73,7 +73,7 @@ def print_error(text: str) -> None:
 def progress_bar(
     name: str, unit: str = "frame", **options: Any
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on a terminal; yield a function that takes the finished steps and their number."""
+    """Show a bar on a terminal; yield a function that takes the done and total steps."""
     from tqdm import tqdm
 
     with tqdm(desc=name, unit=unit, disable=None, **options) as bar:
@@ -90,8 +90,8 @@ def waiting_reason(stats: Stats | None, own: int = 0) -> str:
 
     Parameters
     ----------
-    stats : statistics of the whole service; None if the key may not see them
-    own : number of the caller's jobs that wait for a worker; those of others are ahead of them
+    stats : statistics of the service; None if the key may not read them
+    own : number of the caller's waiting jobs; all other waiting jobs are ahead of them
     """
     if stats is None or not stats.workers:
         return "Check that workers are running; `sceneprint work` starts some."

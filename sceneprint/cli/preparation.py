@@ -1,4 +1,4 @@
-"""Signers of commands: the model that options name, and messages while kernels are compiled."""
+"""Signers for commands, with messages while kernels are compiled."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ def add_model_options(command: argparse.ArgumentParser) -> None:
     choice = command.add_mutually_exclusive_group()
     choice.add_argument(
         "--preset", choices=PRESETS,
-        help=f"preset that ships with sceneprint (default: {PRESETS[0]})",
+        help=f"model that sceneprint contains (default: {PRESETS[0]})",
     )  # fmt: skip
-    choice.add_argument("--model", type=Path, metavar="FILE", help="path of your own model")
+    choice.add_argument("--model", type=Path, metavar="FILE", help="file of your own model")
 
 
 def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = False) -> Signer:
-    """Return the signer of the model that `add_model_options` named, with its code compiled and
-    its table open; UnreadableModel if there is no such model.
+    """Return the signer of the model in the options, with compiled kernels and an open table. Raise
+    UnreadableModel if the model does not exist.
 
-    With `psi`, it signs with psi itself, by default of the preset `paper`.
+    With `psi`, the signer returns psi itself; the default model is then `paper`.
     """
     compile_kernels(settings.cache_dir, ("signing",), _print)
-    chosen = options.model or options.preset or ("paper" if psi else PRESETS[0])
-    model = read_model(chosen)
-    signer = _open_signer(model.without_whitening if psi else model, str(chosen), settings)
-    with suppress(FrameError):  # a model of another range may see nothing there
-        sign(_wall(), signer)  # so that the first frame's time is that of signing, not of loading
+    name = options.model or options.preset or ("paper" if psi else PRESETS[0])
+    model = read_model(name)
+    signer = _open_signer(model.without_whitening if psi else model, str(name), settings)
+    with suppress(FrameError):  # the wall may be outside of the model's range
+        sign(_wall(), signer)  # loads everything, so that the first frame takes no extra time
     return signer
 
 
@@ -53,8 +53,8 @@ def prepare_presets(
 
     Parameters
     ----------
-    say : function that reports each step (default: prints on standard error)
-    clouds : whether to compile the kernels of clouds, for which the first cloud waits otherwise
+    say : function that reports each step (default: print on standard error)
+    clouds : whether to compile the kernels of clouds too; otherwise the first cloud waits for them
     stop : event that ends the preparation
     """
     parts = ALL if clouds else DEPTH
@@ -74,6 +74,6 @@ def _open_signer(model: Model, name: str, settings: Settings) -> Signer:
 
 
 def _wall() -> DepthFrame:
-    """A flat wall 2 m ahead."""
-    camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, as most are
+    """Return a frame of a flat wall at 2 m."""
+    camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, like most images
     return DepthFrame(np.full((192, 256), 2.0, np.float32), camera)

@@ -1,4 +1,4 @@
-"""`sceneprint make`: results that a worker computes of a map, such as an association or a mesh."""
+"""`sceneprint make`: results that a worker computes from a map, such as a mesh."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from sceneprint_client.api.sessions import Association, GraphFormat, Join
     from sceneprint_client.api.surface import Coverage
 
-#: Formats of a pose graph by the suffixes of their files.
+#: Formats of a pose graph by file suffix.
 _FORMATS: dict[str, GraphFormat] = {".g2o": "g2o", ".txt": "tum", ".tum": "tum", ".json": "json"}
-#: Longest wait for a mesh, seconds.
+#: Time limit for a mesh, seconds.
 _TIMEOUT_S = 600.0
 
 
@@ -38,7 +38,7 @@ def add_make(command: argparse.ArgumentParser) -> None:
     for name, add, run, text in (
         ("association", _add_association, _associate,
          "join two sessions of a map, or find the loop closures of one"),
-        ("mesh", _add_mesh, _reconstruct, "fuse the matches of a frame to a mesh"),
+        ("mesh", _add_mesh, _reconstruct, "fuse the matches of a frame into a mesh"),
     ):  # fmt: skip
         doc = " ".join((run.__doc__ or "").split())
         kind = kinds.add_parser(name, help=text, description=doc)
@@ -49,7 +49,7 @@ def add_make(command: argparse.ArgumentParser) -> None:
 
 
 def run_make(options: argparse.Namespace) -> int:
-    """Let a worker compute something of a map, and wait for it: an association of sessions, or a
+    """Let a worker compute a result from a map, and wait for it: an association of sessions, or a
     mesh of a place.
     """
     return int(options.make(options))
@@ -60,15 +60,15 @@ def _add_association(command: argparse.ArgumentParser) -> None:
     which = command.add_mutually_exclusive_group(required=True)
     which.add_argument(
         "--session", action="append", metavar="NAME",
-        help="once for loop closures; twice to join two sessions, the first onto the second",
+        help="once for loop closures; twice to join two sessions, the first to the second",
     )  # fmt: skip
     which.add_argument(
         "--undo", metavar="ID",
-        help="undo the join of this association: poses are again as they were sent",
+        help="undo the join of this association, so that poses return to the uploaded ones",
     )  # fmt: skip
     command.add_argument(
         "--robot", action="append", metavar="NAME",
-        help="robot of each session, in the same order; needed if several robots use the same "
+        help="robot of each session, in the same order; required if several robots use the same "
         "session name",
     )  # fmt: skip
     command.add_argument(
@@ -99,12 +99,12 @@ def _add_association(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--join", action=argparse.BooleanOptionalAction, default=True,
-        help="let the poses of both sessions lead to one parent frame, where the join is strong "
+        help="move the poses of both sessions into one parent frame, if the join is strong "
         "(default)",
     )  # fmt: skip
     command.add_argument(
         "--out", type=Path, metavar="FILE",
-        help="write the pose graph: .g2o, .txt (the vertices as a TUM trajectory) or .json",
+        help="file of the pose graph: .g2o, .txt (the vertices as a TUM trajectory) or .json",
     )  # fmt: skip
     command.add_argument(
         "--odometry", action="store_true", help="include edges between consecutive frames"
@@ -115,8 +115,8 @@ def _add_association(command: argparse.ArgumentParser) -> None:
 
 def _associate(options: argparse.Namespace) -> int:
     """Find where two sessions of a map see the same places and how they align, or find the loop
-    closures of a single session. Can write the pose graph for an optimiser. Exit code 2 if it did
-    not succeed.
+    closures of a single session. The command can write the pose graph for an optimiser. The exit
+    code is 2 if the job fails.
     """
     from sceneprint_client.api.sessions import Association
 
@@ -126,14 +126,14 @@ def _associate(options: argparse.Namespace) -> int:
         return 0
     if len(options.session) > 2:
         raise InvalidRequest(
-            "An association needs one or two sessions. Give --session once or twice."
+            "An association requires one or two sessions. Specify --session once or twice."
         )
     kind = None if options.out is None else _FORMATS.get(options.out.suffix.lower())
-    if options.out is not None:  # before the work, which may take an hour
+    if options.out is not None:  # checked before the job, which may take an hour
         if kind is None:
             raise InvalidRequest(
-                f"{options.out.name!a:.80} has no known file type. Use a name for --out that ends "
-                f"in {', '.join(_FORMATS)}."
+                f"{options.out.name!a:.80} has an unknown file type. Use a name for --out that "
+                f"ends in {', '.join(_FORMATS)}."
             )
         check_writable(options.out)
     check_scene(options)
@@ -165,7 +165,7 @@ def _print_association(one: Association, options: argparse.Namespace) -> None:
 
 
 def _association_lines(one: Association) -> list[str]:
-    """Return the lines of an association: its edges, and whether the sessions are joined."""
+    """Return the lines of an association with its edges and joins."""
     name = f"association {one.job_id}"
     if one.result is None:
         why = "" if one.error is None else f": {one_line(one.error)}"
@@ -186,10 +186,10 @@ def _join_lines(one: Join) -> list[str]:
     names = f"{one_line(one.from_parent)} onto {one_line(one.to_parent)}"
     if one.transform is None:
         return [f"not joined, {names}: {one_line(one.reason)}"]
-    sure = "surely" if one.strength == "strong" else "weakly (check it before you rely on it)"
+    sure = "strongly" if one.strength == "strong" else "weakly (check it before you rely on it)"
     t, r = one.transform.translation, one.transform.rotation
-    moved = [] if one.root is None else [f"  all their poses are in {one_line(one.root)} now"]
-    moved += ["  undone: it moves no pose any more"] if one.undone else []
+    moved = [] if one.root is None else [f"  all their poses are now in {one_line(one.root)}"]
+    moved += ["  undone: it no longer moves poses"] if one.undone else []
     return [
         f"joined {sure}, {names}: {one_line(one.reason)}, spread "
         f"{100 * (one.spread_m or 0.0):.1f} cm, {one.spread_deg or 0.0:.1f} deg",
@@ -209,7 +209,7 @@ def _add_mesh(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--out", type=Path, default=Path("mesh.ply"), metavar="FILE",
-        help="PLY to write (default: mesh.ply)",
+        help="PLY file (default: mesh.ply)",
     )  # fmt: skip
     command.add_argument(
         "--k", type=positive, default=10, metavar="K",
@@ -218,11 +218,9 @@ def _add_mesh(command: argparse.ArgumentParser) -> None:
     add_seed_option(command)
     command.add_argument(
         "--voxel", type=float, metavar="METRES",
-        help="size of a voxel (default: the finest that fits)",
+        help="size of a voxel (default: the finest that fits into memory)",
     )  # fmt: skip
-    command.add_argument(
-        "--strong", action="store_true", help="fuse only strongly accepted matches"
-    )
+    command.add_argument("--strong", action="store_true", help="fuse only strong matches")
     command.add_argument("--cloud", action="store_true", help="write points without triangles")
     command.add_argument(
         "--without-query", action="store_true", help="fuse only the matches, not the frame itself"
@@ -231,8 +229,8 @@ def _add_mesh(command: argparse.ArgumentParser) -> None:
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
-    """Query a map with a depth frame, and let a worker fuse the accepted matches to a surface in
-    the camera frame of the query. Exit code 1 if no match is accepted.
+    """Query a map with a depth frame, and let a worker fuse the accepted matches into a surface in
+    the camera frame of the query. The exit code is 1 if no match is accepted.
     """
     check_writable(options.out)
     with open_client(options) as client:
@@ -287,5 +285,5 @@ def _query(client: Client, options: argparse.Namespace) -> Answer:
 
     frames = [frame for sequence in find_sequences(path) for frame in sequence.frames]
     if len(frames) != 1:
-        raise DatasetError(f"{path}: {len(frames)} frames found. Name a single frame file.")
+        raise DatasetError(f"{path}: {len(frames)} frames found. Specify a single frame file.")
     return client.query(options.map, frames[0], **fields)

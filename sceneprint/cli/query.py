@@ -1,4 +1,4 @@
-"""`sceneprint query` and `localize`: where in a map frames were taken."""
+"""`sceneprint query` and `localize`: queries of frames against a map."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def add_query(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint query`."""
     command.add_argument(
         "--map", action="append", default=[], metavar="NAME", dest="also",
-        help="search this map together with MAP; repeatable (MAP may be '*' for every map that "
-        "you may read)",
+        help="search this map together with MAP; repeatable (MAP may be '*' for all maps that the "
+        "key may read)",
     )  # fmt: skip
     command.add_argument(
         "--stages", default="retrieve,diversify,validate",
@@ -64,23 +64,24 @@ def add_query(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--overlay", type=Path, metavar="FILE.ply",
-        help="for a single frame: write its points, aligned with those of its first match",
+        help="for a single frame: write its points aligned with those of its first match",
     )  # fmt: skip
     command.add_argument(
         "--color", choices=COLOURS, default="source",
-        help="colour the overlay by frame, by normal, or by distance from the other surface "
+        help="colour of the overlay: by frame, by normal, or by distance to the other surface "
         "(default: source)",
     )  # fmt: skip
     command.add_argument(
         "--by", choices=TRANSFORMS, default="aligned",
-        help="transform of the overlay: the match's, its best rival, or none (default: aligned)",
+        help="transform of the overlay: that of the match, its best rival, or none (default: "
+        "aligned)",
     )  # fmt: skip
     _add_frame_options(command)
     command.set_defaults(run=run_query)
 
 
 def _add_frame_options(command: argparse.ArgumentParser) -> None:
-    """Add the options of both commands."""
+    """Add the options that both commands have."""
     command.add_argument("map", metavar="MAP")
     command.add_argument(
         "path", type=Path, metavar="PATH", help="a depth image, a cloud, a folder or a recording"
@@ -97,10 +98,10 @@ def _add_frame_options(command: argparse.ArgumentParser) -> None:
 
 
 def run_query(options: argparse.Namespace) -> int:
-    """Query a map with depth frames or point clouds: one file, or the frames of a folder (7-Scenes,
-    TUM RGB-D or plain depth images, with an intrinsics.json beside them or in a folder above; or
-    clouds), or the keyframes of a recording of ROS. They are not added to the map. Exit code 2 if a
-    frame could not be looked up.
+    """Query a map with depth frames or point clouds from a file, from a folder (7-Scenes, TUM
+    RGB-D, depth images with an intrinsics.json beside them or in a folder above, or clouds), or
+    from the keyframes of a ROS recording. They are not added to the map. The exit code is 2 if the
+    query of a frame failed.
     """
     _check_scene(options)
     references = _wanted_frames(options, _frames_at(options))
@@ -108,11 +109,11 @@ def run_query(options: argparse.Namespace) -> int:
     several = options.map == "*" or options.also
     if several:
         fields["maps"] = "*" if options.map == "*" else [options.map, *options.also]
-    if options.overlay is not None:  # before the first query
+    if options.overlay is not None:  # checked before the first query
         if len(references) != 1:
             raise DatasetError(
                 f"{options.path}: has {len(references)} frames, but --overlay writes a single "
-                "file. Choose a frame with --frame."
+                "file. Select a frame with --frame."
             )
         check_writable(options.overlay)
     with open_client(options) as client, open_scene(options, client) as scene:
@@ -140,9 +141,7 @@ def _results(
     references: Sequence[FrameReference],
     ask: Callable[[FrameReference], tuple[Any, str]],
 ) -> Iterator[tuple[FrameReference, tuple[Any, str] | None]]:
-    """Look frames up, and print and yield each answer with its text; None where a frame alone is
-    at fault.
-    """
+    """Query frames; print and yield each answer with its text, or None if a frame is invalid."""
     for reference in references:
         try:
             record, text = ask(reference)
@@ -161,17 +160,17 @@ def _results(
 def _check_scene(options: argparse.Namespace) -> None:
     check_scene(options)
     if options.mcap is not None and options.no_keep:
-        raise InvalidRequest("A scene is made of stored answers. Leave --no-keep out.")
+        raise InvalidRequest("A scene requires stored answers. Omit --no-keep.")
 
 
 def _save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -> str:
-    """Write the points of the query aligned with those of its best match; return a line about it.
+    """Write the points of the query aligned with its best match, and return a message.
 
     Raises
     ------
-    UnknownFrame : the answer has no match.
-    InvalidRequest : its first match has no such transform.
-    NotIndexed : the query had no validation.
+    UnknownFrame : If the answer has no match.
+    InvalidRequest : If the first match does not have the requested transform.
+    NotIndexed : If the query was not validated.
     """
     if not answer.matches:
         raise UnknownFrame("The query has no match to overlay. Query a map that has frames.")
@@ -186,7 +185,7 @@ def _save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -
 def _answer_scene(
     scene: Scene | None, references: Sequence[FrameReference]
 ) -> Callable[[FrameReference, Answer, str], None]:
-    """Return a function that adds the answer of a frame, and its text, to the scene, if any."""
+    """Return a function that adds an answer and its text to the scene, if there is a scene."""
     places = {one.path: place for place, one in enumerate(references)}
     stamps = stamps_of(references)
 
@@ -213,7 +212,7 @@ def _frames_at(options: argparse.Namespace) -> list[FrameReference]:
 def _wanted_frames(
     options: argparse.Namespace, references: list[FrameReference]
 ) -> list[FrameReference]:
-    """Return all frames, or that of `--frame`; DatasetError if it does not exist."""
+    """Return all frames, or the frame of `--frame`; raise DatasetError if it does not exist."""
     path, wanted = options.path, options.frame
     if wanted is None:
         return references
@@ -232,7 +231,7 @@ def _wanted_frames(
     ]
     if len(named) == 1:
         return named
-    found = f"{len(named)} frames are called" if named else "no frame is called"
+    found = f"{len(named)} frames are named" if named else "no frame is named"
     raise DatasetError(
         f"{path}: {found} {wanted}. Set --frame to an index from 0, or to a name such as "
         f"{references[0].name}."
@@ -240,12 +239,12 @@ def _wanted_frames(
 
 
 def answer_lines(name: str, answer: Answer) -> list[str]:
-    """Return the lines of an answer: its status, its matches and the pose."""
+    """Return the lines of an answer: status, matches and pose."""
     counts = answer.counts
     tried = f"{counts.accepted} of {counts.validated} validated, " if counts.validated else ""
     of = f"{counts.map}"
     if counts.passed != counts.map:
-        of = f"{counts.passed} that pass the filter, of {counts.map}"
+        of = f"{counts.passed} that match the filter, of {counts.map}"
     there = answer.location or next(iter(answer.alternatives), None)
     sure = "" if there is None else _percent(there.confidence)
     lines = [
@@ -293,7 +292,7 @@ _DECIDED = {
 
 
 def _grounds(there: Location | Localization) -> str:
-    """Return the votes and the evidence for a pose, and what verified it."""
+    """Return the votes, the verification and the evidence for a pose as text."""
     if there.support == 0:
         voted = "no match votes for it"
     elif there.support == 1:
@@ -307,7 +306,7 @@ def _grounds(there: Location | Localization) -> str:
 
 
 def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
-    """Return the evidence for a pose; `expected` if only places near the prior were compared."""
+    """Return the evidence for a pose as text; `expected` if only places near the prior count."""
     if e is None:
         return "not compared with other places"
     place = "place that the prior expects" if expected else "place"
@@ -320,7 +319,7 @@ def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
 
 
 def _percent(confidence: float | None) -> str:
-    """Return a confidence to print after a status."""
+    """Return a confidence to print after a status, or nothing."""
     return "" if confidence is None else f" {percent(confidence)}"
 
 
@@ -330,7 +329,7 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
         return []
     head = f"  {len(alternatives)} poses are supported; at most one is right:"
     if len(alternatives) == 1:
-        head = "  one pose is supported, and not confirmed:"
+        head = "  one pose is supported, but not confirmed:"
     places = [
         f"  {_percent(one.confidence):>7}  {_metres(one.pose)} m in "
         f"{one_line(one.pose.parent_frame)}, support {one.support}; "
@@ -341,13 +340,13 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
 
 
 def _label(match: Match, several: bool) -> str:
-    """Return the map if there are several, the robot, session and file of a match, and its id."""
+    """Return the map (if several), robot, session and file of a match, and its id."""
     seen = "/".join(one_line(who) for who in (match.robot, match.session, match.name) if who)
     return "  ".join(part for part in (match.map if several else "", seen, match.frame_id) if part)
 
 
 def _metres(transform: Transform | None) -> str:
-    """Return a translation."""
+    """Return a translation as text."""
     if transform is None:
         return ""
     t = transform.translation
@@ -355,7 +354,7 @@ def _metres(transform: Transform | None) -> str:
 
 
 def _degrees(transform: Transform | None) -> str:
-    """Return the angle of a rotation, degrees."""
+    """Return the angle of a rotation in degrees as text."""
     if transform is None:
         return ""
     r = transform.rotation
@@ -363,7 +362,7 @@ def _degrees(transform: Transform | None) -> str:
 
 
 def _explanation_lines(answer: Answer) -> list[str]:
-    """Return why frames of the ranking, or the named frame, dropped out, if it was asked."""
+    """Return the explanations of the answer, if they were requested."""
     lines = [
         f"  {one.rank:4}  {frame_label(one.frame_id, one.name)}  {one.similarity:4.2f}  "
         f"{one.stage}: {one.outcome.replace('_', ' ')}; {one_line(one.reason)}"
@@ -372,15 +371,15 @@ def _explanation_lines(answer: Answer) -> list[str]:
     one = answer.explained_frame
     if one is not None:
         place = "not searched" if one.rank is None else f"rank {one.rank} of {one.of}"
-        lost = "a match" if one.lost_at is None else f"lost at {one.lost_at}"
+        lost = "a match" if one.lost_at is None else f"dropped at {one.lost_at}"
         label = frame_label(one.frame_id, one.name)
         lines.append(f"  {label}: {place}; {lost}: {one_line(one.reason)}")
     return lines
 
 
-# `sceneprint localize`: one pose of a frame in a map, or why there is none.
+# `sceneprint localize`.
 
-#: Default number of frames of a sequence, and how far back the earlier ones may be.
+#: Default number of frames of a sequence, and maximum number of frames to look back.
 _LAST, _FARTHEST_BACK = 3, 200
 
 
@@ -388,9 +387,9 @@ def add_localize(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint localize`."""
     command.add_argument(
         "--last", type=positive, metavar="K",
-        help="look each frame up together with the frames before it, K in all, 1 to 10: those "
-        "that were taken 0.1 m or 6 degrees apart. Their poses in the folder are used as odometry "
-        "(default: 3 where frames have poses and --up is not given; 1: each frame alone)",
+        help="query each frame together with earlier frames, 1 to 10 in total, that are 0.1 m or 6 "
+        "degrees apart, with their poses in the folder as odometry (default: 3 if frames have "
+        "poses and --up is absent; 1: each frame alone)",
     )  # fmt: skip
     _add_frame_options(command)
     command.set_defaults(run=run_localize)
@@ -398,8 +397,8 @@ def add_localize(command: argparse.ArgumentParser) -> None:
 
 def run_localize(options: argparse.Namespace) -> int:
     """Find the poses in a map at which depth frames or clouds were taken. They are not added to the
-    map. Exit code 0: all are found; 1: one is ambiguous or not found; 2: one could not be looked
-    up.
+    map. The exit code is 0 if all poses are found, 1 if one is ambiguous or not found, and 2 if a
+    query failed.
     """
     _check_scene(options)
     every = _frames_at(options)
@@ -427,48 +426,50 @@ def run_localize(options: argparse.Namespace) -> int:
 def _frames_to_localize(
     options: argparse.Namespace, every: list[FrameReference]
 ) -> list[FrameReference]:
-    """Return all frames, or that of `--frame`.
+    """Return all frames, or the frame of `--frame`.
 
     Raises
     ------
-    DatasetError : no such frame, a prior of several, or --last that cannot be used.
+    DatasetError : If the frame does not exist, a prior applies to several frames, or --last
+        conflicts with other options.
     """
     if options.last is not None and options.last > MOST_OF_SEQUENCE:
-        raise DatasetError(f"--last {options.last}: choose from 1 to {MOST_OF_SEQUENCE}.")
+        raise DatasetError(f"--last {options.last}: use a number from 1 to {MOST_OF_SEQUENCE}.")
     if options.up is not None and (options.last or 1) > 1:
         raise DatasetError(
-            "--up is of one frame. Leave --last out, or have `up` in the intrinsics.json beside "
-            "the frames."
+            "--up applies to one frame. Omit --last, or set `up` in the intrinsics.json beside the "
+            "frames."
         )
     if options.prior is not None and options.frame is None and len(every) > 1:
         raise DatasetError(
-            f"{options.path} has {len(every)} frames, and --prior is of one. Name it with --frame."
+            f"{options.path} has {len(every)} frames, but --prior applies to one. Select it with "
+            "--frame."
         )
     return _wanted_frames(options, every)
 
 
 def _localize(
     client: Client, options: argparse.Namespace, every: list[FrameReference],
-    reference: FrameReference, how: dict[str, Any],
+    reference: FrameReference, fields: dict[str, Any],
 ) -> Localization:  # fmt: skip
-    """Look a frame up with earlier ones, or alone if the service refuses one of these."""
+    """Query a frame with earlier frames, or alone if the service refuses one of them."""
     before = _frames_before(options, every, reference)
     if before:
         try:
-            return client.localize_sequence(options.map, [*before, reference], **how)
+            return client.localize_sequence(options.map, [*before, reference], **fields)
         except (FrameError, TooLarge):
-            pass  # the frame alone shows whether an earlier one is at fault
-    return client.localize(options.map, reference, up=options.up, **how)
+            pass  # the query of the frame alone shows whether that frame is invalid
+    return client.localize(options.map, reference, up=options.up, **fields)
 
 
 def _frames_before(
     options: argparse.Namespace, every: list[FrameReference], reference: FrameReference
 ) -> list[FrameReference]:
-    """Return the earlier frames of its sequence that a frame is looked up with.
+    """Return the earlier frames of the sequence to query together with a frame.
 
     Raises
     ------
-    DatasetError : --last asks for some, and the frame has no pose.
+    DatasetError : If --last requires earlier frames, but the frame has no pose.
     """
     most = options.last or (_LAST if options.up is None else 1)
     if most == 1:
@@ -477,8 +478,8 @@ def _frames_before(
         if options.last is None:
             return []
         raise DatasetError(
-            f"{reference.name} has no pose, and --last {options.last} needs odometry. Leave --last "
-            "out, or put the poses beside the frames."
+            f"{reference.name} has no pose, but --last {options.last} requires odometry. Omit "
+            "--last, or put the poses beside the frames."
         )
     run = reference.name.rpartition("/")[0]
     frames = [frame for frame in every if frame.name.rpartition("/")[0] == run]
@@ -489,7 +490,7 @@ def _frames_before(
 
 
 def _pose_or_none(reference: FrameReference) -> Floats | None:
-    """Return the pose of a frame; None if it has none, or tracking was lost."""
+    """Return the pose of a frame; None without a pose or if tracking was lost."""
     try:
         return reference.pose
     except InvalidPose:

@@ -1,4 +1,4 @@
-"""Scenes of what a command found, which sceneprint-viewers writes where it is installed."""
+"""Scenes of the results of commands, which the package sceneprint-viewers writes."""
 
 from __future__ import annotations
 
@@ -25,65 +25,65 @@ if TYPE_CHECKING:
 
 
 class Scene(Protocol):
-    """The scene that a command fills, of one service and one file."""
+    """A scene in one file, to which a command adds results of one service."""
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was added."""
+        """Whether the scene has no content."""
 
     def add_answer(
         self, answer: Answer, name: str, text: str, camera: CameraIntrinsics | None,
         place: tuple[int, int], stamp_ns: int | None,
     ) -> None:  # fmt: skip
-        """Add an answer as the next moment.
+        """Add an answer as the next point in time.
 
         Parameters
         ----------
-        answer : stored by the service
-        name : of the frame that was looked up
-        text : about the answer, for people
-        camera : of that frame; None of a cloud
-        place : of the frame among those that are looked up, from 0, and their number
-        stamp_ns : when it was taken, nanoseconds since 1970; None where not known
+        answer : answer that the service stores
+        name : name of the queried frame
+        text : description of the answer, for people
+        camera : camera of the frame; None for a cloud
+        place : index of the frame among the queried frames, from 0, and their number
+        stamp_ns : capture time, nanoseconds since 1970; None if unknown
         """
 
     def add_frame(self, frame: Frame) -> None:
         """Add one frame of a map."""
 
     def add_frames(self, frames: Sequence[Frame]) -> None:
-        """Add posed frames of one map."""
+        """Add frames with poses of one map."""
 
     def add_association(self, association: Association, text: str) -> None:
-        """Add what an association found; `text` describes it for people."""
+        """Add an association with a description for people."""
 
 
-#: Opens the scene of a file; also takes the client to fetch with, and how many frames of a map
-#: are shown. The file is there only when the block ends without an error.
+#: Function that opens the scene of a file. It also takes the client and the maximum number of
+#: frames of the map to show. The file appears only if the block ends without an error.
 SceneOpener: TypeAlias = "Callable[[Path, Client, int], AbstractContextManager[Scene]]"
 
 
 def add_scene_options(command: argparse.ArgumentParser) -> None:
     """Add `--mcap` and `--map-frames`."""
     group = command.add_argument_group(
-        "scene", "what was found, in 3-D, for a viewer; see docs/viewers.md"
+        "scene", "a 3-D scene of the results for a viewer; see docs/viewers.md"
     )
     group.add_argument(
         "--mcap", type=Path, metavar="FILE",
-        help="write an MCAP file for Foxglove or Rerun (needs sceneprint-viewers)",
+        help="write an MCAP file for Foxglove or Rerun (requires sceneprint-viewers)",
     )  # fmt: skip
     group.add_argument(
         "--map-frames", type=whole_number, default=120, metavar="N",
-        help="frames of the map whose points are shown, evenly taken (default: 120)",
+        help="number of evenly spaced frames of the map whose points are shown (default: 120)",
     )  # fmt: skip
 
 
 def check_scene(options: argparse.Namespace) -> None:
-    """Check before any work that the scene can be written.
+    """Check early that the scene can be written.
 
     Raises
     ------
-    MissingDependency : no viewer is installed.
-    OSError : the file cannot be written.
+    MissingDependency : If no viewer is installed.
+    OSError : If the file cannot be written.
     """
     if options.mcap is not None:
         _opener()
@@ -102,7 +102,7 @@ def _opener() -> SceneOpener:
 
 @contextmanager
 def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | None]:
-    """Open the scene that `--mcap` names; None without that option."""
+    """Open the scene of `--mcap`; yield None without the option."""
     if options.mcap is None:
         yield None
         return
@@ -113,7 +113,7 @@ def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | 
 
 
 def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:
-    """Nanoseconds since 1970 of frames; all None unless each is later than the one before."""
+    """Return the capture times of frames, nanoseconds since 1970; all None unless they increase."""
     stamps = [one.timestamp for one in references]
     known = [t for t in stamps if t is not None and 0 <= t < 2**63 * 1e-9]
     rising = all(a < b for a, b in itertools.pairwise(known))

@@ -1,4 +1,4 @@
-"""`sceneprint serve`: the service and its workers in one go."""
+"""`sceneprint serve` and `work`: the service and its workers."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ def add_serve(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--port", type=whole_number, metavar="N",
-        help="port to listen on (default: 8008); 0 picks a free port and prints it",
+        help="port to listen on (default: 8008); 0 selects a free port and prints it",
     )  # fmt: skip
     add_workers_option(command)
     command.set_defaults(run=run_serve)
 
 
 def add_workers_option(command: argparse.ArgumentParser) -> None:
-    """`--workers`."""
+    """Add `--workers`."""
     command.add_argument(
         "--workers", type=whole_number, metavar="N",
-        help="number of worker processes (default: processors)",
+        help="number of worker processes (default: number of processors)",
     )  # fmt: skip
 
 
 def run_serve(options: argparse.Namespace) -> int:
-    """Run the HTTP service and its workers. It needs no configuration; you can also set every
-    option in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).
+    """Run the HTTP service and its workers. No configuration is required; every option can also be
+    set in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).
     """
-    gc.disable()  # until all is imported: a twelfth of the start would go to it
+    gc.disable()  # until imports are done; collections would take a twelfth of the start
     from sceneprint.process import log_as_json
     from service.server import run as serve
 
     settings = settings_of(options)
-    log_as_json()  # from the first line on
+    log_as_json()
     stop = threading.Event()
     failures: list[Exception] = []
 
@@ -54,28 +54,28 @@ def run_serve(options: argparse.Namespace) -> int:
             from worker.supervisor import Supervisor
 
             prepare_presets(settings, logging.getLogger(__name__).info, stop=stop)
-            if not (read_only or stop.is_set()):  # there would be nothing for workers to do
+            if not (read_only or stop.is_set()):  # workers would have nothing to do
                 supervisor = Supervisor(settings)
                 supervisor.start()
                 supervisor.watch(stop)
-        except Exception as error:  # a service without its workers must not go on
+        except Exception as error:  # the service must not run without its workers
             failures.append(error)
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
 
     threads: list[threading.Thread] = []
 
     def ready(url: str, read_only: bool) -> None:
-        # the service answers while kernels are compiled; workers begin once they are
+        # The service responds while kernels are compiled; workers start afterwards.
         threads.append(threading.Thread(target=work, args=(read_only,), name="supervisor"))
         threads[0].start()
         print(f"sceneprint: serving {url}\nsceneprint: dashboard {url}/dashboard", flush=True)
 
-    # uvicorn handles both signals while it runs; before and after, leave by the same way out
+    # uvicorn handles both signals while it runs; this covers the time before and after.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         serve(settings, ready)
     except KeyboardInterrupt:
-        pass  # the ordinary end
+        pass  # the normal end
     finally:
         stop.set()
         for thread in threads:
@@ -85,7 +85,7 @@ def run_serve(options: argparse.Namespace) -> int:
     return 0
 
 
-# `sceneprint work`: workers alone, beside a service that runs elsewhere on the same store.
+# `sceneprint work`: workers without a service, on the same store.
 
 
 def add_work(command: argparse.ArgumentParser) -> None:
@@ -104,9 +104,9 @@ def run_work(options: argparse.Namespace) -> int:
     from worker.supervisor import run as work
 
     settings = settings_of(options)
-    log_as_json()  # from the first line on
+    log_as_json()
     warn_if_public(settings.data_dir)
-    require_writable(settings)  # what is wrong is said once, and not by every worker
+    require_writable(settings)  # reports errors once, instead of in every worker
     prepare_presets(settings, logging.getLogger(__name__).info)
     work(settings)
     return 0

@@ -18,7 +18,7 @@ def add_sessions(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint sessions`."""
     command.add_argument("map", metavar="MAP")
     command.add_argument("session", nargs="?", metavar="SESSION", help="name of one session")
-    command.add_argument("--robot", metavar="NAME", help="only the frames of this robot")
+    command.add_argument("--robot", metavar="NAME", help="only frames of this robot")
     command.add_argument("--rename", metavar="NAME", help="rename the session")
     command.add_argument("--rename-robot", metavar="NAME", help="rename the robot of its frames")
     for option, what in (("--tag", "add a tag to"), ("--untag", "remove a tag from")):
@@ -26,7 +26,7 @@ def add_sessions(command: argparse.ArgumentParser) -> None:
             option, action="append", default=[], metavar="TAG",
             help=f"{what} its frames; repeatable",
         )  # fmt: skip
-    command.add_argument("--delete", action="store_true", help="delete it with all its frames")
+    command.add_argument("--delete", action="store_true", help="delete the session and its frames")
     command.add_argument("--yes", action="store_true", help="confirm a deletion")
     command.add_argument(
         "--deletions", action="store_true", help="list deletions of frames that can be undone"
@@ -38,8 +38,8 @@ def add_sessions(command: argparse.ArgumentParser) -> None:
 
 
 def run_sessions(options: argparse.Namespace) -> int:
-    """List the sessions of a map. With SESSION: rename it, change the tags of its frames, or
-    delete it with all its frames. Deletions can be undone for a while.
+    """List the sessions of a map. With SESSION, rename it, change the tags of its frames, or
+    delete it with all its frames. Deletions can be undone for a limited time.
     """
     edits = {
         "rename": options.rename, "rename_robot": options.rename_robot, "add_tags": options.tag,
@@ -47,12 +47,12 @@ def run_sessions(options: argparse.Namespace) -> int:
     }  # fmt: skip
     edits = {name: value for name, value in edits.items() if value}
     if options.session is None and (edits or options.delete):
-        raise InvalidRequest("Name the session after the map, to edit or delete it.")
+        raise InvalidRequest("Specify the session after the map to edit or delete it.")
     if options.delete and edits:
-        raise InvalidRequest("--delete removes the session. Leave the other changes out.")
+        raise InvalidRequest("--delete removes the session. Omit the other changes.")
     undo = options.deletions or options.undo is not None
     if undo and (options.session is not None or edits):
-        raise InvalidRequest("--deletions and --undo apply to the whole map. Name no session.")
+        raise InvalidRequest("--deletions and --undo apply to the whole map. Omit the session.")
     with open_client(options) as client:
         if options.undo is not None:
             undone = client.restore_deletion(options.map, options.undo)
@@ -74,9 +74,9 @@ def run_sessions(options: argparse.Namespace) -> int:
             found = client.sessions(options.map)
             names = {"session": options.session, "robot": options.robot}
             wanted = {name: value for name, value in names.items() if value is not None}
-            chosen = (s for s in found if all(getattr(s, n) == v for n, v in wanted.items()))
+            rows = (s for s in found if all(getattr(s, n) == v for n, v in wanted.items()))
             print_rows(
-                chosen, _session_line, as_json=options.json, none="no sessions yet",
+                rows, _session_line, as_json=options.json, none="no sessions yet",
                 header="frames  indexed  poses  first captured       last captured        "
                 "robot/session  [tags]",
             )  # fmt: skip
@@ -90,7 +90,7 @@ def _delete_session(client: Client, options: argparse.Namespace) -> None:
         of = [one for one in of if options.robot in (None, one.robot)]
         n_frames = sum(sum(one.frames.values()) for one in of)
         raise InvalidRequest(
-            f"This would delete session {name} and its {n_frames} frames. Add --yes to go ahead."
+            f"This would delete session {name} and its {n_frames} frames. Add --yes to confirm."
         )
     deleted = client.delete_session(options.map, options.session, options.robot)
     print(f"deleted session {name} and its {deleted} frames")

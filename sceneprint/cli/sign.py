@@ -1,4 +1,4 @@
-"""`sceneprint sign`: signatures of frames, without a service."""
+"""`sceneprint sign`: signatures of frames without a service."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def add_sign(command: argparse.ArgumentParser) -> None:
     add_model_options(command)
     command.add_argument(
         "--psi", action="store_true",
-        help="sign with psi, the Fisher vectors of the paper, from the given model or else the "
-        "preset paper",
+        help="compute psi, the Fisher vectors of the paper, with the specified model or the preset "
+        "paper",
     )  # fmt: skip
     command.add_argument(
         "--out", type=Path, metavar="DIR",
@@ -39,16 +39,16 @@ def add_sign(command: argparse.ArgumentParser) -> None:
 
 
 def run_sign(options: argparse.Namespace) -> int:
-    """Sign every frame of the given files and folders (7-Scenes, TUM RGB-D or plain depth images,
-    with an intrinsics.json beside them or in a folder above; or point clouds). Exit code 2 if a
+    """Sign all frames of files and folders (7-Scenes, TUM RGB-D, depth images with an
+    intrinsics.json beside them or in a folder above, or point clouds). The exit code is 2 if a
     frame could not be signed.
     """
     frames, out = _named_frames(options), options.out
     signer = open_for(options, Settings(), psi=options.psi)
     if out is not None:
-        _claim(out, signer)
+        _prepare_folder(out, signer)
     entries: list[dict[str, Any]] = []
-    has_reader = True  # of standard output
+    has_reader = True  # of standard output, which may be closed
     try:
         with tqdm(frames.items(), desc="sign", unit="frame", disable=None) as bar:
             for name, reference in bar:
@@ -61,7 +61,7 @@ def run_sign(options: argparse.Namespace) -> int:
                     if out is None:
                         raise
                     has_reader = False
-    finally:  # what was written is listed, however the run ended
+    finally:  # written signatures are listed even after an error
         if out is not None:
             names = ("name", "id", "signature_bytes", "metric", "unrelated_distance")
             model = {name: getattr(signer.model, name) for name in names}
@@ -80,16 +80,16 @@ def run_sign(options: argparse.Namespace) -> int:
 
 
 def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
-    """Return all frames below the paths by names that are unique among them.
+    """Return all frames below the paths by unique names.
 
     Raises
     ------
-    DatasetError : nothing is found at a path, or one path is there twice.
+    DatasetError : If a path has no frames, or a name or file occurs twice.
     """
     frames: dict[str, FrameReference] = {}
     files: set[Path] = set()
     for path in options.paths:
-        several = len(options.paths) > 1 and path.is_dir()  # its folder names a file already
+        several = len(options.paths) > 1 and path.is_dir()  # the name of a file is unique already
         prefix = f"{path.resolve().name}/" if several else ""
         for sequence in sequences_at(path, options):
             for reference in sequence.frames:
@@ -105,8 +105,8 @@ def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
     return frames
 
 
-def _claim(folder: Path, signer: Signer) -> None:
-    """Create the folder, or check that it holds signatures of this model."""
+def _prepare_folder(folder: Path, signer: Signer) -> None:
+    """Create the folder, or check that its signatures are of the same model."""
     folder.mkdir(parents=True, exist_ok=True)
     index = folder / "signatures.json"
     try:
@@ -115,7 +115,7 @@ def _claim(folder: Path, signer: Signer) -> None:
         known = "no readable model id"
     if known not in (None, signer.model.id):
         raise DatasetError(
-            f"{folder}: holds signatures of another model ({known[:12]}, not "
+            f"{folder}: contains signatures of another model ({known[:12]}, not "
             f"{signer.model.id[:12]}), and models must not be mixed. Use a new folder, or empty "
             "this one."
         )
@@ -124,7 +124,7 @@ def _claim(folder: Path, signer: Signer) -> None:
 def _sign(
     name: str, reference: FrameReference, signer: Signer, out: Path | None
 ) -> tuple[dict[str, Any], str]:
-    """Sign a frame and write its signature; return its entry in the index and a line about it."""
+    """Sign a frame and write its signature; return its entry in the index and its output line."""
     entry: dict[str, Any] = {"name": name, "path": str(reference.path)}
     file = None if out is None else out / f"{name}.sig"
     try:
@@ -133,7 +133,7 @@ def _sign(
         signature = sign(frame, signer)
     except FrameError as error:
         if file is not None:
-            file.unlink(missing_ok=True)  # of an earlier run
+            file.unlink(missing_ok=True)  # the signature of an earlier run
         line = f"{one_line(name)}  NOT SIGNED  {one_line(str(error))}"
         return entry | {"signed": False, "reason": str(error)}, line
     milliseconds = 1e3 * (time.perf_counter() - start)

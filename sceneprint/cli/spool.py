@@ -1,4 +1,4 @@
-"""`sceneprint spool`: frames kept on disk while there is no service, and uploaded later."""
+"""`sceneprint spool`: frames on disk while no service is reachable, uploaded later."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ def add_spool(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--most-bytes", type=positive, metavar="N",
-        help="bytes that the spool may hold; stays so until given again (default: "
+        help="maximum size of the spool, bytes; stored in the spool (default: "
         f"{MOST_BYTES} for a new spool)",
     )  # fmt: skip
     add_frame_options(command)
     command.add_argument(
-        "--every", type=positive, default=1, metavar="N", help="add every Nth frame"
+        "--every", type=positive, default=1, metavar="N", help="add every n-th frame"
     )
     command.add_argument("--json", action="store_true", help="print the status as JSON")
     group = command.add_argument_group("upload")
     group.add_argument(
         "--to", metavar="MAP",
-        help="upload the waiting frames to this map, which must exist, oldest first; exit code 2 "
-        "if anything was refused or frames wait",
+        help="upload the waiting frames to this map, which must exist, oldest first; the exit code "
+        "is 2 if frames were refused or still wait",
     )  # fmt: skip
     group.add_argument(
-        "--retry-refused", action="store_true", help="upload again what was refused before"
+        "--retry-refused", action="store_true", help="upload previously refused frames again"
     )
     add_signing_options(group)
     add_recording_options(command)
@@ -52,20 +52,20 @@ def add_spool(command: argparse.ArgumentParser) -> None:
 
 
 def run_spool(options: argparse.Namespace) -> int:
-    """Keep frames in a file of bounded size while a robot is offline, and upload them with --to
-    when it is back; without PATH and --to, show what waits and what became of the rest. A full
-    spool gives up the frames that are nearest to others. A frame leaves the spool once the map has
-    it; whatever is interrupted, run the command again.
+    """Store frames in a file of limited size while a robot is offline, and upload them later with
+    --to. Without PATH and --to, show the waiting and uploaded frames. A full spool drops the frames
+    that are nearest to others. A frame leaves the spool once the map has it; after an interruption,
+    run the command again.
     """
     if options.paths and options.to is not None:
-        raise InvalidRequest("A spool is filled or uploaded. Leave --to out, or give no PATH.")
+        raise InvalidRequest("Either add frames to a spool or upload it: omit --to or PATH.")
     if options.retry_refused and options.to is None:
-        raise InvalidRequest("--retry-refused needs --to. Name the map to upload to.")
+        raise InvalidRequest("--retry-refused requires --to. Specify the map to upload to.")
     if options.paths:
         return _add(options)
     if not options.spool.is_file():
         raise DatasetError(
-            f"{options.spool}: There is no spool here. Check the path; `sceneprint spool FILE "
+            f"{options.spool}: there is no spool here. Check the path; `sceneprint spool FILE "
             "PATH` creates one."
         )
     with Spool(options.spool) as spool:
@@ -86,7 +86,7 @@ def _add(options: argparse.Namespace) -> int:
                     new, there = new + is_new, there + (not is_new)
                 except OF_FRAME as error:
                     errors.append(f"{one_line(frame.name)}: {one_line(str(error))}")
-        finally:  # what was added stays, however the run ended
+        finally:  # added frames stay, even after an error
             now = spool.status()
             left = len(found) - new - there - len(errors)
             print(
@@ -126,7 +126,7 @@ def _status(spool: Spool, options: argparse.Namespace) -> int:
 
 
 def _sync(spool: Spool, options: argparse.Namespace) -> int:
-    """Upload; return 2 if a frame is refused."""
+    """Upload the waiting frames; return 2 if one is refused."""
     if options.retry_refused:
         spool.retry_refused()
     before = spool.status()
@@ -138,7 +138,7 @@ def _sync(spool: Spool, options: argparse.Namespace) -> int:
                     client, options.to, priority=options.priority, if_novel=options.if_novel,
                     progress=progress,
                 )  # fmt: skip
-        finally:  # what was uploaded stays there, however the run ended
+        finally:  # uploaded frames stay in the map, even after an error
             now = spool.status()
             parts = f", {report.there} of them already there" if report and report.there else ""
             print(

@@ -1,4 +1,4 @@
-"""Commands on a store: `migrate`, `fsck`, `snapshot`, `restore`, `pull`, `reencode`."""
+"""Commands on a store: `migrate`, `fsck`, `snapshot`, `restore`, `pull` and `reencode`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sceneprint.store import Database
     from sceneprint_client.api import Map
 
-#: What fsck counts, in the order in which it prints the counts.
+#: Names of the counts of fsck, in the order of its output.
 _COUNTED = ("models", "frames", "signatures", "blobs", "files", "indexes")
 
 
@@ -44,16 +44,16 @@ def add_migrate(command: argparse.ArgumentParser) -> None:
     add_data_option(command)
     command.add_argument(
         "--check", action="store_true",
-        help="change nothing; exit code 1 if the schema must first be created or upgraded",
+        help="change nothing; the exit code is 1 if the schema must be created or upgraded first",
     )  # fmt: skip
     command.set_defaults(run=run_migrate)
 
 
 def run_migrate(options: argparse.Namespace) -> int:
-    """Create or upgrade the schema of a data folder or of DATABASE_URL, in one transaction, and
-    print the revisions. `serve` and `work` do so by themselves when they start; use this as a step
-    of its own in a deployment. Where the schema is up to date it changes nothing. Exit code 2 if a
-    later version wrote the database, or it cannot be reached.
+    """Create or upgrade the schema of a data folder or of DATABASE_URL in one transaction, and
+    print the revisions. `serve` and `work` do this automatically at their start; this command is a
+    separate step for deployments. A schema that is up to date is not changed. The exit code is 2 if
+    a later version wrote the database, or if it is not reachable.
     """
     from sceneprint.store.database import database_exists, reach_database
 
@@ -67,7 +67,7 @@ def run_migrate(options: argparse.Namespace) -> int:
         if options.check:
             print(shown if usable else f"{shown}; run `sceneprint migrate`")
             return 0 if usable else 1
-        with open_command_store(settings):  # which creates or upgrades the schema
+        with open_command_store(settings):  # creates or upgrades the schema
             pass
         after, _ = _revisions(database)
     finally:
@@ -77,7 +77,7 @@ def run_migrate(options: argparse.Namespace) -> int:
 
 
 def _revisions(database: Database) -> tuple[str | None, bool]:
-    """Return the revision of a store's schema, and whether this version can use it as it is."""
+    """Return the revision of a store's schema, and whether this version can use it unchanged."""
     from sceneprint.store.database import current_revision, known_revisions, revision_of
 
     with database.read() as connection:
@@ -99,8 +99,8 @@ def add_fsck(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     how.add_argument(
         "--purge", action="store_true",
-        help="check nothing, but erase every byte of deleted frames on this node now, without "
-        "waiting for SCENEPRINT_PURGE_DEADLINE_S; their deletion cannot be undone afterwards",
+        help="do not check anything; erase all data of deleted frames on this node now, without "
+        "waiting for SCENEPRINT_PURGE_DEADLINE_S; their deletion can then not be undone",
     )  # fmt: skip
     command.add_argument(
         "--grace", type=whole_number, metavar="SECONDS",
@@ -113,9 +113,9 @@ def add_fsck(command: argparse.ArgumentParser) -> None:
 
 
 def run_fsck(options: argparse.Namespace) -> int:
-    """Check rows, signatures, blobs and indexes of a data folder, and report problems and what
-    --repair would do. Changes nothing without --repair. The service may be running. Exit code 1 if
-    problems remain, 2 if the folder cannot be checked.
+    """Check rows, signatures, blobs and indexes of a data folder; report problems and what --repair
+    would do. Without --repair nothing is changed. The service may be running. The exit code is 1 if
+    problems remain, and 2 if the folder cannot be checked.
     """
     from sceneprint.engine.admin.operations import Audit
     from sceneprint.maintenance.fsck.check import fsck
@@ -187,12 +187,12 @@ def _record(finding: Finding) -> dict[str, object]:
 
 
 def _purge(options: argparse.Namespace) -> int:
-    """Erase deleted frames; return 1 if the log of the database could not be emptied."""
+    """Erase deleted frames; return 1 if the write-ahead log could not be emptied."""
     from sceneprint.engine.context import open_context
     from sceneprint.engine.upkeep.housekeeping import purging_of
 
     if not options.map is options.grace is options.json is None:
-        raise InvalidRequest("--purge checks nothing. Give no other option than --data with it.")
+        raise InvalidRequest("--purge checks nothing. Use it only with --data.")
     with open_context(existing_store(options)) as context:
         found = purging_of(context).now()
         print(
@@ -200,14 +200,14 @@ def _purge(options: argparse.Namespace) -> int:
             f"{found.products} products; rebuilt {found.indexes} indexes"
         )
         if not context.store.database.shrink_log():
-            print("the database log is in use: run this again when nothing reads the database")
+            print("the database log is in use: run this again when no process reads the database")
             return 1
     return 0
 
 
-# `sceneprint snapshot` and `restore`: bundles of database and blobs.
+# `sceneprint snapshot` and `restore`.
 
-#: Most damaged blobs whose names are printed.
+#: Maximum number of damaged blobs that are printed.
 _SHOWN = 10
 
 
@@ -216,21 +216,20 @@ def add_snapshot(command: argparse.ArgumentParser) -> None:
     _add_database_options(command)
     command.add_argument(
         "--to", required=True, metavar="PLACE",
-        help="folder or URL such as s3://bucket/prefix, with bundles of this store alone",
+        help="folder or URL such as s3://bucket/prefix, for bundles of this store only",
     )  # fmt: skip
     command.add_argument(
         "--keep", type=positive, metavar="N",
-        help="remove all but the newest N bundles afterwards (default: keep all)",
+        help="delete all but the newest N bundles afterwards (default: keep all)",
     )  # fmt: skip
     command.set_defaults(run=run_snapshot)
 
 
 def run_snapshot(options: argparse.Namespace) -> int:
     """Write a bundle of database and blobs to a folder or an object store. The service and its
-    workers may keep running. What an earlier bundle there holds is not written again. Search
-    indexes are left out, as they can be rebuilt. Exit code 1 if a blob was missing or damaged and
-    could not be included. A bundle contains all frames and the hashes of keys: protect it like the
-    data folder.
+    workers may keep running. Blobs of earlier bundles are not written again. Search indexes are not
+    included, because they can be rebuilt. The exit code is 1 if a blob was missing or damaged. A
+    bundle contains all frames and the hashes of keys: protect it like the data folder.
     """
     from sceneprint.bundle.backup import take_backup
 
@@ -250,16 +249,16 @@ def _add_database_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--database", metavar="URL",
         help="URL such as postgresql://user@host/name (default: SCENEPRINT_DATABASE_URL, else "
-        "SQLite in the data folder); put a password into that variable or PGPASSWORD",
+        "SQLite in the data folder); put a password into that variable or into PGPASSWORD",
     )  # fmt: skip
 
 
 def _named_database(options: argparse.Namespace) -> Settings:
-    """Return the settings of the environment with the database that `--database` names.
+    """Return the settings of the environment with the database of `--database`.
 
     Raises
     ------
-    InvalidRequest : its URL has a password, which everybody on the machine could see.
+    InvalidRequest : If the URL contains a password, which all users of the machine could see.
     """
     from pydantic import SecretStr
     from sqlalchemy import make_url
@@ -272,20 +271,21 @@ def _named_database(options: argparse.Namespace) -> Settings:
         url = make_url(options.database)
     except (ArgumentError, ValueError):
         raise InvalidRequest(
-            "--database: not a database URL such as postgresql://user@host/name."
+            "--database is not a database URL such as postgresql://user@host/name."
         ) from None
     if url.password is not None or "password" in url.query:
         raise InvalidRequest(
-            "--database: a password on the command line is visible to everybody on this "
-            "machine. Set PGPASSWORD, or put the whole URL into SCENEPRINT_DATABASE_URL."
+            "--database: a password on the command line is visible to all users of this machine. "
+            "Set PGPASSWORD, or put the whole URL into SCENEPRINT_DATABASE_URL."
         )
     return settings.model_copy(update={"database_url": SecretStr(options.database)})
 
 
 def _contents(bundle: Bundle) -> str:
-    held = bundle.manifest
+    manifest = bundle.manifest
     return (
-        f"{held.maps} maps, {held.n_frames} frames, {held.blobs} blobs, {held.bytes / 1e6:,.1f} MB"
+        f"{manifest.maps} maps, {manifest.n_frames} frames, {manifest.blobs} blobs, "
+        f"{manifest.bytes / 1e6:,.1f} MB"
     )
 
 
@@ -294,7 +294,7 @@ def _report_lost(bundle: Bundle, advice: str) -> int:
     if not bundle.lost:
         return 0
     for one in bundle.lost[:_SHOWN]:
-        print_error(f"not in it: blob {one.digest[:12]}, {one.why}")
+        print_error(f"missing: blob {one.digest[:12]}, {one.why}")
     if len(bundle.lost) > _SHOWN:
         print_error(f"... and {len(bundle.lost) - _SHOWN} more")
     print_error(f"Everything else is included. {advice}")
@@ -307,13 +307,13 @@ def add_restore(command: argparse.ArgumentParser) -> None:
         "place", metavar="PLACE", help="folder or URL that `sceneprint snapshot` wrote to"
     )
     _add_database_options(command)
-    command.add_argument("--bundle", metavar="NAME", help="bundle to restore (default: the newest)")
+    command.add_argument("--bundle", metavar="NAME", help="bundle to restore (default: newest)")
     command.add_argument(
         "--verify-only", action="store_true",
-        help="read and check the whole bundle without restoring it",
+        help="verify the whole bundle without restoring it",
     )  # fmt: skip
     command.add_argument(
-        "--list", action="store_true", help="list the bundles of the place, and restore none"
+        "--list", action="store_true", help="list the bundles of the place without restoring any"
     )
     command.add_argument(
         "--keys", choices=("keep", "revoke"),
@@ -324,11 +324,11 @@ def add_restore(command: argparse.ArgumentParser) -> None:
 
 
 def run_restore(options: argparse.Namespace) -> int:
-    """Restore a bundle to a data folder, verifying every byte. With the URL of an empty PostgreSQL
-    database, its rows go there in one transaction, and its blobs to SCENEPRINT_BLOB_URL or else
-    the data folder. A folder that is not empty stays untouched. A restore that was interrupted
-    goes on when you run it again. Exit code 1 if the bundle lists blobs that were damaged when it
-    was taken; 2 if nothing was restored.
+    """Restore a bundle to a data folder and verify every byte. With the URL of an empty PostgreSQL
+    database, rows are restored to it in one transaction, and blobs to SCENEPRINT_BLOB_URL or else
+    the data folder. A folder that is not empty stays untouched. After an interruption, run the
+    command again to continue. The exit code is 1 if blobs were already damaged when the bundle was
+    taken, and 2 if nothing was restored.
     """
     from sceneprint.bundle import restoration
 
@@ -349,8 +349,8 @@ def run_restore(options: argparse.Namespace) -> int:
         else:
             if settings.blob_url is not None:
                 raise InvalidRequest(
-                    "SCENEPRINT_BLOB_URL is set, but blobs are restored to the data folder, where "
-                    "no service would look for them. Unset the variable, or restore into a fleet "
+                    "SCENEPRINT_BLOB_URL is set, but this restores blobs to the data folder, where "
+                    "a service would not find them. Unset the variable, or restore into a fleet "
                     "with --database."
                 )
             bundle = restoration.restore_to_folder(
@@ -369,7 +369,7 @@ def run_restore(options: argparse.Namespace) -> int:
         )
     advice = (
         "These blobs were damaged when the bundle was taken. Run `sceneprint fsck` on the restored "
-        "store to see whose they are."
+        "store to list the affected frames."
     )
     return _report_lost(bundle, advice)
 
@@ -392,33 +392,33 @@ def _list_bundles(name: str) -> int:
 
     place = BundlePlace.open(name)
     for bundle in place.names():
-        held = place.read(bundle)
-        print(f"{bundle}  {held.maps} maps, {held.n_frames} frames, {held.bytes / 1e6:,.1f} MB")
+        manifest = place.read(bundle)
+        size = f"{manifest.bytes / 1e6:,.1f} MB"
+        print(f"{bundle}  {manifest.maps} maps, {manifest.n_frames} frames, {size}")
     return 0
 
 
 def _server(settings: Settings) -> str:
-    """Return the database of a fleet, to show."""
+    """Return the address of a fleet's database; raise InvalidRequest for SQLite."""
     from sceneprint.store.database import reach_database
 
     database = reach_database(settings.database)
     database.close()
     if database.is_sqlite:
         raise InvalidRequest(
-            "SCENEPRINT_DATABASE_URL is set to SQLite, but a bundle is restored to the data "
-            "folder, where no service would look for it. Unset the variable, for the service "
-            "too."
+            "SCENEPRINT_DATABASE_URL is set to SQLite, but this restores to the data folder, where "
+            "a service would not find the bundle. Unset the variable, also for the service."
         )
     return one_line(database.shown)
 
 
-# `sceneprint pull`: a robot's copies of maps, to localise without network.
+# `sceneprint pull`.
 
 
 def add_pull(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint pull`."""
     command.add_argument(
-        "--map", action="append", metavar="NAME", required=True, help="a map; may be repeated"
+        "--map", action="append", metavar="NAME", required=True, help="name of a map; repeatable"
     )
     add_data_option(command)
     add_service_options(command)
@@ -426,8 +426,8 @@ def add_pull(command: argparse.ArgumentParser) -> None:
 
 
 def run_pull(options: argparse.Namespace) -> int:
-    """Copy maps of a service to a data folder, without uploads and keys. Only what is new is
-    downloaded. A key that may read the maps suffices, and programs may use the folder meanwhile.
+    """Copy maps of a service to a data folder, without uploads and keys. Only new data is
+    downloaded. The key must have `read` for the maps. Programs may use the folder meanwhile.
     """
     from sceneprint.engine.maps.map_copy import claim_folder, pull_map
     from sceneprint.store import open_store
@@ -435,8 +435,8 @@ def run_pull(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     if settings.database_url is not None or settings.blob_url is not None:
         raise InvalidRequest(
-            "SCENEPRINT_DATABASE_URL or SCENEPRINT_BLOB_URL is set, but a copy lies in its data "
-            "folder. Unset them."
+            "SCENEPRINT_DATABASE_URL or SCENEPRINT_BLOB_URL is set, but `pull` writes to a data "
+            "folder only. Unset them."
         )
     folder = settings.data_dir.absolute()
     claim_folder(folder)
@@ -458,11 +458,11 @@ def run_pull(options: argparse.Namespace) -> int:
     return 0
 
 
-# `sceneprint reencode`: a map signed with another model, to which it then switches.
+# `sceneprint reencode`.
 
-#: Seconds without a frame signed after which no worker is believed to run.
+#: Time without a signed frame after which no worker seems to run, seconds.
 STALL_S = 120.0
-#: Seconds between two looks; longer where a look takes more than a tenth of it.
+#: Interval of progress checks, seconds; at least ten times the duration of a check.
 LOOK_S = 0.5
 
 
@@ -474,7 +474,7 @@ def add_reencode(command: argparse.ArgumentParser) -> None:
     what.add_argument("--status", action="store_true", help="show the progress")
     what.add_argument(
         "--cancel", action="store_true",
-        help="keep the current model, and discard signatures of the new one",
+        help="keep the current model, and delete signatures of the new one",
     )  # fmt: skip
     command.add_argument("--wait", action="store_true", help="wait until the map has switched")
     add_data_option(command)
@@ -482,10 +482,10 @@ def add_reencode(command: argparse.ArgumentParser) -> None:
 
 
 def run_reencode(options: argparse.Namespace) -> int:
-    """Sign every frame of a map again with another model, from the stored uploads. Workers sign
-    new uploads first. Queries use the current model until all frames are signed; then the map
-    switches at once. Works on the data folder, also while a service runs on it. Run the same
-    command again to retry failed frames.
+    """Sign all frames of a map with another model, from the stored uploads. Workers sign new
+    uploads first. Queries use the current model until all frames are signed; then the map switches
+    at once. The command works on the data folder, even while a service runs on it. Run it again to
+    retry failed frames.
     """
     from sceneprint.engine.context import open_context
     from sceneprint.engine.maps import map_lifecycle
@@ -512,18 +512,18 @@ def _print_reencoding(one: Map) -> None:
     print(f"next model: {coming.model}; {coming.done} frames signed, {coming.left} waiting")
     if coming.failed:
         print(
-            f"{coming.failed} frames cannot be signed with it: they will be rejected when the "
-            "map switches"
+            f"{coming.failed} frames cannot be signed with it and will be rejected when the map "
+            "switches"
         )
     if coming.dead:
         print(
-            f"{coming.dead} frames failed every attempt, and the map does not switch until they "
-            "are signed or deleted: see their jobs, then run this with --model again"
+            f"{coming.dead} frames failed in every attempt, and the map does not switch until they "
+            "are signed or deleted: read their jobs, then run this with --model again"
         )
 
 
 def _wait(context: Context, one: Map) -> int:
-    """Wait as long as frames are signed now and then; return 2 if they are not."""
+    """Wait while frames are being signed; return 2 if the progress stops."""
     from sceneprint.engine.admin.statistics import Statistics
     from sceneprint.engine.maps.map_lifecycle import get_map
 

@@ -1,4 +1,4 @@
-"""`sceneprint upload`: frames of a data set into a map of a service."""
+"""`sceneprint upload`: uploads of frames to a map of a service."""
 
 from __future__ import annotations
 
@@ -63,29 +63,29 @@ if TYPE_CHECKING:
     from sceneprint_client.api.frames import SampleRange, UploadSummary
     from sceneprint_client.api.listing import Session
 
-# The frames of an upload, counted by their outcomes.
+# Outcomes of uploaded frames.
 
 
 @dataclass
 class Tally:
-    """Counts frames by their outcomes."""
+    """Counts of frames by their outcomes."""
 
     new: int = 0
-    there: int = 0  #: in the map before
+    there: int = 0  #: frames that the map already had
     refused: int = 0
     indexed: int = 0
     rejected: int = 0
     failed: int = 0
-    redundant: int = 0  #: not kept, as the map had their places
-    #: Names of the frames that are not signed yet, by their jobs; one content has one job.
+    redundant: int = 0  #: frames that were not kept, because the map already covered their places
+    #: Names of frames that are not signed yet, by their jobs. Frames of equal content share a job.
     waiting: dict[str, list[str]] = field(default_factory=dict)
-    errors: list[tuple[str, str]] = field(default_factory=list)  #: name of a frame, and why
-    ranges: list[SampleRange] = field(default_factory=list)  #: of the frames that were received
-    summaries: list[str] = field(default_factory=list)  #: of archives
-    lost: int = 0  #: frames and poses that could not be sent, though no option leaves them out
+    errors: list[tuple[str, str]] = field(default_factory=list)  #: name of a frame, and reason
+    ranges: list[SampleRange] = field(default_factory=list)  #: ranges of received frames
+    summaries: list[str] = field(default_factory=list)  #: summaries of archives
+    lost: int = 0  #: frames and poses that were not sent, although no option excludes them
 
     def count(self, name: str, added: Added, new: bool) -> None:
-        """Count a frame that was received, or is in the map."""
+        """Count a frame that was received or is already in the map."""
         from sceneprint_client.api import FrameState
 
         self.new += new
@@ -102,7 +102,7 @@ class Tally:
             self._lose(name, added.reason, rejected=added.state is FrameState.REJECTED)
 
     def refuse(self, name: str, reason: str) -> None:
-        """Count a frame that was not received."""
+        """Count a frame that was refused."""
         self.refused += 1
         self.errors.append((name, reason))
 
@@ -120,7 +120,7 @@ class Tally:
                 self._lose(name, reason, rejected=job.state is JobState.FAILED)
 
     def report(self, total: int, seconds: float) -> None:
-        """Print the counts, and a line for each frame that was not indexed."""
+        """Print the counts, and one line for each frame that was not indexed."""
         refused = f", {self.refused} refused" if self.refused else ""
         waiting = f", {len(self.waiting)} waiting" if self.waiting else ""
         redundant = f", {self.redundant} redundant" if self.redundant else ""
@@ -139,21 +139,19 @@ class Tally:
         self.errors.append((name, f"{what}: {reason or 'no reason'}"))
 
 
-# Waiting until the frames of an upload are signed.
+# Waiting for the frames of an upload.
 
 
 def wait_for_all(
     client: Client, map_name: str, tally: Tally, patience: Patience, *, may_be_redundant: bool
 ) -> None:
-    """Wait for the jobs until all have ended or patience has; `tally.waiting` has the rest.
+    """Wait for jobs until all have ended or the time limit is over; `tally.waiting` has the rest.
 
     Parameters
     ----------
-    client : of the service
-    map_name : of the map
-    tally : of the upload, which counts every job that is over
-    patience : how long to wait
-    may_be_redundant : whether frames were sent to be kept only where the map lacks the place
+    tally : counts of the upload, updated for every job that ends
+    patience : time limit
+    may_be_redundant : whether frames were sent with the condition that their place is new
     """
     total = len(tally.waiting)
     with progress_bar("sign", total=total) as progress:
@@ -174,7 +172,7 @@ def wait_for_all(
 
 
 def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
-    """Return whether a frame was signed and not kept, which its job alone does not show."""
+    """Return whether a frame was signed but not kept, which its job does not show."""
     from sceneprint_client.api import FrameState, JobState
 
     if job.state is not JobState.SUCCEEDED:
@@ -182,21 +180,21 @@ def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
     return client.frame(map_name, str(job.frame_id)).state is FrameState.REDUNDANT
 
 
-# Metadata of all frames of a command.
+# Metadata of frames from options.
 
 
 def add_frame_options(
     command: argparse.ArgumentParser, up: Callable[[str], object] = up_of
 ) -> None:
-    """Add `--robot` and other metadata of frames; `up` reads the text of `--up`."""
+    """Add `--robot` and other metadata of frames; `up` parses the value of `--up`."""
     command.add_argument(
         "--row", type=row_option, metavar="NAMES",
-        help="what a row of float32 in .bin files holds, such as x,y,z,i,ring (default: x,y,z and "
+        help="values in a float32 row of .bin files, such as x,y,z,i,ring (default: x,y,z and "
         "intensity)",
     )  # fmt: skip
     command.add_argument(
         "--robot", metavar="NAME",
-        help="robot that took the frames; also qualifies the parent frame of the poses",
+        help="robot that took the frames; also a prefix of the parent frame of the poses",
     )  # fmt: skip
     command.add_argument(
         "--session", metavar="NAME", help="session of the frames (default: the sequence's name)"
@@ -206,17 +204,17 @@ def add_frame_options(
     )
     command.add_argument(
         "--parent-frame", metavar="NAME",
-        help="parent frame of all poses; poses of several uploads are combined if they share it "
+        help="parent frame of all poses; uploads with the same parent frame share coordinates "
         "(default: the name of the scene's folder, with --robot ROBOT/SCENE)",
     )  # fmt: skip
-    command.add_argument("--no-pose", action="store_true", help="do not upload known poses")
+    command.add_argument("--no-pose", action="store_true", help="do not upload poses")
     command.add_argument(
         "--trust-depth", action="store_true",
-        help="take depth images that do not look like depth, which are refused else",
+        help="accept depth images that fail the sanity check",
     )  # fmt: skip
     command.add_argument(
         "--base", type=base_of, metavar="TX,TY,TZ,QX,QY,QZ,QW",
-        help="mounting pose of the sensor, sensor to base: metres and a unit quaternion",
+        help="mounting pose of the sensor (sensor to base): metres and a unit quaternion",
     )  # fmt: skip
     command.add_argument(
         "--base-frame", metavar="NAME", help="name of the robot's base frame (default: base_link)"
@@ -227,7 +225,7 @@ def add_frame_options(
 def frame_metadata(
     options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
 ) -> FrameMeta:
-    """Return the metadata of a frame, with that of the options; raises as `meta_of`."""
+    """Return the metadata of a frame, including the options; errors are those of `meta_of`."""
     from sceneprint.formats.dataset.frame_reference import parent_frame_of, session_of
     from sceneprint_client.frame_files import meta_of
 
@@ -244,7 +242,7 @@ def frame_metadata(
     )
 
 
-#: Errors of one frame, after which the next is still uploaded.
+#: Errors of one frame, after which the upload continues.
 OF_FRAME = (
     FrameError, DatasetError, FrameConflict, InvalidRequest, MissingDependency, Refused,
 )  # fmt: skip
@@ -265,14 +263,14 @@ def add_upload(command: argparse.ArgumentParser) -> None:
         "--model", choices=PRESETS, help=f"model of a new map (default: {PRESETS[0]})"
     )
     command.add_argument(
-        "--every", type=positive, default=1, metavar="N", help="upload every Nth frame"
+        "--every", type=positive, default=1, metavar="N", help="upload every n-th frame"
     )
     add_signing_options(command)
     command.add_argument("--no-wait", action="store_true", help="do not wait for signing")
     command.add_argument(
         "--timeout", type=positive_number, metavar="SECONDS",
-        help="wait so long for signing; frames that are not signed by then are signed later "
-        f"(default: until none was signed for {STALL_S:.0f} s)",
+        help="time limit for signing; the remaining frames are signed later (default: "
+        f"{STALL_S:.0f} s without a signed frame)",
     )  # fmt: skip
     command.add_argument(
         "--parallel", type=positive, default=4, metavar="N",
@@ -285,13 +283,12 @@ def add_upload(command: argparse.ArgumentParser) -> None:
 
 
 def run_upload(options: argparse.Namespace) -> int:
-    """Upload every frame of the given files and folders (7-Scenes, TUM RGB-D or plain depth
-    images, with an intrinsics.json beside them or in a folder above; or point clouds), and wait
-    until they are signed. Of a recording of ROS (MCAP, rosbag2, ROS 1 bag) keyframes are
-    uploaded. RTAB-Map databases, E57 files, and exports of Polycam, Record3D and nerfstudio are
-    taken with their poses. A zip or tar archive is sent whole and unpacked by the service. With
-    --as-map, one cloud or mesh of a whole place becomes the map. A frame that the map already
-    has is not stored twice.
+    """Upload all frames of files and folders (7-Scenes, TUM RGB-D, depth images with an
+    intrinsics.json beside them or in a folder above, or point clouds), and wait until they are
+    signed. From a ROS recording (MCAP, rosbag2, ROS 1 bag), keyframes are uploaded. RTAB-Map
+    databases, E57 files, and exports of Polycam, Record3D and nerfstudio are uploaded with their
+    poses. A zip or tar archive is sent whole, and the service unpacks it. With --as-map, one cloud
+    or mesh of a whole place becomes the map. Frames that the map already has are not stored twice.
     """
     check_map_options(options)
     if options.as_map:
@@ -315,11 +312,11 @@ def run_upload(options: argparse.Namespace) -> int:
                 if tally.waiting:
                     late = True
                     _report_late(client, options, tally)
-        finally:  # what was received stays, however the run ended
+        finally:  # received frames stay, even after an error
             counted = tally.new + tally.there + tally.refused
             tally.report(max(len(found), counted), time.perf_counter() - start)
             for sequence in sequences:
-                if sequence.layout.is_export:  # the summary has the notes of others
+                if sequence.layout.is_export:  # the summary contains the notes of others
                     print_note(sequence)
                 tally.lost += 0 if options.no_pose else sequence.lost
             hint_at_maps(paths)
@@ -343,22 +340,21 @@ def _report_late(client: Client, options: argparse.Namespace, tally: Tally) -> N
 
 
 def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
-    """Return advice after an upload, on poses, their parent frames, and the model of the map.
+    """Return advice after an upload about the poses, the parent frames and the model of the map.
 
     Parameters
     ----------
-    client, map_name : of the map
-    clouds : point clouds among the frames that were uploaded
+    clouds : number of uploaded point clouds
     """
     now, lines = client.map(map_name), []
     if clouds and now.model.startswith("depth-"):
         lines.append(
-            f"{clouds} of the frames are point clouds, and map {now.name} has the model for depth "
-            f"cameras. For scans of a LiDAR, `sceneprint reencode {now.name} --model lidar` "
-            "switches it."
+            f"{clouds} of the frames are point clouds, but map {now.name} has the model for depth "
+            f"cameras. For LiDAR scans, switch it with `sceneprint reencode {now.name} --model "
+            "lidar`."
         )
     if now.frames.get("indexed") and not now.posed_frames:
-        lines.append(f"map {now.name} has no poses: queries find frames, and no coordinates")
+        lines.append(f"map {now.name} has no poses, so answers have frames but no coordinates")
     if now.parent_frames > 1:
         first: dict[str, Session] = {}
         for one in client.sessions(now.name):
@@ -368,15 +364,15 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
         two = list(first.values())[:2]
         line = (
             f"the poses of map {now.name} are in {now.parent_frames} parent frames, and an answer "
-            "is in that of its matches. The service joins those that surely show one place"
+            "uses that of its matches. The service joins those that reliably show one place"
         )
         if len(two) == 2:
             options = " ".join(f"--session {shlex.quote(str(one.session))}" for one in two)
             if two[0].session == two[1].session and all(one.robot for one in two):
                 options += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
             line += (
-                f"; `sceneprint make association {now.name} {options}` does so at once, or says "
-                "why not"
+                f"; `sceneprint make association {now.name} {options}` does so at once, or "
+                "explains why not"
             )
         lines.append(f"{line}.")
     return lines
@@ -385,17 +381,17 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
 def summary_of(
     found: list[tuple[FrameSequence, FrameReference]], tally: Tally, *, with_pose: bool
 ) -> UploadSummary:
-    """Return the summary of the frames that were found and sent."""
+    """Return the summary of the uploaded frames."""
     from sceneprint_client.api.frames import upload_summary
 
-    lost = {name for name, _ in tally.errors}
+    failed = {name for name, _ in tally.errors}
     without: Counter[str] = Counter()
     for sequence, frame in found:
         if not with_pose:
             without["--no-pose"] += 1
         elif frame.pose_source is None:
             without[sequence.unposed] += 1
-        elif frame.name in lost:
+        elif frame.name in failed:
             without["not indexed"] += 1
     sequences = dict.fromkeys(sequence for sequence, _ in found)
     notes = [one_line(one.note) for one in sequences if one.note and not one.layout.is_export]
@@ -407,7 +403,7 @@ def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSe
 
     Raises
     ------
-    DatasetError : nothing is found at a path, or two places share the name of their poses' frame.
+    DatasetError : If a path has no frames, or two places have the same default parent frame.
     """
     from sceneprint.formats.dataset.frame_reference import numbered_sequences
 
@@ -424,16 +420,16 @@ def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSe
             known = places.setdefault(sequence.parent_frame, place)
             if known != place and options.parent_frame is None:
                 raise DatasetError(
-                    f"{path}: The name {sequence.parent_frame} is also used for {known}, and poses "
-                    "of the two would be mixed. Upload a folder above both, rename one, or, if "
-                    "their poses share one parent frame, name it with --parent-frame."
+                    f"{path}: the parent frame {sequence.parent_frame} is also that of {known}, "
+                    "and poses of the two would be mixed. Upload a folder above both, rename one, "
+                    "or, if their poses share one parent frame, specify it with --parent-frame."
                 )
             sequences.append(sequence)
     return numbered_sequences(sequences, options.session)
 
 
 def row_option(text: str) -> tuple[str, ...]:
-    """Read the names of `--row`."""
+    """Parse the value of `--row`."""
     try:
         return row_of(text)
     except DatasetError as error:
@@ -441,15 +437,15 @@ def row_option(text: str) -> tuple[str, ...]:
 
 
 def _with_row(sequence: FrameSequence, row: tuple[str, ...]) -> FrameSequence:
-    """Return a sequence of .bin files whose rows hold these values."""
+    """Return a sequence of .bin files with these names of values in a row."""
     frames = tuple(
         replace(one, cloud=replace(one.cloud, row=row)) for one in sequence.frames if one.cloud
     )
     if len(frames) < len(sequence.frames) or not all(one.row for one in frames):
         raise InvalidRequest(
-            f"--row is for .bin files, and {sequence.name} has others. Leave it out, or name "
-            "folders of .bin files alone.",
-            (("row", "not of these files"),),
+            f"--row is for .bin files, but {sequence.name} has other files. Omit it, or specify "
+            "only folders of .bin files.",
+            (("row", "not allowed for these files"),),
         )
     return replace(sequence, frames=frames)
 
@@ -460,12 +456,12 @@ def _ensure_map(client: Client, options: argparse.Namespace) -> None:
     except UnknownMap:
         if not options.create:
             raise
-        made = client.create_map(options.map, model=options.model or PRESETS[0])
-        print(f"created map {made.name} with model {made.model}")
+        record = client.create_map(options.map, model=options.model or PRESETS[0])
+        print(f"created map {record.name} with model {record.model}")
         return
     if options.model is not None and model.rpartition("-")[0] != options.model:
         raise MapExists(
-            f"Map {options.map} already exists with model {model}. Leave --model out, or use "
+            f"Map {options.map} already exists with model {model}. Omit --model, or use "
             "another map."
         )
 
@@ -476,7 +472,7 @@ def _send_all(
     found: list[tuple[FrameSequence, FrameReference]],
     tally: Tally,
 ) -> None:
-    """Upload all, several at a time, until an error of the service."""
+    """Upload all frames, several at a time, until the service fails."""
     pool = ThreadPoolExecutor(options.parallel, thread_name_prefix="upload")
     sent = {pool.submit(_send, client, options, *one): one[1].name for one in found}
     try:
@@ -488,7 +484,7 @@ def _send_all(
                 except OF_FRAME as error:
                     tally.refuse(name, str(error))
                 bar.update()
-    finally:  # also where Ctrl-C ends it: what is in flight arrives, nothing follows it
+    finally:  # uploads in progress complete, even after Ctrl-C, and no others start
         pool.shutdown(cancel_futures=True)
         for future, name in sent.items():
             if not future.cancelled() and future.exception() is None:

@@ -1,7 +1,7 @@
-"""The dashboard: static pages that use the public HTTP API, as any other page would.
+"""The dashboard: static pages that use only the public HTTP API.
 
-What is in the folder `pages` when the service starts is all that is served: a path of a request
-is looked up among those names, and never reaches the disk.
+The service reads the folder `pages` at startup and serves only those files. Paths of requests are
+looked up among their names and never reach the disk.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from starlette.exceptions import HTTPException
 from service.static_files import KINDS, StaticFile, answer_file, read_file
 
 PAGES = Path(__file__).parent / "pages"
-#: The page that all others are shown in.
+#: Page that contains all other pages.
 INDEX = "index.html"
-#: Nothing from elsewhere, nothing written into the page, no frame around it, no form sent away.
+#: No external content, no inline scripts, no embedding in frames, no forms.
 POLICY = "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 
 
 def files_in(folder: Path) -> dict[str, StaticFile]:
-    """Files of a folder and those within it that a browser is sent, by their path from there."""
+    """Return the files of a folder and its subfolders that browsers load, by relative path."""
     return {
         path.relative_to(folder).as_posix(): read_file(path)
         for path in sorted(folder.rglob("*"))
@@ -44,7 +44,7 @@ def routes(files: Mapping[str, StaticFile]) -> APIRouter:
     def front(request: Request) -> Response:
         if "text/html" not in request.headers.get("accept", ""):
             raise HTTPException(404, "Not Found")
-        # from where it was asked for, so that a proxy's prefix and its TLS stay
+        # A relative address keeps the prefix and the TLS of a proxy.
         return Response(status_code=307, headers={"Location": "dashboard", "Vary": "Accept"})
 
     @router.api_route("/dashboard", methods=["GET", "HEAD"])

@@ -1,4 +1,4 @@
-"""Whether the service lives, whether it can work, and its figures."""
+"""Routes of the operator: health, metrics, keys, the audit log, statistics and models."""
 
 from __future__ import annotations
 
@@ -35,33 +35,33 @@ from service.running_service import Here
 
 router = APIRouter(tags=["operations"])
 
-#: Seconds that `/readyz` waits to learn whether kernels have to be compiled.
+#: Longest time that `/readyz` waits for the state of the compiled kernels, seconds.
 LOOK_S = 1.0
 
 
 class Health(BaseModel):
-    """The service is running."""
+    """State of a running service."""
 
     status: str
     version: str
 
 
 class Readiness(Health):
-    """The service is ready; `read_only`: it answers queries, and accepts no changes."""
+    """State of a service that is ready. With `read_only` it answers queries and refuses changes."""
 
     read_only: bool
     frames: dict[str, int] | None = Field(
-        description="Number of frames in each state; null if you may not read all maps."
+        description="Number of frames in each state; null unless your key may read all maps."
     )
     jobs: dict[str, int] | None = Field(
-        description="Number of jobs in each state; null like `frames`."
+        description="Number of jobs in each state; null unless your key may read all maps."
     )
 
 
-@router.head("/healthz", include_in_schema=False)  # as balancers ask
+@router.head("/healthz", include_in_schema=False)  # load balancers send HEAD
 @router.get("/healthz", responses=declared())
 async def healthz() -> Health:
-    """Answers while the process lives, whatever else it does."""
+    """Return 200 while the process runs, even if the store is unavailable."""
     return Health(status="ok", version=__version__)
 
 
@@ -71,20 +71,19 @@ async def healthz() -> Health:
     openapi_extra={"security": [{}]},  # besides a key: none
 )  # fmt: skip
 async def readyz(here: Here, asking: Guest) -> Readiness:
-    """Answers while the database and the object store do; 503 while one does not, while kernels are
-    being compiled, and for good once a later version has migrated the store. Requires no key. The
-    answer is at most a second old.
+    """Return 200 if the service can work. It returns 503 while the database or the object store
+    does not respond, while kernels are being compiled, and permanently after a later version has
+    migrated the store. Requires no key. The result is at most one second old.
     """
-    found = await here.looks.get("readiness", partial(_look, here.context))
-    # who shows no key has nothing counted: that takes the longer the more there is
+    found = await here.looks.get("readiness", partial(_check_readiness, here.context))
+    # Counting takes time that grows with the store, so requests without a key get no counts.
     if asking is None or not asking.reads_every:
         return found
     frames, jobs = await here.looks.get("counts", here.statistics.state_counts)
     return found.model_copy(update={"frames": frames, "jobs": jobs})
 
 
-def _look(context: Context) -> Readiness:
-    """Check that the service can work; raises what it cannot do without."""
+def _check_readiness(context: Context) -> Readiness:
     context.signers.require_kernels(LOOK_S)
     context.store.blobs.check()
     context.store.database.require_schema()
@@ -103,18 +102,18 @@ def _look(context: Context) -> Readiness:
     "/metrics", response_class=Response, responses=declared(), dependencies=[Depends(reads_every)]
 )
 def metrics(here: Here) -> Response:
-    """Figures for Prometheus; a key, where one is asked for, must have `read` for `*`."""
+    """Return metrics in the format of Prometheus. With required keys, it takes `read` for `*`."""
     figures = here.statistics.figures()
     held, spool = here.requests.by_tenant(), here.spool.by_tenant()
     text = here.metrics.text(figures, here.feed.streams, here.context.query_log.lost, held, spool)
     return Response(text, media_type=CONTENT_TYPE_LATEST)
 
 
-# Keys, and who changed what.
+# Keys and the audit log.
 
 keys_router = v1_router(tag="keys")
 
-Cursor = Annotated[str | None, Query(description="`next_cursor` of the page before.")]
+Cursor = Annotated[str | None, Query(description="`next_cursor` of the previous page.")]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 
 
@@ -126,7 +125,7 @@ Limit = Annotated[int, Query(ge=1, le=1000)]
     dependencies=[Depends(administers)],
 )
 async def create_key(request: Request, here: Here, response: Response) -> MadeKey:
-    """Make a key. Its secret is in this answer and nowhere else; a lost one is revoked."""
+    """Create a key. Only this response contains its secret; revoke a key whose secret is lost."""
     new = await read_record(request, NewKey, "The key")
     make = partial(
         operations.create_key, here.context.store, new.name, new.grants, new.expires_at, new.tenant
@@ -138,13 +137,13 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
 
 @keys_router.get("/keys", responses=declared(422), dependencies=[Depends(administers)])
 def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key]:
-    """Keys by name, without their secrets."""
+    """List keys by name, without their secrets."""
     return operations.list_keys(here.context.store, cursor, limit)
 
 
 @keys_router.get("/keys/me", responses=declared())
 def me(asking: Asking) -> Me:
-    """What the key may do that is shown."""
+    """Return the name, the grants and the expiry of the key of this request."""
     until = asking.expires_at
     return Me(
         name=asking.name or None,
@@ -159,20 +158,21 @@ def me(asking: Asking) -> Me:
     dependencies=[Depends(administers)],
 )
 def rotate_key(
-    key_name: Annotated[str, Path(description="Of the key.")],
+    key_name: Annotated[str, Path(description="Name of the key.")],
     here: Here,
     overlap_s: Annotated[
         float,
         Query(
             ge=0,
             le=operations.MOST_OVERLAP_S,
-            description="Seconds for which the secret before still works; 0: it ends now.",
+            description="Seconds for which the previous secret still works; 0 revokes it now.",
         ),
     ] = operations.OVERLAP_S,
 ) -> MadeKey:
-    """Give a key a new secret, which is in this answer and nowhere else.
+    """Give a key a new secret. Only this response contains it.
 
-    Rotated again within the overlap, the secret in use keeps its end, and the new one is replaced.
+    A second rotation within the overlap replaces the new secret; the previous secret still expires
+    at the time that the first rotation set.
     """
     return operations.rotate_key(here.context.store, key_name, overlap_s)
 
@@ -183,8 +183,8 @@ def rotate_key(
     responses=declared(404),
     dependencies=[Depends(administers)],
 )
-def revoke_key(key_name: Annotated[str, Path(description="Of the key.")], here: Here) -> None:
-    """Let a key open nothing any more, from the next request on, on every machine of the store."""
+def revoke_key(key_name: Annotated[str, Path(description="Name of the key.")], here: Here) -> None:
+    """Revoke a key. It is refused from the next request on, on every machine of the store."""
     operations.revoke_key(here.context.store, key_name)
 
 
@@ -192,26 +192,26 @@ def revoke_key(key_name: Annotated[str, Path(description="Of the key.")], here: 
 def list_changes(
     here: Here,
     actor: Annotated[
-        str | None, Query(max_length=128, description="Name of the key that made them.")
+        str | None, Query(max_length=128, description="Only changes by the key of this name.")
     ] = None,
     map_name: Annotated[
-        str | None, Query(alias="map", max_length=63, description="That was changed.")
+        str | None, Query(alias="map", max_length=63, description="Only changes of this map.")
     ] = None,
     action: Annotated[
         str | None,
-        Query(max_length=32, description="Beginning of the action, such as `key.` or `refused`."),
+        Query(max_length=32, description="Prefix of the action, such as `key.` or `refused`."),
     ] = None,
     cursor: Cursor = None,
     limit: Limit = 100,
 ) -> Page[AuditLine]:
-    """List who changed what, and which requests were refused (401, 403), the newest first.
+    """List changes and refused requests (401, 403) with their keys, newest first.
 
-    Lines are kept for `SCENEPRINT_AUDIT_LOG_DAYS`, and at most a million of each tenant.
+    The log keeps lines for `SCENEPRINT_AUDIT_LOG_DAYS`, and at most a million per tenant.
     """
     return here.audit.page(AuditFilter(actor, map_name, action), cursor, limit)
 
 
-# How the service does, what maps can be signed with, and changing that.
+# Statistics, and the models of maps.
 
 operations_router = v1_router(tag="operations")
 
@@ -222,11 +222,11 @@ def stats(
     asking: Asking,
     map_name: Annotated[
         str | None,
-        Query(alias="map", description="Of this map alone, for who may read that but not all."),
+        Query(alias="map", description="Only this map; required if the key may not read all maps."),
     ] = None,
-    minutes: Annotated[int, Query(ge=1, le=60, description="Of history.")] = 60,
+    minutes: Annotated[int, Query(ge=1, le=60, description="Length of the history.")] = 60,
 ) -> Stats:
-    """How the service does now, and did in the last hour, whichever of its processes did it."""
+    """Return the present load and the history of up to an hour, over all processes."""
     if map_name is None:
         asking.require_every("read")
     else:
@@ -236,9 +236,9 @@ def stats(
 
 @operations_router.get("/models", responses=declared())
 def models(here: Here, asking: Asking) -> Page[ModelInfo]:
-    """Models that a map can be signed with: those that ship, and those that maps have or had."""
+    """List models for maps: the presets, and those that maps have or had."""
     found = here.catalogue.tell(lambda name: asking.may("read", name))
-    if not asking.reads_every:  # one that only other maps have tells of them
+    if not asking.reads_every:  # a model of unreadable maps would reveal them
         found = [one for one in found if one.preset or one.maps]
     return Page[ModelInfo](items=found)
 
@@ -251,10 +251,10 @@ def models(here: Here, asking: Asking) -> Page[ModelInfo]:
     dependencies=[Depends(may_admin)],
 )
 async def reencode(map_name: str, request: Request, here: Here, asking: Asking) -> Map:
-    """Have every frame of a map signed with another model; the map switches when all are.
+    """Sign all frames of a map with another model. The map switches when all are signed.
 
-    Queries go on with the model that the map has until then. `reencoding` of the map tells how
-    far it is. Asked again, it tries again what broke down.
+    Until then, queries use the present model. `reencoding` of the map shows the progress. A
+    repeated request retries failed frames.
     """
     wanted = await read_record(request, NewModel, "The model")
     may_read = None if asking.reads_every else partial(asking.may, "read")
@@ -270,5 +270,5 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
     "/maps/{map_name}/reencoding", responses=declared(404, 409), dependencies=[Depends(may_admin)]
 )
 def cancel_reencoding(map_name: str, here: Here) -> Map:
-    """Let a map keep the model that it has; what was made for the other is removed."""
+    """Cancel the change of a map's model and delete the signatures of the new model."""
     return map_lifecycle.cancel_reencoding(here.context.store, map_name)

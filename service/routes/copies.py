@@ -1,4 +1,4 @@
-"""One map for a robot's own store: who may read it may copy it."""
+"""Routes that copy a map to a robot's own store. They require the scope `read` of the map."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ _BYTES: dict[int | str, dict[str, Any]] = {
     openapi_extra=json_body("CopyRequest"),
 )  # fmt: skip
 async def copy_map(map_name: str, request: Request, here: Here) -> Response:
-    """The map and its indexed frames at one moment: a line with the head, a `MapCopy` as JSON, and
-    the bytes of the parts that the caller lacks, at most some 32 MB. Ask again for the others.
+    """Return a consistent copy of a map and its indexed frames: a first line with a `MapCopy` as
+    JSON, then the bytes of the parts that are not in `have`, at most approximately 32 MB. Repeat
+    the request for the remaining parts.
     """
     known = await read_record(request, CopyRequest, "The request")
     return _response(await here.run(here.copies.bundle, map_name, frozenset(known.have)))
@@ -37,13 +38,13 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
 def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
-    """The geometry of an indexed frame, as validation compares it."""
+    """Return the geometry that validation compares of an indexed frame."""
     return _response(here.copies.artifact(map_name, digest))
 
 
 @router.get("/model", response_class=Response, responses={**_BYTES, **declared(404)})
 def get_map_model(map_name: str, here: Here) -> Response:
-    """The file of the map's model."""
+    """Return the model file of a map."""
     return _response(here.copies.model(map_name))
 
 

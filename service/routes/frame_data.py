@@ -1,4 +1,4 @@
-"""What a frame is made of, as files and as JSON; a client that has it is told so with 304."""
+"""Routes for the data of a frame, as files and as JSON, with ETags."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ async def get_cloud(
     frame: Annotated[
         CloudFrame,
         Query(
-            description="Coordinates: `optical` of the camera (of a cloud, its sensor), `parent` "
-            "of its pose, or `base` of the robot."
+            description="Frame of the coordinates: `optical` of the camera (for a cloud, its "
+            "sensor), `parent` of its pose, or `base` of the robot."
         ),
     ] = "optical",
 ) -> Response:
-    """The surface that was seen, as a cloud of up to 160 x 120 points: smoothed, as validation
-    compares it; of a point cloud, a range image's about its viewpoint. The samples themselves are
-    in the upload.
+    """Return the visible surface as a cloud of up to 160 x 120 points, smoothed as validation
+    compares it. A point cloud is first rendered as a range image around its viewpoint. The original
+    samples are in the upload.
     """
     found = await here.run(lambda: here.outputs.cloud(map_name, frame_id, frame))
     return await sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
@@ -72,7 +72,7 @@ async def get_cloud(
     "/preview.png",
     response_class=Response,
     responses=file_responses(
-        PNG, description="What its colours mean is in the tEXt chunks.", statuses=(404, 409, 422)
+        PNG, description="The tEXt chunks explain the colours.", statuses=(404, 409, 422)
     ),
 )
 async def get_preview(
@@ -83,16 +83,18 @@ async def get_preview(
     view: Annotated[
         View,
         Query(
-            description="`depth`: yellow near, violet far. `normals`: red, green, blue are "
-            "127.5 (1 + n) of x right, y down, z forward. `patches`: each of the finest level a "
-            "colour. Dark grey where nothing is known. Of a cloud what is seen around its "
-            "viewpoint, normals along its own axes; of one without, the view from above, with "
-            "heights in place of depth."
+            description="`depth`: yellow near, violet far. `normals`: red, green and blue are "
+            "127.5 (1 + n) for x right, y down, z forward. `patches`: one colour for each patch of "
+            "the finest level. Pixels without data are dark grey. A cloud is shown as seen from "
+            "its viewpoint, with normals along its own axes; without a viewpoint, it is shown from "
+            "above, with heights in place of depth."
         ),
     ] = "depth",
-    width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
+    width: Annotated[
+        int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Width in pixels.")
+    ] = WIDTH,
 ) -> Response:
-    """A picture of a frame, for people."""
+    """Return a picture of a frame."""
     found = await here.run(lambda: here.outputs.preview(map_name, frame_id, view, width))
     return await sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
 
@@ -100,13 +102,13 @@ async def get_preview(
 @router.get(
     "/patches",
     response_class=Response,
-    responses=file_responses(model=FramePatches, description="The same, as lists of numbers."),
+    responses=file_responses(model=FramePatches, description="The patches as lists of numbers."),
 )
 async def get_patches(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
-    """The surface patches of a frame, by level, and those that validation compares."""
+    """Return the surface patches of a frame by level, and the patches that validation compares."""
     found = await here.run(lambda: here.outputs.patches(map_name, frame_id))
-    told = Output(found.tag, lambda: found.make().model_dump_json().encode())
-    return await sent(request, here, told, JSON)
+    document = Output(found.tag, lambda: found.make().model_dump_json().encode())
+    return await sent(request, here, document, JSON)
 
 
 @router.get(
@@ -116,29 +118,29 @@ async def get_patches(map_name: str, frame_id: str, request: Request, here: Here
         BYTES,
         NPY,
         model=FrameSignature,
-        description="By Accept: JSON with the bytes as base64, the bytes, or an NPY file.",
+        description="Depending on Accept: JSON with base64, the bytes, or an NPY file.",
     ),
 )
 async def get_signature(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
-    """The signature of a frame. Signatures of one model are compared by the sum of absolute
-    differences of their bytes.
+    """Return the signature of a frame. The distance of two signatures of one model is the sum of
+    the absolute differences of their bytes.
     """
     outputs, kind = here.outputs, preferred_media_type(request, (JSON, BYTES, NPY))
     if kind == JSON:
-        made = await here.run(lambda: outputs.signature(map_name, frame_id))
-        told = Output(made.tag, lambda: made.make().model_dump_json().encode())
+        record = await here.run(lambda: outputs.signature(map_name, frame_id))
+        output = Output(record.tag, lambda: record.make().model_dump_json().encode())
     else:
-        told = await here.run(lambda: outputs.vector(map_name, frame_id, kind))
-    return await sent(request, here, told, kind, Vary="Accept")
+        output = await here.run(lambda: outputs.vector(map_name, frame_id, kind))
+    return await sent(request, here, output, kind, Vary="Accept")
 
 
 @router.get(
     "/upload",
     response_class=Response,
-    responses=files(media_types_of("depth", "cloud"), "Byte for byte as it came.", 409),
+    responses=files(media_types_of("depth", "cloud"), "The uploaded bytes, unchanged.", 409),
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
-    """The frame's upload: what you sent in is yours to take out."""
+    """Return the uploaded file of a frame."""
     found = await here.run(lambda: here.outputs.upload(map_name, frame_id))
     if is_known(request, found.tag):
         return Response(None, 304, tagged(found))
@@ -146,7 +148,7 @@ async def get_upload(map_name: str, frame_id: str, request: Request, here: Here)
 
 
 def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str) -> Response:
-    """An upload out of its file: of 70 MiB in memory each, a few slow readers would be too much."""
+    """Send an upload from its file; several uploads of 70 MiB in memory would be too much."""
     blobs, blob = here.context.store.blobs, found.blob or ""
     if blobs.condition(blob) == "sound":
         with suppress(FileNotFoundError):
@@ -154,19 +156,18 @@ def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str
                 kind, suffix = upload_type(file.read(HEAD))
             name = safe(f"{frame_id}{suffix}")
             return send_file(request, lambda: blobs.open(blob), kind, found.tag, name)
-    found.make()  # says what is wrong with it
-    raise DamagedBlob(f"The upload of frame {frame_id} was restored just now. Try again.")
+    found.make()  # raises an error that says what is wrong with the blob
+    raise DamagedBlob(f"The upload of frame {frame_id} has just been restored. Try again.")
 
 
-# Points as bytes that a page draws as they are; `sceneprint.formats.export` says what they
-# mean.
+# Points as bytes that a page draws without conversion; see `sceneprint.formats.export`.
 
 points_router = v1_router()
 
 Limit = Annotated[
-    int, Query(ge=1, le=MOST, description="Most points; of more, always the same ones are told.")
+    int, Query(ge=1, le=MOST, description="Maximum number of points; the choice is deterministic.")
 ]
-_BYTES = "12 bytes a point after a header of 48: docs/reference.md, Points. "
+_BYTES = "12 bytes per point after a header of 48 bytes; see docs/reference.md, Points. "
 
 
 @points_router.get(
@@ -185,10 +186,12 @@ async def get_frame_points(
     frame_id: str,
     request: Request,
     here: Here,
-    frame: Annotated[CloudFrame, Query(description="Coordinates, as of `cloud.ply`.")] = "optical",
+    frame: Annotated[
+        CloudFrame, Query(description="Frame of the coordinates, as for `cloud.ply`.")
+    ] = "optical",
     limit: Limit = LIMIT,
 ) -> Response:
-    """The points of `cloud.ply` in a third of its bytes, for a page to draw."""
+    """Return the points of `cloud.ply` in a third of its bytes, for drawing on a page."""
     found = await here.run(lambda: here.points.frame(map_name, frame_id, frame, limit))
     return await sent(request, here, found, MEDIA_TYPE)
 
@@ -206,7 +209,7 @@ async def get_frame_points(
 async def get_query_points(
     query_id: str, request: Request, here: Here, asking: Asking, limit: Limit = LIMIT
 ) -> Response:
-    """The surface that a query saw, for a page to draw, in the query's sensor's frame."""
+    """Return the surface of a query in the frame of its sensor, for drawing on a page."""
     await here.run(require_readable, query_id, here, asking)
     found = await here.run(lambda: here.points.query(query_id, limit))
     return await sent(request, here, found, MEDIA_TYPE)
@@ -218,7 +221,7 @@ async def get_query_points(
     response_class=Response,
     responses=file_responses(
         MEDIA_TYPE,
-        description=f"{_BYTES}With normals, validation patches and, where there is a transform, "
+        description=f"{_BYTES}With normals, validation patches and, if there is a transform, "
         "residuals.",
         statuses=(404, 409, 422),
     ),
@@ -230,18 +233,18 @@ async def get_match_points(
     here: Here,
     asking: Asking,
     map_name: MatchMap = None,
-    side: Annotated[PointsSide, Query(description="Whose points.")] = "query",
+    side: Annotated[PointsSide, Query(description="Which of the two frames to return.")] = "query",
     transform: Annotated[
         OverlayTransform,
         Query(
-            description="Under which they are compared: `aligned` as the match was found, `rival` "
-            "the other transform that fits best, `none` both as their cameras saw them."
+            description="Transform of the comparison: `aligned` of the match, `rival` the other "
+            "transform that fits best, `none` the identity."
         ),
     ] = "aligned",
     limit: Limit = LIMIT,
 ) -> Response:
-    """The query or a match of it, for a page to draw, each in its own sensor's frame; every point
-    says how far it is from the surface that the other saw.
+    """Return the query or one of its matches in the frame of its own sensor, for drawing on a page.
+    Every point has its distance from the surface of the other frame.
     """
     await here.run(require_readable, query_id, here, asking)
     found = await here.run(

@@ -1,4 +1,4 @@
-"""Jobs."""
+"""Routes for jobs and events."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from service.running_service import Here, Service
 
 router = v1_router("/jobs", "jobs")
 
-#: Dead jobs that one request looks at: each that is tried again is a commit.
+#: Maximum number of dead jobs in one request; each retry is a commit.
 MOST_RETRIED = 200
 
 
@@ -35,14 +35,18 @@ def list_jobs(
     here: Here,
     asking: Asking,
     state: JobState | None = None,
-    kind: Annotated[str | None, Query(max_length=16, description="Such as `associate`.")] = None,
-    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    kind: Annotated[
+        str | None, Query(max_length=16, description="Only this kind, such as `associate`.")
+    ] = None,
+    map_name: Annotated[
+        str | None, Query(alias="map", description="Only jobs of this map.")
+    ] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[Job]:
-    """Jobs of all maps, the newest first; `state=dead` lists what broke down again and again.
+    """List the jobs of all maps that the key may read, newest first.
 
-    With a key, those of the maps that it may read.
+    `state=dead` lists jobs that failed repeatedly.
     """
     names = asking.named
     if map_name is not None:
@@ -58,13 +62,18 @@ def list_jobs(
 def retry_dead_jobs(
     here: Here,
     asking: Asking,
-    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
-    limit: Annotated[int, Query(ge=1, le=MOST_RETRIED, description="Jobs looked at.")] = 100,
+    map_name: Annotated[
+        str | None, Query(alias="map", description="Only jobs of this map.")
+    ] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
+    limit: Annotated[
+        int, Query(ge=1, le=MOST_RETRIED, description="Number of jobs in one page.")
+    ] = 100,
 ) -> RetriedJobs:
-    """Try again all dead jobs, a page of them at a time; those that were tried since stay.
+    """Retry a page of the dead jobs. Jobs that were already retried are skipped.
 
-    Without `map` the key must write to all maps; jobs of no map are for admins.
+    Without `map`, this requires `write` for `*`; jobs that belong to no map require `admin` for
+    `*`.
     """
     if map_name is not None:
         asking.require(map_name, "write")
@@ -79,13 +88,13 @@ def retry_dead_jobs(
 
 @router.get("/{job_id}", responses=declared(404))
 def get_job(job_id: str, here: Here, asking: Asking) -> Job:
-    """What has become of a job."""
+    """Return a job and its state."""
     return asking.require_job(lifecycle.get_job(here.context.store, job_id))
 
 
 @router.post("/{job_id}/cancel", responses=declared(404, 409))
 def cancel_job(job_id: str, here: Here, asking: Asking) -> Job:
-    """Give up a job that is not over; its frame is `failed` then. Asked twice, it stays so."""
+    """Cancel an unfinished job; its frame becomes `failed`. A second request changes nothing."""
     asking.require_job(lifecycle.get_job(here.context.store, job_id), "write")
     return lifecycle.cancel(here.context.store, job_id)
 
@@ -94,13 +103,13 @@ def cancel_job(job_id: str, here: Here, asking: Asking) -> Job:
     "/{job_id}/retry",
     status_code=202,
     responses={
-        200: {"model": Job, "description": "Its frame is being tried again already, by this job."},
+        200: {"model": Job, "description": "This job is already retrying the frame."},
         **declared(404, 409),
     },
 )
 def retry_job(job_id: str, here: Here, asking: Asking, response: Response) -> Job:
-    """Try again what was given up (dead, cancelled or failed): a frame in a new job, a long job
-    as itself, from where it stood.
+    """Retry a dead, cancelled or failed job. A frame gets a new job; a long job continues from its
+    last progress under its own id.
     """
     asking.require_job(lifecycle.get_job(here.context.store, job_id), "write")
     job, is_new = lifecycle.retry(here.context.store, here.context.bell, job_id)
@@ -109,14 +118,14 @@ def retry_job(job_id: str, here: Here, asking: Asking, response: Response) -> Jo
     return job
 
 
-# Events: as a stream while they happen, or as pages of those that are kept.
+# Events, as a live stream or as pages of stored events.
 
 events_router = v1_router("/events", "operations")
 
 _STREAM = {
-    "description": "A page of events; or, where `Accept` names text/event-stream, a stream that "
-    "goes on: each message has the event's `id` and the event as JSON in `data`. "
-    "A comment comes every 3 s.",
+    "description": "A page of events; or, if `Accept` contains text/event-stream, an endless "
+    "stream whose messages have the `id` of the event and the event as JSON in `data`. The stream "
+    "sends a comment every 3 s.",
     "model": EventPage,
     "content": {MEDIA_TYPE: {"schema": {"type": "string"}}},
 }
@@ -127,58 +136,62 @@ async def events(
     request: Request,
     here: Here,
     asking: Asking,
-    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
+    map_name: Annotated[
+        str | None, Query(alias="map", description="Only events of this map.")
+    ] = None,
     kind: Annotated[
         list[str],
         Query(
             max_length=MOST_KINDS,
-            description="Beginning of the kinds that are wanted, such as `frame.` or "
-            "`frame.indexed`; more than once for several.",
+            description="Only kinds with this prefix, such as `frame.` or `frame.indexed`. Repeat "
+            "the parameter for several prefixes.",
         ),
     ] = [],  # noqa: B006  (FastAPI copies it)
     after: Annotated[
         str | None,
         Query(
             max_length=64,
-            description="Only events that followed the one of this id; `0`: all that are kept. "
-            "Without it a stream begins with what happens from now on.",
+            description="Only events after the event of this id; `0`: all stored events. Default "
+            "for a stream: only new events.",
         ),
     ] = None,
     order: Annotated[
         Literal["newest", "oldest"] | None,
-        Query(description="Of a page: which come first; the oldest where `after` is given."),
+        Query(description="Order of a page; default: `oldest` with `after`, `newest` without."),
     ] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Of a page.")] = 100,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Number of events in a page.")] = 100,
     last_event_id: Annotated[
         str | None,
-        Header(description="Of the last event that came: a stream goes on there. Goes before "
-               "`after`."),
+        Header(description="Id of the last received event; the stream continues after it. It "
+               "overrides `after`."),
     ] = None,
 ) -> Response:  # fmt: skip
-    """What happened: frames that came, were indexed or deleted, maps made and removed.
+    """List events, such as frames that were uploaded, indexed or deleted, and created or deleted
+    maps.
 
-    With `Accept: text/event-stream` the events come as they happen, half a second late at most,
-    each once and in order, also where several processes work on the store. Who lost the stream
-    sends the id of the last event as `Last-Event-ID`, as browsers do by themselves, and
-    misses nothing. Where what is asked for is no longer kept, an event `events.missed` says so.
+    With `Accept: text/event-stream`, events arrive within half a second, each once and in order,
+    even if several processes use the store. After a lost connection, send the id of the last event
+    as `Last-Event-ID`, as browsers do automatically, to receive all events since. If some of them
+    have expired, the stream sends an event `events.missed`.
 
-    With a key, events of the maps that it may read; those of no map are for admins of all.
+    The list contains events of the maps that the key may read. Events that belong to no map require
+    `admin` for `*`.
     """
     seals, place = here.context.store.seals, "after" if last_event_id is None else "Last-Event-ID"
     last = after if last_event_id is None else last_event_id
 
-    def asked() -> tuple[EventFilter, int | None]:
-        seals.row("event", cursor)  # a stream has no pages; what is wrong is told all the same
+    def read_filter() -> tuple[EventFilter, int | None]:
+        seals.row("event", cursor)  # raises for an invalid cursor, although a stream has no pages
         wanted = _wanted(here, asking, map_name, kind)
         return wanted, None if last is None else seals.event(last, place)
 
-    wanted, number = await here.run(asked)
+    wanted, number = await here.run(read_filter)
     if MEDIA_TYPE in request.headers.get("accept", ""):
         here.feed.join(asking.tenant)
         release_place(request)
-        told = _told(here.feed, seals, wanted, number, _still(request, here, asking))
-        return EventStream(told, partial(here.feed.leave, asking.tenant))
+        messages = _messages(here.feed, seals, wanted, number, _access_check(request, here, asking))
+        return EventStream(messages, partial(here.feed.leave, asking.tenant))
     await hold_read(request, here, asking.tenant)
     newest_first = order == "newest" or (order is None and last is None)
 
@@ -205,25 +218,26 @@ def _wanted(here: Service, asking: Caller, map_name: str | None, kinds: list[str
     return replace(wanted, of_maps=True)
 
 
-def _still(request: Request, here: Service, asking: Caller) -> Callable[[], bool]:
-    """Asks whether the key that was shown still opens what it did."""
+def _access_check(request: Request, here: Service, asking: Caller) -> Callable[[], bool]:
+    """Return a function that checks whether the key is still valid, with the same grants."""
     secret = request.headers.get("authorization", "").partition(" ")[2].strip()
 
-    def ask() -> bool:
+    def has_access() -> bool:
         if not asking.name:
-            return True  # none was asked for
+            return True  # no key is required
         key = here.find_key(secret)
         lasts = key is not None and (key.expires_at is None or key.expires_at > time.time())
         return key is not None and lasts and dict(key.grants) == dict(asking.grants)
 
-    return ask
+    return has_access
 
 
-async def _told(
-    feed: Feed, seals: OpaqueIds, wanted: EventFilter, after: int | None, still: Callable[[], bool]
-) -> AsyncGenerator[bytes, None]:
+async def _messages(
+    feed: Feed, seals: OpaqueIds, wanted: EventFilter, after: int | None,
+    has_access: Callable[[], bool],
+) -> AsyncGenerator[bytes, None]:  # fmt: skip
     yield BEGIN
-    async with aclosing(feed.batches(wanted, after, still)) as batches:
-        async for found, seen in batches:
-            messages = [message(event_record(seals, one)) for one in found]
-            yield b"".join(messages) if found else alive(seals.seal("event", seen))
+    async with aclosing(feed.batches(wanted, after, has_access)) as batches:
+        async for rows, seen in batches:
+            messages = [message(event_record(seals, one)) for one in rows]
+            yield b"".join(messages) if rows else alive(seals.seal("event", seen))

@@ -1,4 +1,4 @@
-"""Maps."""
+"""Routes that create, list, edit and delete maps, and edit a frame."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ router = v1_router("/maps", "maps")
     openapi_extra=json_body("NewMap"),
 )
 async def create_map(request: Request, here: Here, asking: Asking, response: Response) -> Map:
-    """Make a map. One that is there as wanted is answered with 200."""
+    """Create a map. If it already exists with the same settings, the response is 200."""
     new = await read_record(request, NewMap, "The map")
     asking.require_new(new.name)
     if OPERATORS & new.model_fields_set:
         asking.require_every("admin")
-    made, is_new = await here.run(map_lifecycle.create_map, here.context.store, new)
+    record, is_new = await here.run(map_lifecycle.create_map, here.context.store, new)
     response.status_code = 201 if is_new else 200
-    response.headers["Location"] = f"/v1/maps/{made.name}"
-    return made
+    response.headers["Location"] = f"/v1/maps/{record.name}"
+    return record
 
 
 @router.get("", responses=declared())
 def list_maps(here: Here, asking: Asking) -> Page[Map]:
-    """All maps by name; those that the key may read."""
+    """List the maps that the key may read, by name."""
     found = map_lifecycle.get_maps(here.context.store)
     return Page[Map](items=[one for one in found if asking.may("read", one.name)])
 
 
 @router.get("/{map_name}", responses=declared(404), dependencies=[Depends(may_read)])
 def get_map(map_name: str, here: Here, response: Response) -> Map:
-    """A map, with how many frames are in each state. Its ETag stands for what PATCH can change."""
+    """Return a map with its number of frames in each state. The ETag changes with each PATCH."""
     found = map_lifecycle.get_map(here.context.store, map_name)
     response.headers["ETag"] = f'"{found.etag}"'
     return found
@@ -57,11 +57,11 @@ def get_map(map_name: str, here: Here, response: Response) -> Map:
     "/{map_name}", status_code=204, responses=declared(404), dependencies=[Depends(may_admin)]
 )
 def delete_map(map_name: str, here: Here) -> None:
-    """Remove a map with all that is in it, for good."""
+    """Delete a map with everything in it. This cannot be undone."""
     map_lifecycle.delete_map(here.context, map_name)
 
 
-# Metadata of frames and maps, edited.
+# Edits of metadata of frames and maps.
 
 edits_router = v1_router("/maps/{map_name}")
 
@@ -72,22 +72,22 @@ _KINDS = (MERGE_PATCH, "application/json")
 DryRun = Annotated[
     bool,
     Query(
-        description="Change nothing; the map is told as it would be: `overdue` is how many frames "
-        "`retention_days` would delete at once."
+        description="Return the map as the edit would leave it, and change nothing. `overdue` is "
+        "the number of frames that `retention_days` would delete at once."
     ),
 ]
 
 
 def _document(record: str) -> dict[str, Any]:
-    """The parts of an operation that FastAPI does not see."""
+    """Return the request body and the header `If-Match`, which FastAPI cannot infer."""
     schema = {"schema": {"$ref": f"#/components/schemas/{record}"}}
     if_match = {
         "name": "If-Match",
         "in": "header",
         "required": False,
         "schema": {"type": "string"},
-        "description": "The ETag of what was read: 412 where it has been edited since. Without "
-        "it the last edit wins.",
+        "description": "The ETag of a previous response. 412 if the object has been edited since. "
+        "Without the header the last edit wins.",
     }
     body = {"required": True, "content": dict.fromkeys(_KINDS, schema)}
     return {"requestBody": body, "parameters": [if_match]}
@@ -103,7 +103,7 @@ def _document(record: str) -> dict[str, Any]:
 async def patch_frame(
     map_name: str, frame_id: str, request: Request, here: Here, response: Response
 ) -> Frame:
-    """Change the metadata of a frame (JSON merge patch, RFC 7396); filters see it at once."""
+    """Edit the metadata of a frame (JSON merge patch, RFC 7396). Filters use it at once."""
     patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
     frame = await here.run(edit_frame, here.context.store, map_name, frame_id, patch, tags)
     response.headers["ETag"] = f'"{frame.etag}"'
@@ -121,9 +121,9 @@ async def patch_map(
     map_name: str, request: Request, here: Here, asking: Asking, response: Response,
     dry_run: DryRun = False,
 ) -> Map:  # fmt: skip
-    """Change title, quotas, retention and up of a map (JSON merge patch, RFC 7396).
+    """Edit the title, quotas, retention and up vector of a map (JSON merge patch, RFC 7396).
 
-    Quotas are the operator's: `quota_frames` and `quota_bytes` ask for `admin` for `*`.
+    `quota_frames` and `quota_bytes` require the scope `admin` for `*`.
     """
     patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
     if OPERATORS & patch.keys():

@@ -1,4 +1,4 @@
-"""Products of maps: coverage, associations and differences of sessions share their routes."""
+"""Routes for coverage, associations and differences of sessions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from service.problems import declared
 from service.responses import file_responses, preferred_media_type, send_product_file
 from service.running_service import Here, Service
 
-Cursor = Annotated[str | None, Query(description="`next_cursor` of the page before.")]
+Cursor = Annotated[str | None, Query(description="`next_cursor` of the previous page.")]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 
 
@@ -39,10 +39,10 @@ def product_router(
 
     Parameters
     ----------
-    products_of : returns the products of a service
-    record : of the API
-    about : what the job does, for the OpenAPI document
-    optional : whether a request may come without a body
+    products_of : function that returns the products of a service
+    record : class of the product in the API
+    about : description of the job, for the OpenAPI document
+    optional : whether the body of a request is optional
     """
     noun, path, request_type = record.noun, record.collection, record.request_type
     router = v1_router(f"/maps/{{map_name}}/{path}", path, may_read)
@@ -67,8 +67,8 @@ def product_router(
         "", begin, methods=["POST"], name=f"begin_{noun}", status_code=202, response_model=record,
         responses=declared(400, 404, 413, 415, 422), dependencies=writes,
         openapi_extra=json_body(request_type.__name__, required=not optional),
-        description=f"{about} GET the path in `Location` until `state` is `succeeded`. Needs the "
-        "scope `write`.",
+        description=f"{about} GET the path in `Location` until `state` is `succeeded`. Requires "
+        "the scope `write`.",
     )  # fmt: skip
     add(
         "", list_all, methods=["GET"], name=f"list_{path}", responses=declared(404, 422),
@@ -83,8 +83,8 @@ def product_router(
     add(
         "/{job_id}", delete, methods=["DELETE"], name=f"delete_{noun}", status_code=204,
         responses=declared(404, 409), dependencies=writes,
-        description=f"Delete the {noun} job and its results, also while a worker runs it. 409: the "
-        "map depends on it.",
+        description=f"Delete the {noun} job and its results, even while a worker runs it. 409 if "
+        "the map depends on it.",
     )  # fmt: skip
     return router
 
@@ -93,10 +93,10 @@ def product_router(
 
 coverage_router = product_router(
     lambda service: service.coverage, MapCoverage,
-    "Measure where in the map a robot would be found. A job queries each frame, or every n-th, "
-    "against the rest of the map, and counts by cell of a plan how many are found, found in a "
-    "wrong place, ambiguous and not found. It runs when nothing else waits for a worker, and takes "
-    "about as long as so many queries.",
+    "Measure where in the map localisation works. A job queries each frame, or every n-th, against "
+    "the rest of the map. For each cell of a plan it counts the frames that are found, found in a "
+    "wrong place, ambiguous and not found. It runs when no other job waits for a worker, and takes "
+    "as long as that number of queries.",
     optional=True,
 )  # fmt: skip
 
@@ -112,9 +112,9 @@ def list_coverage_frames(
         CoverageOutcome | None, Query(description="Only frames of this outcome.")
     ] = None,
 ) -> Page[CoverageFrame]:
-    """Queried frames with what became of each, also while more are queried.
+    """List the queried frames with their outcomes, even while the job runs.
 
-    Frames that were deleted since are left out.
+    Frames that have been deleted since are left out.
     """
     return here.coverage.frames(map_name, job_id, cursor, limit, outcome)
 
@@ -126,10 +126,10 @@ def get_coverage_changes(
     here: Here,
     since: Annotated[
         str,
-        Query(max_length=64, description="Id of an earlier result of the map, with equal options."),
+        Query(max_length=64, description="Id of an earlier job of the map with the same options."),
     ],
 ) -> CoverageChanges:
-    """Which cells became better or worse since an earlier result; 409 until both succeeded."""
+    """Return the cells that became better or worse since an earlier job. 409 until both succeed."""
     return here.coverage.changes(map_name, job_id, since)
 
 
@@ -138,8 +138,8 @@ def get_coverage_changes(
 differences_router = product_router(
     lambda service: service.differences, Difference,
     "Compare two sessions whose frames have poses in one parent frame. A job fuses at most 500 "
-    "frames of each session to cells, and asks the frames of the other session about each cell. It "
-    "runs when nothing else waits for a worker.",
+    "frames of each session into cells, and compares each cell with the frames of the other "
+    "session. It runs when no other job waits for a worker.",
 )  # fmt: skip
 
 
@@ -149,46 +149,46 @@ differences_router = product_router(
     responses=file_responses(
         MEDIA_TYPE,
         description="Cells of both sessions in the format of `frames/{frame_id}/points`. The patch "
-        "index says what each is: 0 same, 1 gone, 2 new, 3 only in `before` and unseen in `after`, "
-        "4 the reverse. Points are in this order.",
+        "index is the class of the cell: 0 same, 1 gone, 2 new, 3 only in `before` and unseen in "
+        "`after`, 4 the reverse. Points are sorted by class.",
         statuses=(404, 409),
     ),
 )
 def get_difference_points(map_name: str, job_id: str, request: Request, here: Here) -> Response:
-    """The cells of both sessions; 409 until the job has succeeded."""
+    """Return the cells of both sessions. 409 until the job has succeeded."""
     find = partial(here.differences.file, map_name, job_id, POINTS)
     return send_product_file(request, here, find, f"{job_id[:12]}-points")
 
 
-# Associations: sessions joined, loops closed.
+# Associations: joins of sessions and loop closures.
 
 associations_router = product_router(
     lambda service: service.associations, Association,
-    "Find where sessions see the same places: two of them, which joins their maps, or one, which "
-    "closes its loops. Every frame of the first session is looked up among those of the second; "
-    "what validation accepts is an edge. Edges near each other must agree with how the robots "
-    "moved between their frames, and those that are left vote on how the sessions' parent frames "
-    "lie to each other. The job takes some 0.1 s a frame and worker.",
+    "Find the places that two sessions share, to join their maps, or the places that one session "
+    "revisits, to close its loops. A job queries each frame of the first session against the "
+    "second. Each match that passes validation is an edge. Edges of neighbouring frames must agree "
+    "with the motion of the robots; the remaining edges vote for the transform between the parent "
+    "frames of the sessions. The job takes approximately 0.1 s per frame and worker.",
 )  # fmt: skip
 
 _TEXT_SCHEMA = {"schema": {"type": "string"}}
 _GRAPH: dict[int | str, dict[str, Any]] = {
     200: {
         "model": Graph,
-        "description": "The graph as one of its files.",
+        "description": "The graph in the requested format.",
         "content": {MEDIA_TYPES["g2o"]: _TEXT_SCHEMA, MEDIA_TYPES["tum"]: _TEXT_SCHEMA},
     }
 }
-_Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Least overlap of an edge.")]
+_Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Minimum overlap of an edge.")]
 
 
 @associations_router.delete(
     "/{job_id}/join", responses=declared(404, 409), dependencies=[Depends(may_write)]
 )
 def undo_join(map_name: str, job_id: str, here: Here) -> Association:
-    """Undo the join of an association: poses are again as they were sent, or in the parent frame
-    that other joins lead to. Without a join that stands nothing changes. The parent frames are not
-    joined again unless somebody asks for an association.
+    """Undo the join of an association. Poses return to the uploaded ones, or to the parent frame of
+    other joins. Without an active join nothing changes. Workers do not join the parent frames again
+    unless you request an association.
     """
     return here.associations.undo_join(map_name, job_id)
 
@@ -204,12 +204,12 @@ def list_edges(
     consistent: Annotated[
         bool | None,
         Query(
-            description="`true`: those that a second edge or a join supports. `false`: those that "
-            "were outvoted."
+            description="`true`: only edges that a second edge or a join supports. `false`: only "
+            "edges that were outvoted."
         ),
     ] = None,
 ) -> Page[Edge]:
-    """Edges in the order in which they were found, also while more are."""
+    """List the edges in the order of their discovery, even while the job runs."""
     return here.associations.edges(
         map_name, job_id, cursor, limit, min_overlap, consistent=consistent
     )
@@ -228,28 +228,28 @@ async def get_graph(
         Query(
             alias="format",
             description="`g2o` (VERTEX_SE3:QUAT, EDGE_SE3:QUAT), `tum` (the vertices as a "
-            "trajectory), or `json`; default: by Accept, else g2o.",
+            "trajectory), or `json`; default: the type in Accept, otherwise g2o.",
         ),
     ] = None,
     min_overlap: _Overlap = 0.0,
     odometry: Annotated[
         bool,
-        Query(description="With an edge between each two consecutive frames, from their poses."),
+        Query(description="Add an edge between consecutive frames, from their poses."),
     ] = False,
     consistent: Annotated[
         bool,
         Query(
-            description="Only edges that a second edge of another viewpoint or a join supports. "
-            "`false`: also those that nothing checks, such as all edges of frames without poses."
+            description="`true`: only edges that a second edge of another viewpoint or a join "
+            "supports. `false`: also unsupported edges, such as all edges of frames without poses."
         ),
     ] = True,
 ) -> Response:
-    """The pose graph of an association that has succeeded, for an optimiser.
+    """Return the pose graph of an association that has succeeded, for an optimiser.
 
-    Vertices are all frames of the sessions, run after run in the order of time, numbered from 0;
-    their poses are in one frame where the sessions are joined. One pair of frames that look alike
-    is no evidence of one place, so edges that no other supports are left out. `format=json` tells
-    which vertex is which frame.
+    Vertices are all frames of the sessions, run by run in the order of time, numbered from 0. Their
+    poses are in one coordinate frame if the sessions are joined. By default, edges that no other
+    edge supports are left out, because two frames of different places may look alike. With
+    `format=json`, each vertex has the id of its frame.
     """
     kinds = {media: name for name, media in MEDIA_TYPES.items()}
     wanted: Any = kind or kinds[preferred_media_type(request, list(kinds))]

@@ -1,8 +1,8 @@
-"""Queries as they come, and each answered in its turn, with its count and its record.
+"""Routes for queries: localisation, similar frames, and the comparison of two frames.
 
-A query names a stored frame in JSON, or comes as a frame with its options.
+A query names a stored frame in JSON, or sends a frame with its options.
 
-    SentQuery, what answers it  --run_query-->  Answer
+    SentQuery, function that answers it  --run_query-->  Answer
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ _QUERY = "The query"
 
 @dataclass(frozen=True, eq=False)
 class QueryBody(Generic[Asked]):
-    """A query as it came.
+    """Contents of the request of a query.
 
     Parameters
     ----------
-    query : how to ask
-    upload : the frame that was sent; None where a stored one is named
-    named : what JSON had beside the query, by name
-    robot : who asks, as far as it is told
+    query : options of the query
+    upload : the sent frame; None if a stored frame is named
+    named : fields of JSON beside the query, by name
+    robot : name of the robot that sends the query; None if unknown
     """
 
     query: Asked
@@ -77,12 +77,12 @@ class QueryBody(Generic[Asked]):
 
     @property
     def session(self) -> str | None:
-        """In which run an upload was taken."""
+        """Name of the session of the uploaded frame."""
         return None if self.upload is None else self.upload.meta.session
 
 
-class _Asker(Given):
-    """What JSON says of who asks."""
+class _Sender(Given):
+    """The field of JSON that names the sender."""
 
     robot: Label | None = None
 
@@ -91,23 +91,23 @@ class _Asker(Given):
 async def question(
     request: Request, kind: type[Asked], named: str
 ) -> AsyncIterator[QueryBody[Asked]]:
-    """Read a query, however it came.
+    """Read a query from JSON or from an upload.
 
     Parameters
     ----------
-    request : with JSON, or with a frame as `uploaded` reads it
-    kind : of the query
-    named : field of JSON that names a stored frame; others have none
+    request : request with JSON, or with a frame that `uploaded` reads
+    kind : class of the query
+    named : name of the JSON field that names a stored frame; a form does not have it
 
     Raises
     ------
-    UnsupportedType, MalformedBody, InvalidRequest, StoreFull, UnusableStore : see `uploaded`.
+    UnsupportedType, MalformedBody, InvalidRequest, StoreFull, UnusableStore : See `uploaded`.
     """
     if media_type(request) == JSON:
-        given = await read_object(request)
-        asker = record_of(_Asker, {"robot": given.pop("robot", None)}, _QUERY)
-        own = {} if named in kind.model_fields else {named: given.pop(named, None)}
-        yield QueryBody(record_of(kind, given, _QUERY), None, own, asker.robot)
+        fields = await read_object(request)
+        sender = record_of(_Sender, {"robot": fields.pop("robot", None)}, _QUERY)
+        own = {} if named in kind.model_fields else {named: fields.pop(named, None)}
+        yield QueryBody(record_of(kind, fields, _QUERY), None, own, sender.robot)
         return
     options = [name for name in kind.model_fields if name != named]
     async with uploaded(request, *options) as upload:
@@ -115,28 +115,29 @@ async def question(
 
 
 async def read_object(request: Request) -> dict[str, Any]:
-    """The body as a JSON object; MalformedBody where it is none."""
-    given = await read_json(request)
-    if not isinstance(given, dict):
+    """Return the body as a JSON object; raise MalformedBody if it is not one."""
+    body = await read_json(request)
+    if not isinstance(body, dict):
         raise MalformedBody("The body is not a JSON object. Send an object.")
-    return given
+    return body
 
 
 def unnamed(name: str) -> InvalidRequest:
-    """That a query has no frame: neither a file nor the name of a stored one."""
+    """Return the error for a query without a frame."""
     return InvalidRequest(
-        f"The query has no frame. Give `{name}`, or send a frame as a form.", ((name, "missing"),)
+        f"The query has no frame. Specify `{name}`, or send a frame in a form.",
+        ((name, "missing"),),
     )
 
 
 def described(kind: type[BaseModel], named: Mapping[str, Any], required: list[str]) -> Any:
-    """The ways to ask, for the OpenAPI document: `requestBody` and `parameters`.
+    """Return `requestBody` and `parameters` of a query, for the OpenAPI document.
 
     Parameters
     ----------
-    kind : of the query
-    named : schemas of what JSON has beside it, by name
-    required : fields that JSON must have
+    kind : class of the query
+    named : schemas of the JSON fields beside the query, by name
+    required : names of the fields that JSON must have
     """
     form = FRAME_BODY["content"][FORM]["schema"]
     own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
@@ -158,16 +159,16 @@ def described(kind: type[BaseModel], named: Mapping[str, Any], required: list[st
 
 
 def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
-    """A form with the frames of a sequence and how to ask, for the OpenAPI document."""
+    """Return the form of a query with a sequence of frames, for the OpenAPI document."""
     own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
     meta = {"type": "array", "items": {"$ref": "#/components/schemas/FrameMeta"}}
     file = {"type": "string", "format": "binary"}
     properties = {
         "frame": {
             "type": "array", "minItems": 2, "maxItems": most, "items": file,
-            "description": "A part `frame` for each, in the order they were taken.",
+            "description": "One part `frame` for each frame, in the order of time.",
         },
-        "metas": {**meta, "description": "One for each, with `pose`: the odometry."},
+        "metas": {**meta, "description": "One object for each frame, with its odometry `pose`."},
         **{name: as_text(one) for name, one in own.items()},
     }  # fmt: skip
     schema = {"type": "object", "required": ["frame", "metas"], "properties": properties}
@@ -180,48 +181,48 @@ def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
 
 
 def _parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
-    """An option as the query string has it, where the frame is the body."""
+    """Return the query parameter of an option, for requests whose body is the frame."""
     schema = {key: one for key, one in option.items() if key not in ("description", "title")}
-    told = f"Where the frame is the body: {option.get('description', 'as in JSON')}"
-    return query_parameter(name, schema, told)
+    text = f"Only if the body is the frame: {option.get('description', 'the same as in JSON')}"
+    return query_parameter(name, schema, text)
 
 
 def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
-    """An option as a form has it: an object as JSON text, a list with commas between."""
+    """Return the schema of an option in a form: objects as JSON text, lists with commas."""
     kinds = option.get("anyOf", [])
     reference = next((one for one in kinds if "$ref" in one), None)
-    told = {name: option[name] for name in ("description", "title") if name in option}
+    texts = {name: option[name] for name in ("description", "title") if name in option}
     if reference is not None:
         content = {"contentMediaType": JSON, "contentSchema": reference}
-        return {"type": "string", **content, **told}
+        return {"type": "string", **content, **texts}
     if any(one.get("type") == "array" for one in kinds):
-        given = option.get("default")
-        default = {} if given is None else {"default": ",".join(given)}
-        return {"type": "string", **default, **told}
+        values = option.get("default")
+        default = {} if values is None else {"default": ",".join(values)}
+        return {"type": "string", **default, **texts}
     one = next((one for one in kinds if one.get("type") != "null"), None)
-    return dict(option) if one is None else {**one, **told}
+    return dict(option) if one is None else {**one, **texts}
 
 
-# Two frames to compare: each named, or sent as a part of a form.
+# The comparison of two frames, each named or sent in a part of a form.
 
 _SIDES = ("a", "b")
 
 
 @dataclass(frozen=True, eq=False)
 class Sent:
-    """A frame that came in a form; its bytes are on disk until they are read."""
+    """A frame of a form. Its bytes stay on disk until they are read."""
 
     file: BinaryIO
     meta: FrameMeta
 
     def read(self) -> tuple[bytes, FrameMeta]:
-        """Its bytes, and what is known of it."""
+        """Return the bytes and the metadata of the frame."""
         return self.file.read(), self.meta
 
 
 @dataclass(frozen=True, eq=False)
 class PairBody:
-    """Two frames, and how to compare them."""
+    """Two frames and the options of their comparison."""
 
     a: NamedFrame | Sent
     b: NamedFrame | Sent
@@ -248,12 +249,12 @@ async def pair(request: Request) -> AsyncIterator[PairBody]:
 
 
 def _parts(form: FormData) -> tuple[dict[str, BinaryIO], dict[str, str]]:
-    """Files and texts of a form by their names."""
+    """Return the files and the texts of a form by their names."""
     files: dict[str, BinaryIO] = {}
     texts: dict[str, str] = {}
     for name, value in form.multi_items():
         if name in files or name in texts:
-            raise _wrong(name, "given more than once")
+            raise _wrong(name, "specified more than once")
         if isinstance(value, UploadFile) != (name in _SIDES):
             raise _wrong(name, "a file instead of text, or text instead of a file")
         if isinstance(value, UploadFile):
@@ -269,13 +270,13 @@ def _parts(form: FormData) -> tuple[dict[str, BinaryIO], dict[str, str]]:
 def _pair_frame(
     name: str, how: Comparison, files: Mapping[str, BinaryIO], texts: Mapping[str, str]
 ) -> NamedFrame | Sent:
-    """One of the two, as it came."""
+    """Return frame `name` of a comparison."""
     named: NamedFrame | None = getattr(how, f"frame_{name}")
     if (named is None) == (name not in files):
         raise _wrong(
             f"frame_{name}",
             f"missing, and so is a file part `{name}`" if named is None
-            else f"given together with a file part `{name}`",
+            else f"specified together with a file part `{name}`",
         )  # fmt: skip
     if named is not None:
         return named
@@ -287,8 +288,8 @@ def _pair_frame(
 
 def _wrong(name: str, how: str) -> InvalidRequest:
     return InvalidRequest(
-        f"The frames to compare are not valid: {name[:80]!r} is {how}. Give each frame once: as "
-        "a file part `a` or `b` with `meta_a` or `meta_b`, or named in `frame_a` or `frame_b`.",
+        f"The frames to compare are not valid: {name[:80]!r} is {how}. Specify each frame once: as "
+        "a file part `a` or `b` with `meta_a` or `meta_b`, or by name in `frame_a` or `frame_b`.",
         ((name[:80], how),),
     )
 
@@ -296,22 +297,22 @@ def _wrong(name: str, how: str) -> InvalidRequest:
 async def run_query(
     here: Service, sent: SentQuery, since: float, do: Callable[[], Answer]
 ) -> Answer:
-    """Answer a query when it is its turn, count it, and log it if it fails.
+    """Answer a query after its wait at the gate, count it, and log it if it fails.
 
     Parameters
     ----------
-    here : of the service; the query has a place at its gate
-    sent : the query, and who sends it
-    since : when the request came, by `time.perf_counter`
-    do : answers and logs it, in a thread
+    here : the service; the query already has a place at its gate
+    sent : the query and its sender
+    since : time of the request, by `time.perf_counter`
+    do : function that answers and logs the query, in a thread
 
     Raises
     ------
-    Busy : see `Gate.run`; and what `do` raises.
+    Busy : If the wait is too long; see `Gate.run`. Errors of `do` are passed on.
     """
     try:
         answer = await here.gate.run(do)
-    except NotFound:  # what was asked for is not there: no query was begun
+    except NotFound:  # no query was started, so there is nothing to log
         raise
     except Exception as error:
         here.context.query_log.note(query_row(sent, error, time.perf_counter() - since))
@@ -328,11 +329,11 @@ router = v1_router(tag="queries")
 _ROBOT: dict[str, Any] = {
     "robot": {
         "type": "string", "maxLength": 128,
-        "description": "Who sends it, for the log; of an upload `meta` says so.",
+        "description": "Name of the sender, for the log. An upload has it in `meta`.",
     }
 }  # fmt: skip
 _FRAME_ID: dict[str, Any] = {
-    "frame_id": {"type": "string", "description": "A frame of the map, in place of an upload."}
+    "frame_id": {"type": "string", "description": "Id of a frame of the map; replaces an upload."}
 }
 _BODY = described(Query, _FRAME_ID | _ROBOT, ["frame_id"])
 _SEVERAL = described(SeveralQuery, _ROBOT, ["maps"])
@@ -344,11 +345,11 @@ _STATUSES = declared(400, 404, 413, 415, 422)
     dependencies=[Depends(may_read)],
 )  # fmt: skip
 async def ask(map_name: str, request: Request, here: Here, asking: Asking) -> Answer:
-    """Where was this frame taken? Ask with a frame of your own, or with one of the map.
+    """Find where a frame was taken. Send a frame, or name a frame of the map.
 
-    An uploaded frame is not added to the map. A frame of the map does not find itself.
+    A sent frame is not added to the map. A frame of the map is not compared with itself.
     """
-    return await _asked(map_name, request, here, asking, localizes=False)
+    return await _answer(map_name, request, here, asking, localizes=False)
 
 
 @router.post(
@@ -356,11 +357,11 @@ async def ask(map_name: str, request: Request, here: Here, asking: Asking) -> An
     dependencies=[Depends(may_read)],
 )  # fmt: skip
 async def localize(map_name: str, request: Request, here: Here, asking: Asking) -> Localization:
-    """Where am I in this map? One status and one pose; ask as for a query.
+    """Find the pose of a robot in a map. The options are those of a query.
 
-    The whole answer, with all candidates, is stored under `query_id` unless `keep` is false.
+    The full answer with all candidates is stored under `query_id` unless `keep` is false.
     """
-    return localization_of(await _asked(map_name, request, here, asking, localizes=True))
+    return localization_of(await _answer(map_name, request, here, asking, localizes=True))
 
 
 _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
@@ -373,10 +374,10 @@ _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
 async def localize_sequence(
     map_name: str, request: Request, here: Here, asking: Asking
 ) -> Localization:
-    """Where am I in this map, by my last few frames? One status and the pose of the last.
+    """Find the pose of a robot in a map from its last frames. The pose is that of the last frame.
 
-    Send 2 to 10 frames in the order they were taken, each with a `pose` in one parent frame of any
-    name: the odometry. Each is looked up; all of them vote for the pose of the last.
+    Send 2 to 10 frames in the order of time, each with its odometry as a `pose` in one common
+    parent frame. Each frame is queried, and all of them vote for the pose of the last.
     """
     since, at = time.perf_counter(), time.time()
     options = tuple(Query.model_fields)
@@ -398,18 +399,18 @@ async def localize_sequence(
 
 @router.post("/queries", responses=_STATUSES | declared(409), openapi_extra=_SEVERAL)
 async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
-    """In which of these maps was this frame taken? One ranking over all of them.
+    """Find where a frame was taken in several maps, with one ranking over all of them.
 
-    The maps must be of one model. A pose is averaged within one parent frame of one map, which
-    `location.map` names.
+    The maps must have the same model. Poses are averaged only within one parent frame of one map,
+    which `location.map` names.
     """
     since, at, queries = time.perf_counter(), time.time(), here.queries
     async with here.gate.place(), question(request, SeveralQuery, "frame") as body:
         query, upload, frame = body.query, body.upload, body.query.frame
         if query.query_id is not None and (upload is not None or frame is not None):
             raise InvalidRequest(
-                "The query has two frames. Give a frame or `query_id`.",
-                (("query_id", "given together with a frame"),),
+                "The query has two frames. Specify either a frame or `query_id`.",
+                (("query_id", "specified together with a frame"),),
             )
         maps = await here.run(queries.maps_of, query, partial(asking.may, "read"))
         named = None if frame is None else FrameName(map=frame.map, frame_id=frame.frame_id)
@@ -420,7 +421,7 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
                 lambda: queries.upload(maps, upload.file.read(), upload.meta, query, since, sent),
             )  # fmt: skip
         if query.query_id is not None:
-            return await _repeated(query.query_id, here, asking, sent, since)
+            return await _repeat(query.query_id, here, asking, sent, since)
         if named is None:
             raise unnamed("frame")
         asking.require(named.map, "read")
@@ -429,7 +430,7 @@ async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
         )
 
 
-async def _repeated(
+async def _repeat(
     query_id: str, here: Service, asking: Caller, sent: SentQuery, since: float
 ) -> Answer:
     """Repeat an earlier query with other options."""
@@ -443,7 +444,7 @@ async def _repeated(
     )  # fmt: skip
 
 
-async def _asked(
+async def _answer(
     map_name: str, request: Request, here: Service, asking: Caller, *, localizes: bool
 ) -> Answer:
     since, at = time.perf_counter(), time.time()
@@ -469,13 +470,13 @@ async def _asked(
         )
 
 
-# Two frames compared.
+# The comparison of two frames.
 
 similarity_router = v1_router(tag="queries")
 
 
 def _body() -> dict[str, Any]:
-    """The ways to name two frames, for the OpenAPI document."""
+    """Return the body of a comparison, for the OpenAPI document."""
     own = Comparison.model_json_schema(ref_template=TEMPLATE)["properties"]
     file = {"type": "string", "format": "binary", "description": "A depth image: PNG or NPY."}
     meta = {
@@ -505,13 +506,13 @@ def _body() -> dict[str, Any]:
     openapi_extra={"requestBody": _body()},
 )
 async def compare(request: Request, here: Here, asking: Asking) -> Similarity:
-    """How alike are two frames, and do they see one place? Neither is kept.
+    """Return how similar two frames are and whether they show one place. Neither is stored.
 
-    Each is stored, or sent: file part `a` with `meta_a`, `b` with `meta_b`. Stored frames must be
-    of one model; what is sent is signed with theirs. The transform maps b to a.
+    Each frame is named or sent: in the file part `a` with `meta_a`, or `b` with `meta_b`. Stored
+    frames must have the same model; sent frames are signed with it. The transform maps b to a.
     """
-    async with here.gate.place(), pair(request) as asked:
-        a, b = asked.a, asked.b
+    async with here.gate.place(), pair(request) as body:
+        a, b = body.a, body.b
         for side in (a, b):
             if isinstance(side, NamedFrame):
                 asking.require(side.map, "read")
@@ -519,6 +520,6 @@ async def compare(request: Request, here: Here, asking: Asking) -> Similarity:
             lambda: here.queries.compare(
                 a.read() if isinstance(a, Sent) else a,
                 b.read() if isinstance(b, Sent) else b,
-                asked.how,
+                body.how,
             )
         )

@@ -1,4 +1,4 @@
-"""Reconstructions: the views of an answer, fused to a surface by a worker."""
+"""Routes for reconstructions, which fuse the views of an answer into a surface."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ router = v1_router(tag="reconstructions")
 async def reconstruct(
     query_id: str, request: Request, here: Here, asking: Asking, response: Response
 ) -> Reconstruction:
-    """Fuse the accepted matches of an answer, moved into the query's camera frame, to a surface.
+    """Fuse the accepted matches of an answer into a surface in the query's camera frame.
 
-    A worker does it, with Open3D. The answer may expire meanwhile. Ask under `Location` until
-    `state` is `succeeded`; then mesh.ply is there. It takes the scope `write`.
+    A worker runs the job with Open3D, even if the answer expires meanwhile. GET the path in
+    `Location` until `state` is `succeeded`, then download mesh.ply. Requires the scope `write`.
     """
     stored = await here.run(lambda: _stored_answer(here, asking, query_id))
     wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
-    made = await here.run(lambda: here.reconstructions.begin_for(stored, wanted))
-    response.headers["Location"] = f"/v1/reconstructions/{made.job_id}"
-    return made
+    record = await here.run(lambda: here.reconstructions.begin_for(stored, wanted))
+    response.headers["Location"] = f"/v1/reconstructions/{record.job_id}"
+    return record
 
 
 @router.get("/reconstructions/{job_id}", responses=declared(404))
 def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstruction:
-    """A reconstruction: how far it is, and what its views show together when it is done."""
+    """Return a reconstruction, its progress, and its result once it has succeeded."""
     return _find_reconstruction(here, asking, job_id)
 
 
@@ -51,14 +51,14 @@ def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstructio
     responses=files(
         [MEDIA_TYPE],
         "Points with normals, coloured by the first view that saw them, and triangles unless a "
-        "cloud was asked for; binary little-endian. A comment names the frame of coordinates.",
+        "cloud was requested; binary little-endian. A comment names the coordinate frame.",
         409,
     ),
 )
 async def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
-    """The surface, in the query's camera frame; 409 until the job has succeeded."""
+    """Return the surface in the query's camera frame. 409 until the job has succeeded."""
     await here.run(_find_reconstruction, here, asking, job_id)
-    async with here.gate.place():  # it is read whole: when it is its turn
+    async with here.gate.place():  # the whole file is read into memory
         find = partial(here.reconstructions.file, None, job_id, MESH)
         name = f"{job_id[:12]}-{MESH}"
         return await here.gate.run(partial(send_product_file, request, here, find, name))
@@ -66,19 +66,21 @@ async def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) ->
 
 @router.delete("/reconstructions/{job_id}", status_code=204, responses=declared(404))
 def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
-    """Remove a reconstruction with its files; one that is under way is given up."""
+    """Delete a reconstruction with its files. A running job is cancelled."""
     for name in _find_reconstruction(here, asking, job_id).maps:
         asking.require(name, "write")
     here.reconstructions.remove(None, job_id)
 
 
 def _stored_answer(here: Service, asking: Caller, query_id: str) -> StoredAnswer:
-    """The answer, for who may read the maps that it was asked of, and write to those it names."""
+    """Return a stored answer if the caller may read all its maps and write to the maps of its
+    matches.
+    """
     stored = here.context.query_log.find(query_id)
     answer = stored.answer
     matched = {match.map for match in answer.matches}
-    asked = {*answer.maps, *([] if answer.frame is None else [answer.frame.map])}
-    if not all(asking.may("read", name) for name in asked | matched):
+    queried = {*answer.maps, *([] if answer.frame is None else [answer.frame.map])}
+    if not all(asking.may("read", name) for name in queried | matched):
         raise unknown_query(query_id)
     for name in sorted(matched):
         asking.require(name, "write")

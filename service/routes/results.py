@@ -1,4 +1,4 @@
-"""Past queries, and what can be looked at while an answer is stored."""
+"""Routes for past queries and stored answers."""
 
 from __future__ import annotations
 
@@ -42,9 +42,10 @@ def _ply(description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
 
 @router.get("", responses=declared(404, 422))
 def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
-    """The answer once more, as it was given.
+    """Return a stored answer.
 
-    Answers are stored for 30 days by default, and while there is room; not with `keep` false.
+    Answers are stored for 30 days by default, or less if space runs out; with `keep` false they are
+    not stored.
     """
     require_readable(query_id, here, asking)
     return here.inspection.answer(query_id)
@@ -56,7 +57,7 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
     responses=_ply("Points and normals in the query's sensor's frame.", 404, 409, 422),
 )
 async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
-    """The surface that the query saw, as validation compares it: binary PLY, metres."""
+    """Return the surface of the query that validation compares, as binary PLY in metres."""
     await here.run(require_readable, query_id, here, asking)
     data = await here.gate.enter(lambda: here.inspection.cloud(query_id))
     return Response(data, media_type=PLY)
@@ -68,10 +69,10 @@ async def get_similarities(
     here: Here,
     asking: Asking,
     limit: Annotated[
-        int, Query(ge=1, le=200, description="How many of the ranking, the nearest first.")
+        int, Query(ge=1, le=200, description="Number of frames of the ranking, nearest first.")
     ] = 50,
 ) -> Similarities:
-    """How alike the query and its nearest frames are, each to each: what the selection sees."""
+    """Return the pairwise similarities of the query and its nearest frames for the selection."""
     await here.run(require_readable, query_id, here, asking)
     return await here.gate.enter(lambda: here.inspection.similarities(query_id, limit))
 
@@ -80,10 +81,11 @@ async def get_similarities(
 async def get_match(
     query_id: str, frame_id: str, here: Here, asking: Asking, map_name: MatchMap = None
 ) -> MatchDetails:
-    """One match with what it rests on: its rival, patches that coincide, points for and against.
+    """Return a match with its evidence: its rival, coincident patches, and supporting and
+    contradicting points.
 
-    It is validated once more, with the seed and the options of the query; one that the query
-    passed over is validated now.
+    The match is validated again, with the seed and the options of the query. A match that the query
+    skipped is validated now.
     """
     await here.run(require_readable, query_id, here, asking)
     return await here.gate.enter(lambda: here.inspection.match(query_id, frame_id, map_name))
@@ -103,22 +105,22 @@ async def get_overlay(
     color: Annotated[
         OverlayColour,
         Query(
-            description="`source`: the query orange, the match blue. `normal`: directions. "
-            "`residual`: dark green within a fifth of what the model's validation allows between "
-            "surfaces (1 cm of 5 cm of rooms near by; more with distance), light green within two "
-            "fifths, yellow within all of it, grey where there is nothing to compare with or it "
-            "is farther, red where the other saw through."
+            description="`source`: the query orange, the match blue. `normal`: normals. "
+            "`residual`: dark green up to a fifth of the distance that the model's validation "
+            "tolerates between surfaces (1 cm of 5 cm for close surfaces in rooms; more with "
+            "distance), light green up to two fifths, yellow up to the full tolerance, grey beyond "
+            "it or without a counterpart, red for points that the other frame saw through."
         ),
     ] = "source",
     transform: Annotated[
         OverlayTransform,
         Query(
-            description="`aligned`: as the match was found. `rival`: by the other transform that "
-            "fits best. `none`: both as their cameras saw them."
+            description="`aligned`: the transform of the match. `rival`: the other transform that "
+            "fits best. `none`: the identity."
         ),
     ] = "aligned",
 ) -> Response:
-    """The query laid on a match, to see how well they fit: binary PLY, metres."""
+    """Return the clouds of the query and a match in one frame, as binary PLY in metres."""
     await here.run(require_readable, query_id, here, asking)
     data = await here.gate.enter(
         lambda: here.inspection.overlay(query_id, frame_id, map_name, color, transform)
@@ -128,7 +130,7 @@ async def get_overlay(
 
 _PNG: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "What its colours mean is in the tEXt chunks.",
+        "description": "The tEXt chunks explain the colours.",
         "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
     },
     **declared(404, 409, 422),
@@ -137,7 +139,7 @@ _PNG: dict[int | str, dict[str, Any]] = {
 
 @router.get("/question", responses=declared(404, 422))
 def get_question(query_id: str, here: Here, asking: Asking) -> StoredQuery:
-    """How the query was sent: to which maps, with which frame and options."""
+    """Return the maps, the frame and the options of a query."""
     require_readable(query_id, here, asking)
     return here.inspection.question(query_id)
 
@@ -148,11 +150,13 @@ async def get_query_preview(
     here: Here,
     asking: Asking,
     view: Annotated[
-        View, Query(description="As of a frame; `patches` are not stored of a query, and refused.")
+        View, Query(description="As for a frame, except `patches`, which queries do not store.")
     ] = "depth",
-    width: Annotated[int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Columns.")] = WIDTH,
+    width: Annotated[
+        int, Query(ge=WIDTHS[0], le=WIDTHS[1], description="Width in pixels.")
+    ] = WIDTH,
 ) -> Response:
-    """A picture of what the query saw, for people."""
+    """Return a picture of the frame of a query."""
     await here.run(require_readable, query_id, here, asking)
     data = await here.gate.enter(lambda: here.inspection.preview(query_id, view, width))
     return Response(data, 200, {"Cache-Control": "private, no-cache"}, PNG)
@@ -163,10 +167,10 @@ async def get_query_preview(
     openapi_extra=json_body("KeepOptions", required=False),
 )  # fmt: skip
 async def keep_answer(query_id: str, request: Request, here: Here, asking: Asking) -> QueryRecord:
-    """Keep the answer until it is released.
+    """Keep a stored answer until it is released.
 
-    It goes earlier with a map that was searched, and with a frame that it shows. Another `title`
-    replaces the former. It requires the scope `write` for every map that was searched.
+    Deleting a searched map or a frame of the answer also deletes the answer. A new `title` replaces
+    the previous one. Requires the scope `write` for every map that was searched.
     """
     await here.run(_require_write, query_id, here, asking)
     options = await read_record(request, KeepOptions, "The request to keep it", optional=True)
@@ -175,7 +179,7 @@ async def keep_answer(query_id: str, request: Request, here: Here, asking: Askin
 
 @router.delete("/keep", status_code=204, responses=declared(404, 422))
 def release_answer(query_id: str, here: Here, asking: Asking) -> None:
-    """Let the answer expire. It requires the scope `write` for every map that was searched."""
+    """Release a kept answer. Requires the scope `write` for every map that was searched."""
     _require_write(query_id, here, asking)
     here.context.query_log.release(query_id)
 
@@ -194,25 +198,27 @@ history_router = v1_router("/queries", "queries")
 def list_queries(
     here: Here,
     asking: Asking,
-    map_name: Annotated[str | None, Query(alias="map", description="Of this map alone.")] = None,
+    map_name: Annotated[
+        str | None, Query(alias="map", description="Only queries of this map.")
+    ] = None,
     status: Annotated[
         list[RecordStatus],
-        Query(max_length=len(RECORD_STATUSES), description="More than once for several."),
+        Query(max_length=len(RECORD_STATUSES), description="Only these statuses; repeatable."),
     ] = [],  # noqa: B006  (FastAPI copies it)
-    robot: Annotated[Label | None, Query(description="Who sent them.")] = None,
+    robot: Annotated[Label | None, Query(description="Only queries of this robot.")] = None,
     since: Annotated[
-        AwareDatetime | None, Query(description="That came then or later; with a time zone.")
+        AwareDatetime | None, Query(description="Earliest time, with a time zone.")
     ] = None,
-    until: Annotated[AwareDatetime | None, Query(description="That came before then.")] = None,
-    kept: Annotated[bool, Query(description="Only those whose answers somebody keeps.")] = False,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    until: Annotated[AwareDatetime | None, Query(description="Only queries before it.")] = None,
+    kept: Annotated[bool, Query(description="Only queries with kept answers.")] = False,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[QueryRecord]:
-    """Past queries, the newest first: who sent them, their outcome, and how long they took.
+    """List past queries of the maps that the key may read, with sender, outcome and duration,
+    newest first.
 
-    A query is listed within a second, for 30 days by default; not with `record` false. Requests
-    that were refused before a query began are not. With a key, queries of the maps that it may
-    read.
+    A query appears within a second and stays for 30 days by default. Queries with `record` false
+    and requests that were refused before their query started are not listed.
     """
     names = asking.named
     if map_name is not None:
@@ -231,9 +237,9 @@ def list_queries(
 def delete_queries(
     here: Here,
     asking: Asking,
-    map_name: Annotated[str, Query(alias="map", description="Whose queries are removed.")],
+    map_name: Annotated[str, Query(alias="map", description="Name of the map.")],
 ) -> None:
-    """Remove all past queries of a map with their answers. Requires `admin` of the map."""
+    """Delete all past queries of a map with their answers. Requires `admin` for the map."""
     asking.require(map_name, "admin")
     here.audit.record("queries.removed", map_name)
     here.context.query_log.remove_of_map(map_name)

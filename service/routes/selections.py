@@ -1,4 +1,4 @@
-"""Selected frames of a map, deleted or edited together, and deletions undone."""
+"""Routes that delete, edit and restore several frames of a map at once."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _STATUSES = declared(400, 404, 413, 415, 422)
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDeleted:
-    """Delete frames by their ids, or all that pass a filter.
+    """Delete frames by their ids, or all frames that match a filter.
 
-    No query finds them from then on. A call ends after ten seconds: repeat it while `remaining` is
-    not 0. Ten minutes by default, POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes
-    it.
+    Queries stop finding them at once. A call ends after ten seconds: repeat it while `remaining` is
+    not 0. POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it, within ten minutes by
+    default.
     """
     wanted = await read_record(request, FrameSelection, "The selection")
     return await here.upload_gate.enter(
@@ -50,10 +50,10 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdited:
-    """Move frames to a session, rename their robot, add or remove tags: by ids, or by a filter.
+    """Move frames to a session, rename their robot, and add or remove tags, by ids or by a filter.
 
     A call edits at most 1000 frames: repeat it with `after` while `remaining` is not 0. `inverse`
-    has what undoes it.
+    contains the requests that undo the edit.
     """
     edit = await read_record(request, FramesEdit, "The edit of the frames")
     return await here.upload_gate.enter(partial(edit_selection, here.context.store, map_name, edit))
@@ -63,9 +63,9 @@ async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdit
     "/frames/{frame_id}/restore", responses=declared(404, 409), dependencies=[Depends(may_write)]
 )
 def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
-    """Restore a deleted frame, while that can be done; queries find it again at once.
+    """Restore a deleted frame. Queries find it again at once.
 
-    404 where it is gone for good, or another frame has its id; 409 where its content came again.
+    404 if it has been purged or another frame has its id; 409 if its content was uploaded again.
     """
     here.tombstones.restore_one(map_name, frame_id)
     return get_frame(here.context.store, map_name, frame_id)
@@ -75,10 +75,10 @@ def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
 def list_deletions(
     map_name: str,
     here: Here,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[FrameDeletion]:
-    """Deletions of frames that can still be undone, the newest first."""
+    """List deletions of frames that can still be undone, newest first."""
     return here.tombstones.list_all(map_name, cursor, limit)
 
 
@@ -86,9 +86,9 @@ def list_deletions(
     "/deletions/{deletion_id}/restore", responses=declared(404), dependencies=[Depends(may_write)]
 )
 async def restore_deletion(map_name: str, deletion_id: str, here: Here) -> FramesRestored:
-    """Restore the frames of a deletion with all that was known of them, found again at once.
+    """Restore the frames of a deletion with all their data. Queries find them again at once.
 
-    A call ends after ten seconds: repeat it while `remaining` is not 0. 403 where the map may not
-    hold so many frames.
+    A call ends after ten seconds: repeat it while `remaining` is not 0. 403 if the frames exceed
+    the quota of the map.
     """
     return await here.upload_gate.enter(partial(here.tombstones.restore, map_name, deletion_id))

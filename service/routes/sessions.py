@@ -1,4 +1,4 @@
-"""What was taken in one run, and when: sessions of a map, a trajectory, and how the map grew."""
+"""Routes for the sessions of a map and their trajectories."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ router = v1_router("/maps/{map_name}", "sessions", may_read)
 _PLAIN, _JSON = "text/plain", "application/json"
 _TRAJECTORY: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "By Accept: TUM lines `t tx ty tz qx qy qz qw`, their frames in comments; "
-        "or JSON with the ids of the frames.",
+        "description": "Depending on Accept: TUM lines `t tx ty tz qx qy qz qw` with the "
+        "coordinate frames in comments, or JSON with the ids of the frames.",
         "model": Trajectory,
         "content": {_PLAIN: {"schema": {"type": "string"}}},
     },
@@ -36,19 +36,21 @@ _TRAJECTORY: dict[int | str, dict[str, Any]] = {
 def get_sessions(
     map_name: str,
     here: Here,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[Session]:
-    """Runs of a map by session and robot: how many frames, when, and where their poses lead.
+    """List the runs of a map by session and robot, with their number of frames, times and extent.
 
-    Frames that name neither are one run, and the first.
+    Frames without a session and a robot form one run, which comes first.
     """
     return list_sessions(here.context.store, map_name, cursor, limit)
 
 
-# Names of sessions may hold anything, such as slashes, and so are no parts of a path.
+# Names of sessions may contain slashes, so they are not part of the path.
 _SessionName = Annotated[Label, Query(description="Name of the session.")]
-_Robot = Annotated[Label | None, Query(description="Only frames of this robot; default: of all.")]
+_Robot = Annotated[
+    Label | None, Query(description="Only frames of this robot; default: all robots.")
+]
 
 
 @router.delete("/sessions", responses=declared(404, 422), dependencies=[Depends(may_write)])
@@ -57,8 +59,8 @@ async def delete_session_frames(
 ) -> SessionChange:
     """Delete all frames of a session.
 
-    A call ends after ten seconds: repeat it while `remaining` is not 0. Ten minutes by default,
-    POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it.
+    A call ends after ten seconds: repeat it while `remaining` is not 0. POST
+    /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it, within ten minutes by default.
     """
     return await here.upload_gate.enter(
         partial(delete_session, here.context.store, map_name, session, here.tombstones, robot)
@@ -78,10 +80,10 @@ async def patch_session(
     here: Here,
     robot: _Robot = None,
     after: Annotated[
-        str | None, Query(description="`last_frame_id` of the call before, to go on from there.")
+        str | None, Query(description="`last_frame_id` of the previous call, to continue after it.")
     ] = None,
 ) -> SessionChange:
-    """Rename a session or its robot, and add or remove tags, on all its frames.
+    """Rename a session or its robot, and add or remove tags, in all its frames.
 
     A call ends after ten seconds: repeat it with `after` while `remaining` is not 0.
     """
@@ -95,10 +97,10 @@ async def patch_session(
 async def get_trajectory(
     map_name: str, request: Request, here: Here, run: Annotated[Run, Query()]
 ) -> Response:
-    """The poses of a run in the order of time: of the sensors' frames, in metres.
+    """Return the sensor poses of a run in the order of time, in metres.
 
-    At most 100,000 frames at once; ask for parts of a longer one by time, or for `most` of them,
-    which are evenly taken along it.
+    A response has at most 100,000 frames. For a longer run, request intervals of time, or use
+    `most` for that many frames, evenly spaced along the run.
     """
     kind = preferred_media_type(request, (_PLAIN, _JSON))
 

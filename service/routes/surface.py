@@ -1,4 +1,4 @@
-"""The fused surface of a map: tiles to draw, frames that saw a spot, a plan."""
+"""Routes for the fused surface of a map: tiles, frames at a point, and a plan."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from service.running_service import Here
 router = v1_router("/maps/{map_name}/surface", "surface", may_read)
 
 _PNG, _BYTES = "image/png", "application/octet-stream"
-#: Of what a digest stands for: it never changes.
+#: Content under a digest never changes.
 _FOREVER = "private, max-age=31536000, immutable"
 Parent = Annotated[
-    Label | None, Query(description="Parent frame; default: the one of most frames.")
+    Label | None, Query(description="Parent frame; default: that of the most frames.")
 ]
 
 
 @router.get("", responses=declared(404))
 def get_surface(map_name: str, here: Here) -> MapSurface:
-    """What the posed frames of a map saw, fused: levels of tiles, sessions, state."""
+    """Return the state, the levels of tiles and the sessions of a map's fused surface."""
     return here.surfaces.get(map_name)
 
 
@@ -43,17 +43,17 @@ def get_surface(map_name: str, here: Here) -> MapSurface:
     "",
     status_code=202,
     responses={
-        200: {"model": MapSurface, "description": "It is up to date."},
+        200: {"model": MapSurface, "description": "The surface is up to date."},
         **declared(404, 422),
     },
     dependencies=[Depends(may_write)],
 )
 def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
-    """Build the surface of a map, or add what came since, now.
+    """Build the surface of a map now, or add new frames to it.
 
-    Workers do so when frames arrive, unless `SCENEPRINT_BUILD_SURFACES` is `on_request`. Poll
-    `Location` until `state` is `ready`; existing tiles can be read meanwhile. It takes the scope
-    `write`.
+    Workers do this automatically for new frames, unless `SCENEPRINT_BUILD_SURFACES` is
+    `on_request`. GET the path in `Location` until `state` is `ready`; existing tiles stay available
+    meanwhile. Requires the scope `write`.
     """
     surface, begun = here.surfaces.begin(map_name)
     response.headers["Location"] = f"/v1/maps/{map_name}/surface"
@@ -64,7 +64,7 @@ def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
 
 @router.delete("", status_code=204, responses=declared(404), dependencies=[Depends(may_write)])
 def delete_surface(map_name: str, here: Here) -> None:
-    """Delete the surface of a map. Workers build it again only when somebody asks for it."""
+    """Delete the surface of a map. Workers build it again only on request."""
     here.surfaces.remove(map_name)
 
 
@@ -73,11 +73,11 @@ def list_surface_tiles(
     map_name: str,
     here: Here,
     parent: Parent = None,
-    level: Annotated[int, Query(ge=0, le=7, description="0 has the finest cells.")] = 0,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    level: Annotated[int, Query(ge=0, le=7, description="Level; 0 has the finest cells.")] = 0,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 1000,
 ) -> Page[SurfaceTile]:
-    """Tiles of a level by column, row and floor."""
+    """List the tiles of a level by column, row and floor."""
     return here.surfaces.tiles(map_name, parent, level, cursor, limit)
 
 
@@ -85,11 +85,11 @@ def list_surface_tiles(
     "/tiles/{digest}",
     response_class=Response,
     responses=file_responses(
-        _BYTES, description="8 bytes a cell; see docs/surface.md.", statuses=(404,)
+        _BYTES, description="8 bytes per cell; see docs/surface.md.", statuses=(404,)
     ),
 )
 def get_surface_tile(map_name: str, digest: str, request: Request, here: Here) -> Response:
-    """The cells of a tile. They never change: another digest stands for others."""
+    """Return the cells of a tile. A tile with other cells has another digest."""
     found = here.surfaces.tile(map_name, digest)
     headers = {"ETag": f'"{found.tag}"', "Cache-Control": _FOREVER}
     if is_known(request, found.tag):
@@ -103,27 +103,30 @@ def list_surface_frames(
     here: Here,
     parent: Parent = None,
     at: Annotated[
-        str | None, Query(max_length=200, description="x,y,z of a spot that frames saw, metres.")
+        str | None, Query(max_length=200, description="Point x,y,z that frames saw, metres.")
     ] = None,
     radius: Annotated[
         float | None,
-        Query(gt=0, le=1e6, description="How near to the spot, metres; default: two cells."),
+        Query(gt=0, le=1e6, description="Maximum distance from `at`, metres; default: two cells."),
     ] = None,
     box: Annotated[
         str | None,
-        Query(max_length=400, description="x0,y0,z0,x1,y1,z1 of a box that frames were taken in."),
+        Query(
+            max_length=400, description="Box x0,y0,z0,x1,y1,z1 that contains viewpoints, metres."
+        ),
     ] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 20,
 ) -> Page[SurfaceSighting]:
-    """Frames that saw a spot, from the nearest viewpoint on; or frames that were taken in a box.
+    """List frames that saw a point, from the nearest viewpoint on, or frames that were taken in a
+    box.
 
-    Give `at` or `box`. A frame saw the spot where a point of its own lies within `radius`. Before
-    the last page a page may hold fewer than `limit`.
+    Specify either `at` or `box`. A frame saw the point if one of its own points is within `radius`.
+    Pages before the last may have fewer than `limit` items.
     """
     if (at is None) == (box is None):
         raise InvalidRequest(
-            "Give either `at` or `box`.", (("at", "either this or box is required"),)
+            "Specify either `at` or `box`.", (("at", "either this or box is required"),)
         )
     if at is not None:
         spot = _numbers("at", at, 3)
@@ -136,7 +139,7 @@ def list_surface_frames(
     "/plan.png",
     response_class=Response,
     responses=file_responses(
-        _PNG, description="Seen from above, transparent where nothing is.", statuses=(404, 422)
+        _PNG, description="View from above, transparent where it is empty.", statuses=(404, 422)
     ),
 )
 async def get_surface_plan(
@@ -145,18 +148,21 @@ async def get_surface_plan(
     here: Here,
     parent: Parent = None,
     width: Annotated[
-        int, Query(ge=PLAN_WIDTHS[0], le=PLAN_WIDTHS[1], description="Pixels of the longer side.")
+        int,
+        Query(
+            ge=PLAN_WIDTHS[0], le=PLAN_WIDTHS[1], description="Length of the longer side, pixels."
+        ),
     ] = PLAN_WIDTH,
     low: Annotated[
         float | None,
-        Query(ge=-FARTHEST_M, le=FARTHEST_M, description="Only above this height, metres."),
+        Query(ge=-FARTHEST_M, le=FARTHEST_M, description="Only cells above this height, metres."),
     ] = None,
     high: Annotated[
         float | None,
-        Query(ge=-FARTHEST_M, le=FARTHEST_M, description="Only below this height, metres."),
+        Query(ge=-FARTHEST_M, le=FARTHEST_M, description="Only cells below this height, metres."),
     ] = None,
 ) -> Response:
-    """A surface as a picture. `plan` of GET /v1/maps/{map_name}/surface tells where it lies."""
+    """Return a plan of a surface. `plan` of GET /v1/maps/{map_name}/surface has its position."""
     output = await here.run(lambda: here.surfaces.picture(map_name, parent, width, low, high))
     return await sent(request, here, output, _PNG, "surface.png")
 
@@ -173,7 +179,7 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
         math.isfinite(one) and abs(one) <= FARTHEST_M for one in found
     ):
         raise InvalidRequest(
-            f"`{name}` is {text!r:.80}. Give {count} numbers with commas between them, in metres.",
+            f"`{name}` is {text!r:.80}. Specify {count} numbers in metres, separated by commas.",
             ((name, f"not {count} numbers"),),
         )
     return found

@@ -309,7 +309,7 @@ def test_damaged_blobs_are_left_out_and_named(
     folder = tmp_path / "place"
     said = sceneprint("snapshot", "--data", data, "--to", folder, expect=1)
     why = sorted([(first[1], "damaged"), (artifact, "missing")])
-    lines = [f"not in it: blob {digest[:12]}, {why}" for digest, why in why]
+    lines = [f"missing: blob {digest[:12]}, {why}" for digest, why in why]
     assert said.stderr.splitlines()[:-1] == lines
     assert not {digest for digest, _ in why} & set(parts_in(folder))
     assert (

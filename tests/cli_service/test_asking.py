@@ -69,7 +69,7 @@ def test_a_query_says_where_frames_were_lost(
     first, second = (f"{maps['near'][i]} (frame-00000{i}.depth.png)" for i in range(2))
     assert lines[-3].startswith(f"     1  {first}  1.00  validate: accepted; accepted:")
     assert "retrieve: not selected; most similar to the selected frame" in lines[-2]
-    assert lines[-1].startswith(f"  {second}: rank 2 of 2; lost at selection: ")
+    assert lines[-1].startswith(f"  {second}: rank 2 of 2; dropped at selection: ")
     both = json.loads(sceneprint(*asked, "--map", "far", "--json").stdout)
     assert (both["maps"], both["counts"]["map"]) == (["near", "far"], 4)
     line = sceneprint(*asked, "--map", "far", "--diversity", "omega=1000").stdout.splitlines()[2]
@@ -100,7 +100,7 @@ def test_a_frame_is_localized(sceneprint: Run, maps: dict[str, list[str]], rooms
     prior = {"pose": {"parent_frame": "room-0/seq-01", "matrix": np.eye(4).tolist()}}
     asked = ("localize", "near", rooms / "room-0", "--prior", json.dumps(prior))
     refused = sceneprint(*asked, expect=2).stderr
-    assert "has 3 frames, and --prior is of one. Name it with --frame.\n" in refused
+    assert "has 3 frames, but --prior applies to one. Select it with --frame.\n" in refused
     lost = sceneprint(*alone[:-1], "--frame", 2, expect=1).stdout
     assert ": not found; none of 2 candidates is accepted" in lost
     assert lost.splitlines()[1] == "  cause: nothing_alike"
@@ -188,9 +188,9 @@ def test_frames_of_a_folder_are_asked_with_those_before_them(
     one = ("localize", "near", tmp_path / "room-0", "--frame", 1)
     assert json.loads(sceneprint(*one, "--json").stdout)["frames"] == 1
     for wrong, text in (
-        ((*asked, "--last", 11), "--last 11: choose from 1 to 10"),
-        ((*asked, "--last", 2, "--up", "0,-1,0"), "--up is of one frame"),
-        ((*one, "--last", 2), "has no pose, and --last 2 needs odometry"),
+        ((*asked, "--last", 11), "--last 11: use a number from 1 to 10"),
+        ((*asked, "--last", 2, "--up", "0,-1,0"), "--up applies to one frame"),
+        ((*one, "--last", 2), "has no pose, but --last 2 requires odometry"),
     ):
         assert text in sceneprint(*wrong, expect=2).stderr
 
@@ -215,7 +215,7 @@ def test_a_prior_is_a_file_or_json(
     (tmp_path / "torn.json").write_text('{"pose": ')
     pose = {"translation": {"x": 0, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
     for wrong, text in (
-        (tmp_path / "none.json", "cannot be read (No such file or directory). Give JSON, or"),
+        (tmp_path / "none.json", "cannot be read (No such file or directory). Pass JSON or"),
         (tmp_path / "torn.json", "the prior is not JSON ("),
         (json.dumps({"pose": pose}), "parent_frame"),
         (json.dumps({**prior, "covariance": [1]}), "covariance: List should have at least 36"),
@@ -236,7 +236,7 @@ def test_queries_that_came_are_listed(sceneprint: Run, service_url: str, rooms: 
         lost = client.localize("asked", frames[1], robot="cart")
     assert (found.status, lost.status) == ("found", "not_found")
     head, second, first = sceneprint("queries", "asked").stdout.splitlines()
-    assert " ".join(head.split()) == "query came status ms map robot/session where or why"
+    assert " ".join(head.split()) == "query time status ms map robot/session pose or reason"
     assert found.pose is not None
     t = found.pose.translation
     place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in room-0, 1 view, {floored(found.confidence)} %"

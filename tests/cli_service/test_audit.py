@@ -57,6 +57,6 @@ def test_all_entries_are_exported(sceneprint: Run, data: Path) -> None:
 
 def test_a_file_needs_a_format(sceneprint: Run, data: Path) -> None:
     done = sceneprint("audit", "--output", data / "x", "--data", data, expect=2)
-    assert "--output needs --format" in done.stderr
+    assert "--output requires --format" in done.stderr
     with pytest.raises(SystemExit):
         main(["audit", "--format", "xml"])

@@ -69,7 +69,7 @@ def test_rows_of_five_are_named_or_refused(sceneprint: Run, scans: Path, tmp_pat
     done = sceneprint("upload", "rows", scans, "--row", "x,y,z,i", expect=2)
     assert "--row is for .bin files, and walk has others" in done.stderr
     done = sceneprint("upload", "rows", scans / "1.ply", "--as-map", "--row", "x,y,z", expect=2)
-    assert "--row is for .bin files, and not for a map" in done.stderr
+    assert "--row is for .bin files, not for maps" in done.stderr
 
 
 def test_scans_are_signed_where_they_lie(sceneprint: Run, scans: Path) -> None:

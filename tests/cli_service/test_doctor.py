@@ -68,7 +68,7 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, working: str) -> No
         assert found[needed] == "ok"
     assert set(found.values()) <= {"ok", "note"}
     assert f"{working} answers, version {__version__}" in done.stdout
-    assert "--data names another" not in done.stdout
+    assert "the default of --data" not in done.stdout
     assert done.stdout.splitlines()[-1] == "no problems found"
 
 
@@ -90,7 +90,7 @@ def test_a_running_service(sceneprint: Run, working: str, monkeypatch: pytest.Mo
     assert list(found) == SERVICE
     assert set(found.values()) <= {"ok", "note"}
     for told in (
-        "takes uploads and answers queries", r"clock differs from this machine's by 0\.\d s",
+        "accepts uploads and answers queries", r"clock differs from this machine's by 0\.\d s",
         r"database of \d+\.\d MB, blobs of", "1 worker runs, ", rf"{model}: .*looked-at",
     ):  # fmt: skip
         assert re.search(told, said), told
@@ -123,8 +123,8 @@ def test_without_an_address_the_default_folder_is_named(
     monkeypatch.setattr(doctor, "DEFAULT_URL", service_url)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     done = sceneprint("doctor")
-    assert f"{tmp_path}/sceneprint can be created: the default, --data names another" in done.stdout
-    assert f"`sceneprint doctor --url {service_url}` asks the service itself" in done.stdout
+    assert f"{tmp_path}/sceneprint can be created, the default of --data" in done.stdout
+    assert f"`sceneprint doctor --url {service_url}` checks the service itself" in done.stdout
     assert list(verdicts(done.stdout))[-1] == "service"
 
 
@@ -158,7 +158,7 @@ def test_what_is_wrong_says_what_to_do(sceneprint: Run, tmp_path: Path) -> None:
         "service",
     ]
     assert "file is not a database" in done.stdout
-    assert "no service answers at http://127.0.0.1:1" in done.stdout
+    assert "no service responds at http://127.0.0.1:1" in done.stdout
     assert done.stdout.splitlines()[-1] == "2 problems found"
     done = sceneprint("doctor", "--data", "/proc/none", expect=2)
     assert verdicts(done.stdout)["data folder"] == "WRONG"
@@ -178,7 +178,7 @@ def test_databases_of_other_versions(tmp_path: Path) -> None:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
     connection.close()
     finding = found_in(settings)["database"]
-    assert (finding.verdict, "which this one may still use" in finding.text) == ("note", True)
+    assert (finding.verdict, "which this version can still use" in finding.text) == ("note", True)
     with sqlite3.connect(path) as connection:
         connection.execute("UPDATE schema_range SET least_revision = '9999'")
     connection.close()
@@ -313,11 +313,11 @@ def test_workers_that_are_missing(waiting: Client) -> None:
     )
     found = worker_check(late, read_only=False)
     assert found.verdict == "WRONG"
-    assert "not signed. Start some with `sceneprint work`, and see their log" in found.text
+    assert "not signed. Start workers with `sceneprint work`, and read their log" in found.text
     assert worker_check(late, read_only=True).verdict == "ok"  # there is nothing for them to do
     queue = queue_check(late)
     assert queue.verdict == "note"
-    assert "the oldest for 100 s; 2 failed for good: `sceneprint jobs --state dead`" in queue.text
+    assert "the oldest for 100 s; 2 failed in every attempt: `sceneprint jobs" in queue.text
 
 
 def test_why_jobs_wait(waiting: Client) -> None:
@@ -336,7 +336,7 @@ def test_what_a_service_may_tell(waiting: Client) -> None:
     assert found.verdict == "note"
     assert f"version 99.1, 3 frames; this is version {__version__}" in found.text
     found = ready_check(status.model_copy(update={"read_only": True}))
-    assert (found.verdict, "rejects uploads" in found.text) == ("note", True)
+    assert (found.verdict, "refuses uploads" in found.text) == ("note", True)
     for there, verdict, text in (
         (99.0, "ok", "0.0 s"),
         (103.5, "note", "3.5 s"),
@@ -350,7 +350,8 @@ def test_what_a_service_may_tell(waiting: Client) -> None:
     found = model_check([one, old, old], waiting.models())
     assert found.verdict == "note"
     assert (
-        "2 maps have an older model than this version brings: `sceneprint reencode m" in found.text
+        "2 maps have an older model than this version contains: `sceneprint reencode m"
+        in found.text
     )
 
 

@@ -75,7 +75,7 @@ def test_object_stores(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     )  # fmt: skip
     blobs, indexes = object_stores(settings)
     assert (blobs.verdict, indexes.verdict) == ("ok", "ok")
-    assert blobs.text.startswith(f"{bucket}/blobs: written, read and removed in ")
+    assert blobs.text.startswith(f"{bucket}/blobs: written, read and deleted in ")
     assert "AWS_... in the environment" in blobs.text
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
     lost = Settings(data_dir=tmp_path, database_url=None, index_url=f"{bucket}-none")

@@ -42,7 +42,7 @@ def test_a_query_names_what_it_looks_among(sceneprint: Run, service_url: str, ro
         (["--not-within", "5"], "no captured_at"),
         (["--not-within", "-5"], "filter.not_within_s: Input should be greater than 0"),
         (["--before", "yesterday"], "filter.captured_before"),
-        ([box], "Give --region and --region-frame together"),
+        ([box], "Specify --region and --region-frame together"),
     ):
         said = sceneprint(*ask, *options, expect=2)
         assert text in said.stderr

@@ -86,8 +86,8 @@ def test_lists_files_and_edits(
     [
         (("--cloud", "a.ply"), "--cloud applies to one frame"),
         (("--edit", "{}"), "--edit applies to one frame"),
-        (("--trajectory", "a.tum"), "--trajectory needs a session"),
-        (("--session", "s", "--robot", "a", "--robot", "b", "--trajectory", "a"), "one robot only"),
+        (("--trajectory", "a.tum"), "--trajectory requires a session"),
+        (("--session", "s", "--robot", "a", "--robot", "b", "--trajectory", "a"), "only one robot"),
         (("nobody", "--cloud", "a.ply"), "There is no"),
     ],
 )
@@ -116,12 +116,12 @@ def test_a_session_is_renamed_tagged_and_deleted(
     refused = sceneprint("sessions", name, new, "--delete", expect=2).stderr
     assert refused == (
         f"sceneprint sessions: This would delete session {new} and its 3 frames. Add "
-        "--yes to go ahead.\n"
+        "--yes to confirm.\n"
     )
     both = sceneprint("sessions", name, new, "--delete", "--tag", "a", expect=2).stderr
-    assert both.endswith(": --delete removes the session. Leave the other changes out.\n")
+    assert both.endswith(": --delete removes the session. Omit the other changes.\n")
     nameless = sceneprint("sessions", name, "--delete", expect=2).stderr
-    assert nameless.endswith(": Name the session after the map, to edit or delete it.\n")
+    assert nameless.endswith(": Specify the session after the map to edit or delete it.\n")
     said = sceneprint("sessions", name, new, "--delete", "--yes").stdout
     head, undo = said.splitlines()
     assert head == f"deleted session {new} and its 3 frames"
@@ -135,7 +135,7 @@ def test_a_session_is_renamed_tagged_and_deleted(
     again = sceneprint("sessions", name, "--undo", deletion, expect=2).stderr
     assert "has no deletion" in again
     of_one = sceneprint("sessions", name, new, "--deletions", expect=2).stderr
-    assert "Name no session" in of_one
+    assert "Omit the session" in of_one
     sceneprint("sessions", name, new, "--delete", "--yes")
     gone = sceneprint("sessions", name, new, "--delete", "--yes", expect=2).stderr
     assert f"has no frame of session '{new}'" in gone

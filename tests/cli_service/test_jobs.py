@@ -82,4 +82,4 @@ def test_a_priority_out_of_its_range_is_refused(capsys: pytest.CaptureFixture[st
     for wrong in ("11", "-11", "x", "--5", "1.0"):
         with pytest.raises(SystemExit):
             main(["upload", "m", "path", f"--priority={wrong}"])
-        assert "is not a whole number from -10 to 10" in capsys.readouterr().err
+        assert "is not an integer from -10 to 10" in capsys.readouterr().err

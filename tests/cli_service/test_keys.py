@@ -63,10 +63,7 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_pa
     listed = keys("--list")
     assert "robot  read of all, until 2" in listed.stdout
     assert f", old secret until {until:%Y-%m-%dT%H:%M:%SZ}, used {until:%Y-}" in listed.stdout
-    assert (
-        listed.stderr
-        == "expiring within 7 days: robot. Create keys in their place with --create.\n"
-    )
+    assert listed.stderr == "expiring within 7 days: robot. Create new keys with --create.\n"
     last = keys("--rotate", "robot", "--overlap", "0").stdout.strip()
     assert [named(one) for one in (old, last)] == [None, "robot"]
     assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr

@@ -62,6 +62,6 @@ def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: P
     said = sceneprint("make", "mesh", "nothing", first, expect=1)
     assert said.stdout == f"{first}: not found, so there is nothing to fuse\n"
     said = sceneprint("make", "mesh", "nothing", walk, expect=2)
-    assert "6 frames found. Name a single frame file." in said.stderr
+    assert "6 frames found. Specify a single frame file." in said.stderr
     said = sceneprint("make", "mesh", "nothing", "nobody", expect=2)
     assert "There is no frame 'nobody'" in said.stderr

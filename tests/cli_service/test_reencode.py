@@ -90,6 +90,6 @@ def test_waiting_ends_where_it_is_no_use(
     with engine, engine.store.database.write() as connection:
         connection.execute(broken)
     said = sceneprint("reencode", "hall", "--status", "--wait", "--data", tmp_path, expect=2)
-    assert "1 frames failed every attempt, and the map does not switch until" in said.stdout
+    assert "1 frames failed in every attempt, and the map does not switch until" in said.stdout
     said = wait()  # tries it again
     assert "0 frames signed, 1 waiting\n" in said.stdout

@@ -41,7 +41,7 @@ def test_frames_are_spooled_and_uploaded(
 ) -> None:
     spool, bare = tmp_path / "robot.spool", tmp_path / "bare"
     said = sceneprint("spool", spool, expect=2)
-    assert "There is no spool here" in said.stderr
+    assert "there is no spool here" in said.stderr
     assert not spool.exists()
     added = sceneprint("spool", spool, rooms, "--robot", "cart", "--most-bytes", 10**8)
     assert added.stdout == ("6 frames: 6 added, 0 already there, 0 refused; 6 wait, 0 thinned\n")

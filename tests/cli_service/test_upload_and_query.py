@@ -123,7 +123,7 @@ def test_what_is_lost_though_nobody_asked_ends_with_code_2(
     options = ("upload", "day", folder, "--depth-scale", "250")
     done = sceneprint(*options, expect=2)
     *_, counts, summary, hint = done.stdout.splitlines()
-    assert hint == "map day has no poses: queries find frames, and no coordinates"
+    assert hint == "map day has no poses, so answers have frames but no coordinates"
     assert "3 received, 0 already there; 3 indexed" in counts
     assert summary.startswith(
         "poses of 0 of 3 frames; 3 without: groundtruth.txt has no pose within 20 ms of them "
@@ -151,7 +151,7 @@ def test_a_map_without_poses_says_so_and_gives_no_coordinates(
     folder = rooms / "room-0" / "seq-01"
     done = sceneprint("upload", "bare", folder, "--no-pose")
     *_, last = done.stdout.splitlines()
-    assert last == "map bare has no poses: queries find frames, and no coordinates"
+    assert last == "map bare has no poses, so answers have frames but no coordinates"
     [row] = [one for one in sceneprint("maps").stdout.splitlines() if one.startswith("bare ")]
     assert row.endswith("(no poses)")
     there = sceneprint("localize", "bare", folder / "frame-000000.depth.png").stdout
@@ -191,16 +191,14 @@ def test_upload_refuses_what_would_mix(
     sceneprint: Run, house: str, rooms: Path, tmp_path: Path
 ) -> None:
     done = sceneprint("upload", house, rooms, "--model", "paper", expect=2)
-    assert re.search(
-        r"Map house already exists with model depth-\w+\. Leave --model out", done.stderr
-    )
+    assert re.search(r"Map house already exists with model depth-\w+\. Omit --model", done.stderr)
     done = sceneprint("upload", "absent", rooms, "--no-create", expect=2)
     assert "There is no map 'absent'" in done.stderr
     other = tmp_path / "room-0"
     shutil.copytree(rooms / "room-0", other)
     done = sceneprint("upload", house, rooms / "room-0", other, expect=2)
-    assert "The name room-0 is also used for" in done.stderr
-    assert "name it with --parent-frame" in done.stderr
+    assert "the parent frame room-0 is also that of" in done.stderr
+    assert "specify it with --parent-frame" in done.stderr
     assert done.stdout == ""
 
 
@@ -346,7 +344,7 @@ def test_an_archive_is_uploaded_as_its_folder_is(
     bad = tmp_path / "bad.zip"
     bad.write_bytes(b"PK\x03\x04" + bytes(600))
     done = sceneprint("upload", house, made, "--depth-scale", 1000, expect=2)
-    assert 'put it as "depth_scale" into intrinsics.json' in done.stderr
+    assert 'put the value as "depth_scale" into intrinsics.json' in done.stderr
     done = sceneprint("upload", house, bad, expect=2)
     assert (len(done.stdout.splitlines()), len(done.stderr.splitlines())) == (1, 1)
 
@@ -396,7 +394,7 @@ def test_an_upload_waits_for_a_service_that_compiles(
     with Client.embedded(tmp_path) as client:
         client._worker._runner._context.signers._compiled.clear()  # type: ignore[union-attr]
         assert is_starting(client)
-    assert "the service compiles its kernels" in capsys.readouterr().err
+    assert "the service is compiling its kernels" in capsys.readouterr().err
 
 
 def test_an_upload_ends_at_its_timeout(sceneprint: Run, tmp_path: Path, rooms: Path) -> None:
@@ -420,14 +418,14 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     created, views, how, offset, *_ = done.stdout.splitlines()
     assert created.startswith("created map mesh with model depth-")
     assert re.fullmatch(
-        r"room\.ply: \d+ views are in map mesh and see \d+% of its surface\. Their poses lead to "
+        r"room\.ply: \d+ views are in map mesh and see \d+% of its surface\. Their parent frame is "
         r"room\..*",
         views,
     )
-    assert how == "units: m (as you said); up: z (as you said)"
+    assert how == "units: m (as specified); up: z (as specified)"
     assert offset.startswith("offset: 0,0,1 m; ")
     assert re.search(
-        r"^Of \d+ other views of this file \d+% are found in the map: ", done.stdout, re.M
+        r"^Of \d+ test views of this file, \d+% are found in the map: ", done.stdout, re.M
     )
     with Client(service_url) as client:
         frames = list(client.frames("mesh"))
@@ -441,7 +439,7 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
         (("--as-map", "--every", "2"), "every: does not apply to a map"),
         (("--as-map", "--up", "0,0,1"), "up: one of x, -x"),
         (("--offset", "0,0,1"), "--offset is for a map that is one file"),
-        (("--height", "1"), "--height is for a map that is one file. Add --as-map"),
+        (("--height", "1"), "--height is only for maps in one file. Add --as-map"),
         (("--up", "z"), "--up z is an axis of a file, for --as-map"),
     ],
 )

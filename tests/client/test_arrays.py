@@ -156,7 +156,7 @@ def test_the_pose_of_the_base_is_stored_as_that_of_the_sensor(
     pose = client.frame(map_name, added.frame_id).pose
     assert pose is not None
     np.testing.assert_allclose(np.array(pose.matrix)[:3, 3], [1, 2.2, 0.5], atol=1e-12)
-    with pytest.raises(InvalidRequest, match="give T_base_sensor"):
+    with pytest.raises(InvalidRequest, match="requires T_base_sensor"):
         checked(FrameMeta, "The frame", **{**told, "T_base_sensor": None})
     with pytest.raises(InvalidRequest, match="pose of the sensor"):
         checked(Prior, "The prior", pose=told["pose"])

@@ -114,7 +114,7 @@ def test_the_command(
     newest = next(iter(client.products(Association, MAP)))
     assert newest.result is not None
     assert lines[0].startswith(f"association {newest.job_id}: {newest.result.edges} edges")
-    assert lines[2].startswith("joined surely, ann/a onto ann/b: ") or lines[2].startswith(
+    assert lines[2].startswith("joined strongly, ann/a onto ann/b: ") or lines[2].startswith(
         "joined weakly (check it before you rely on it)"
     )
     assert lines[-1] == f"wrote {out}"
@@ -129,7 +129,7 @@ def test_the_command(
     assert told["request"]["apart"] == 2
     assert told["result"]["joins"] == []
     assert main([*of, "--out", str(tmp_path / "graph.gtsam")]) == 2
-    assert "has no known file type" in capsys.readouterr().err
+    assert "has an unknown file type" in capsys.readouterr().err
     begun = len(list(client.products(Association, MAP)))
     assert main([*of, "--out", str(tmp_path / "no" / "graph.g2o")]) == 2  # before it is begun
     assert "No such file or directory" in capsys.readouterr().err

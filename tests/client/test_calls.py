@@ -218,13 +218,13 @@ def test_requests_that_make_no_sense(
     with pytest.raises(InvalidRequest, match="less than or equal to 50") as told:
         client.query(map_name, references[0], k=51)
     assert [place for place, _ in told.value.fields] == ["k"]
-    with pytest.raises(InvalidRequest, match="stages: every query begins with retrieve"):
+    with pytest.raises(InvalidRequest, match="stages: every query starts with retrieve"):
         client.query(map_name, references[0], stages=["validate"])
     with pytest.raises(TypeError, match="either"):
         client.query(map_name)
     rejected = client.upload(map_name, bare_wall, wait_s=PATIENCE_S)
     assert rejected.state is FrameState.REJECTED
-    with pytest.raises(InvalidRequest, match="is rejected: Nothing in it can be signed") as told:
+    with pytest.raises(InvalidRequest, match="is rejected: The frame cannot be signed") as told:
         client.query(map_name, frame_id=rejected.frame_id)
     assert told.value.fields == (("frame_id", "is rejected"),)
     with pytest.raises(UnknownFrame, match="nobody"):

@@ -79,7 +79,7 @@ def test_names_come_back_in_matches_and_are_searched(
     assert [one.name for one in client.frames(map_name, name="frame-", order="desc")] == names
     assert list(client.frames(map_name, name="000001")) == []  # the beginning alone
     assert list(taken) == []
-    with pytest.raises(InvalidRequest, match="`taken` is the order of one session"):
+    with pytest.raises(InvalidRequest, match="`taken` requires exactly one `session`"):
         client.frames(map_name, order="taken")
     answer = client.query(map_name, references[1], explain=True)
     first = next(one for one in answer.matches if one.rank == 1)

@@ -85,7 +85,7 @@ def test_what_a_surface_refuses(fused: Client) -> None:
         fused.surface_plan(MAP, "elsewhere")
     with pytest.raises(InvalidRequest, match="The width is 5000"):
         fused.surface_plan(MAP, width=5000)
-    with pytest.raises(InvalidRequest, match="Give either `at` or `box`"):
+    with pytest.raises(InvalidRequest, match="Specify either `at` or `box`"):
         list(fused.surface_frames(MAP))
     tile = SurfaceTile(column=0, row=0, floor=0, cells=2, bytes=16, digest="x")
     with pytest.raises(Refused, match="sent 15 bytes, which are not 2 cells"):

@@ -414,10 +414,10 @@ def test_too_many_frames_are_refused_in_words(
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"sessions": ["a", "a"]}, "name it once"),
-        ({"sessions": ["a", "b"], "apart": 5}, "in one session"),
+        ({"sessions": ["a", "a"]}, "list the session once"),
+        ({"sessions": ["a", "b"], "apart": 5}, "only for one session"),
         ({"sessions": ["a", "b"], "robots": ["ann"]}, "one for each session"),
-        ({"sessions": ["a"], "filter": {"not_within_s": 3}}, "beside the filter"),
+        ({"sessions": ["a"], "filter": {"not_within_s": 3}}, "outside of the filter"),
         ({"sessions": []}, "at least 1"),
         ({"sessions": ["a"], "k": 11}, "less than or equal to 10"),
     ],

@@ -317,7 +317,7 @@ def test_what_cannot_be_measured_is_refused(
         engine.coverage.begin("none", NewMapCoverage())
     with pytest.raises(InvalidRequest, match="no indexed frame of session 'z'"):
         engine.coverage.begin("hall", NewMapCoverage(session="z"))
-    with pytest.raises(ValueError, match="leaves out the whole session already"):
+    with pytest.raises(ValueError, match="already excludes the whole session"):
         NewMapCoverage(other_sessions=True, not_within_s=3.0)
     queued = engine.coverage.begin("hall", NewMapCoverage(every=6))
     with pytest.raises(NotIndexed, match="is queued"):

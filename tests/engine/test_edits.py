@@ -134,7 +134,7 @@ def test_where_the_camera_sits(edit: Callable[..., Frame], full: Engine) -> None
         ({"pose": {"translation": {"x": 1}}}, "pose.translation.y: "),
         ({"pose": {"matrix": TURN, "translation": {"x": 1, "y": 2, "z": 3}}}, "pose: give "),
         ({"pose": {"nose": 1}}, "pose.nose: "),
-        ({"pose": {"parent_frame": None}}, "name its parent_frame, or the session"),
+        ({"pose": {"parent_frame": None}}, "specify its parent_frame, or the session"),
         ({"T_base_sensor": {"base_frame": "b"}}, "T_base_sensor: give "),
     ],
 )

@@ -307,7 +307,7 @@ def test_files_that_are_no_map_are_refused(empty: Engine, room_mesh: bytes) -> N
         ({"as": "map", "up": [0, 0, 1]}, "up: one of x, -x, y, -y, z, -z"),
         ({"as": "map", "heights": [0.0]}, "greater than 0"),
         ({"up": "z"}, "up: a unit vector in the axes of the sensor"),
-        ({"heights": [1.0]}, "heights: applies only with `as` = `map`"),
+        ({"heights": [1.0]}, "heights: applies only if `as` is `map`"),
         ({"units_per_metre": 1000}, "units_per_metre: applies only"),
         ({"camera": CAMERA}, "camera: applies only"),
     ],

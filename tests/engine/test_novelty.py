@@ -258,6 +258,6 @@ def test_what_may_be_asked(given: Any, share: float | None) -> None:
 
 @pytest.mark.parametrize("given", [0, 0.0, "0", -0.1, 1.1, "nan", float("inf"), "yes", "", "True"])
 def test_what_may_not_be_asked(given: Any) -> None:
-    with pytest.raises(InvalidRequest, match="above 0, up to 1") as caught:
+    with pytest.raises(InvalidRequest, match="above 0 and up to 1") as caught:
         novelty_of(given)
     assert [place for place, _ in caught.value.fields] == ["if_novel"]

@@ -271,7 +271,7 @@ def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> Non
     elsewhere["pose"]["parent_frame"] = "elsewhere"
     with pytest.raises(InvalidRequest, match="No frame of map 'hall' has a pose in the parent"):
         localized(full, uploads[8], prior=elsewhere)
-    with pytest.raises(ValueError, match=r"needs pose\.parent_frame"):
+    with pytest.raises(ValueError, match=r"requires pose\.parent_frame"):
         Prior.model_validate({"pose": {"matrix": np.eye(4).tolist()}})
 
 

@@ -161,5 +161,7 @@ def test_what_selects_nothing_or_everything_is_refused(given: dict[str, Any]) ->
 
 def test_an_edit_changes_something() -> None:
     for given in ({}, {"add_tags": []}, {"after": "a"}):
-        with pytest.raises(ValidationError, match="name session, robot, add_tags or remove_tags"):
+        with pytest.raises(
+            ValidationError, match="specify session, robot, add_tags or remove_tags"
+        ):
             FramesEdit.model_validate({"frame_ids": ["a"]} | given)

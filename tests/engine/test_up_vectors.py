@@ -70,8 +70,8 @@ def test_a_frame_keeps_its_up(empty: Engine, uploads: Any) -> None:
 @pytest.mark.parametrize(
     ("up", "why"),
     [
-        ([0, 0, 9.81], "its length is 9.81, not 1"),
-        ([0, 0, 0], "its length is 0, not 1"),
+        ([0, 0, 9.81], "the length is 9.81, not 1"),
+        ([0, 0, 0], "the length is 0, not 1"),
         ([0, -1], "neither {x, y, z} nor a list of three numbers"),
         ("up", "neither {x, y, z} nor a list of three numbers"),
         ({"x": 0, "y": 1}, "Field required"),

@@ -224,14 +224,14 @@ def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
     table = [re.sub(" +", " ", line.strip()) for line in lines]
     assert table == [
         "/camera/depth/camera_info sensor_msgs/msg/CameraInfo 8 5.7 Hz camera",
-        "/camera/depth/image_raw sensor_msgs/msg/Image 8 5.7 Hz 16UC1, taken",
+        "/camera/depth/image_raw sensor_msgs/msg/Image 8 5.7 Hz 16UC1, used",
         "/tf tf2_msgs/msg/TFMessage 8 5.7 Hz",
         "/tf_static tf2_msgs/msg/TFMessage 1",
         "8 of 8 frames of /camera/depth/image_raw taken, poses of 8 of 8 frames in odom",
         table[5],
         "poses: in lab/odom",
         "mounting: at 0.210 -0.050 0.930 m in base_link",
-        "up: of 0 of 8 frames",
+        "up: known for 0 of 8 frames",
         table[9],
     ]
     assert re.fullmatch(r"depth \S+ to \S+ m \(5th to 95th percentile\), \d+ % of .*", table[9])
@@ -244,7 +244,7 @@ def test_a_bag_of_which_nothing_would_be_taken(
     path = ros.write(tmp_path, lambda writer: writer.imu(0.0, (0, 0, 9.8)), "ros1")
     done = sceneprint("bag", path, expect=1)
     assert "ROS 1, 1 messages of 1 topics" in done.stdout
-    assert "nothing would be taken: " in done.stdout
+    assert "no frame can be used: " in done.stdout
     done = sceneprint("upload", "none", path, expect=2)
     assert done.stderr.startswith(f"sceneprint upload: {path}: There is no topic of depth images")
     assert done.stderr.count("\n") == 1
@@ -284,7 +284,7 @@ def test_options_that_are_none(recording: Path, capsys: pytest.CaptureFixture[st
     for given in ("-1", "nan", "x"):
         with pytest.raises(SystemExit):
             main(["bag", str(recording), "--keyframe-m", given])
-        assert "is not a number from 0 up" in capsys.readouterr().err
+        assert "is not a number of at least 0" in capsys.readouterr().err
 
 
 def test_rosbags_is_loaded_when_a_bag_is_opened_and_not_before(folder: Path) -> None:

@@ -172,10 +172,13 @@ def test_what_cannot_be_is_refused_first(
     query = ("query", MAP, unseen[0].path)
     file = tmp_path / "a"
     for arguments, why in (
-        ((*query, "--mcap", file, "--no-keep"), "Leave --no-keep out"),
+        ((*query, "--mcap", file, "--no-keep"), "Omit --no-keep"),
         ((*query, "--mcap", tmp_path / "no" / "a"), "No such file"),
         ((*query, "--mcap", file, "--map-frames", "-1"), None),
-        (("frames", MAP, "--session", "room", "--trajectory", file, "--mcap", file), "no scene"),
+        (
+            ("frames", MAP, "--session", "room", "--trajectory", file, "--mcap", file),
+            "does not write a scene",
+        ),
         (("frames", MAP, "--tag", "none", "--mcap", file), "No listed frame has a pose"),
         (("query", "nowhere", unseen[0].path, "--mcap", file), "nowhere"),
     ):

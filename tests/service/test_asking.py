@@ -124,7 +124,7 @@ def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map)
     for files, data, text in (
         ({"a": file}, {}, "frame_b"),
         ({"a": file, "b": file}, {}, "meta_a"),
-        ({"a": file}, {"frame_a": json.dumps(named), "meta_a": "{}"}, "given together with"),
+        ({"a": file}, {"frame_a": json.dumps(named), "meta_a": "{}"}, "specified together with"),
         ({"a": file}, {"frame_b": json.dumps(named), "b": "text"}, "text instead of a file"),
         ({"b": file}, {"frame_a": json.dumps(named), "meta_a": "{}"}, "without a file"),
         ({"a": file, "b": file}, {"meta_a": "{}", "meta_b": "{}"}, "intrinsics"),

@@ -299,7 +299,7 @@ def test_a_certificate_that_cannot_be_used_is_said(certificate, tmp_path):
             Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"of somebody")
         )
     )
-    with pytest.raises(InvalidRequest, match="not encrypted"):
+    with pytest.raises(InvalidRequest, match="its unencrypted key"):
         connections.tls_context(Settings(tls_cert=cert, tls_key=locked))
 
 

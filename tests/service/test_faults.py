@@ -30,7 +30,7 @@ def test_a_database_that_vanishes_is_told_of_and_comes_back(
         shaken.client.get(path),
         shaken.client.post(path, **small_shots[2].form()),
     ):
-        refused(answer, 503, "unusable-store", "See its log")
+        refused(answer, 503, "unusable-store", "Its log has the details")
         assert answer.headers["retry-after"] == "1"
         own = answer.headers["x-request-id"]
         noted = [line for line in shaken.log("request failed") if line["request_id"] == own]
@@ -68,7 +68,7 @@ def test_what_nobody_thought_of_is_told_by_its_id_alone(shaken, refused, truth):
     answer = shaken.client.get("/v1/maps", headers={"X-Request-Id": "unheard-of"})
     refused(answer, 500, "internal-error", "Please report it")
     assert answer.headers["x-request-id"] == "unheard-of"
-    (noted,) = shaken.log("request broke down")
+    (noted,) = shaken.log("unexpected error")
     assert noted["request_id"] == "unheard-of"
     assert "Traceback" in noted["traceback"]
     (line,) = [one for one in shaken.log("request") if one["request_id"] == "unheard-of"]

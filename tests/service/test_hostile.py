@@ -151,7 +151,7 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
         look = doctor.machine(Settings(data_dir=narrow.folder, database_url=None))
         told = {one.subject: one for one in look}
         assert told["data folder"].verdict == told["disk"].verdict == "WRONG"
-        assert "is on a full disk. Free some space" in told["data folder"].text
+        assert "is on a full disk, so uploads fail. Free some space" in told["data folder"].text
     narrow.free()
     until(lambda: pending(server) == {"succeeded": 2})  # of itself
     assert server.workers == [worker]

@@ -354,15 +354,15 @@ def test_series_of_tenants_stay_few():
     told = TenantMetrics(registry)
     for number in range(MOST_TENANTS + 5):
         told.request(f"t{number}", 200, 0.5)
-    told.tell({"t0": 2, "t51": 3, "t52": 4, NOBODY: 9}, {}, {})
+    told.update({"t0": 2, "t51": 3, "t52": 4, NOBODY: 9}, {}, {})
     text = generate_latest(registry).decode()
     assert text.count("sceneprint_tenant_requests_total{") == MOST_TENANTS + 1
     assert 'sceneprint_tenant_requests_total{status="200",tenant="(others)"} 5.0' in text
     assert 'sceneprint_tenant_requests_in_progress{tenant="t0"} 2.0' in text
     assert 'sceneprint_tenant_requests_in_progress{tenant="(others)"} 7.0' in text
-    told.tell({}, {"t1": 5}, {"t2": 6})
+    told.update({}, {"t1": 5}, {"t2": 6})
     text = generate_latest(registry).decode()
     assert 'sceneprint_tenant_spool_bytes{tenant="t1"} 5.0' in text
     assert 'sceneprint_tenant_waiting_jobs{tenant="t2"} 6.0' in text
-    told.tell({}, {}, {})
+    told.update({}, {}, {})
     assert "requests_in_progress{" not in generate_latest(registry).decode()

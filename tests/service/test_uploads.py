@@ -123,7 +123,7 @@ def test_a_query_may_be_a_body_too(served, hall, small_shots) -> None:
         ({"fxx": "1"}, "fxx"),
         ({"fx": "wide", "fy": "1", "cx": "1", "cy": "1"}, "fx"),
         ({"fx": "1", "fy": "1", "cx": "1"}, "cy"),
-        ({"meta": "{}", "fx": "1"}, "Put everything into `meta`"),
+        ({"meta": "{}", "fx": "1"}, "Put all fields into `meta`"),
         ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "pose": "1,2,3"}, "has 3 numbers"),
         ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "base_frame": "b"}, "Send both"),
         ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "base": "0,0,0,0,0,0,9"}, "T_base_sensor"),

@@ -12,8 +12,8 @@ Json = Mapping[str, Any]
 RECORDS = "records.md"
 JSON = "application/json"
 PROBLEM = "application/problem+json"
-#: What parameters begin with that stand in for a form, where the body is the frame itself.
-BARE = "Where the frame is the body: "
+#: Prefix of the descriptions of parameters that replace fields of a form.
+BARE = "Only if the body is the frame: "
 _METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD")
 #: Bounds of JSON Schema, as they are written after a type.
 _BOUNDS = {

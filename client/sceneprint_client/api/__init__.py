@@ -1,6 +1,6 @@
-"""What is said between robots, dashboards and the service: one set of records for both ends.
+"""Records of the HTTP API, for the service and its clients.
 
-Field names, units and words are those of the JSON; docs/api.md has examples.
+Names of fields and units are those of the JSON; docs/api.md has examples.
 """
 
 from sceneprint_client.api.admin import Job, Progress

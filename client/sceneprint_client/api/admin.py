@@ -1,4 +1,4 @@
-"""Keys, what they may do, and who changed what, as JSON."""
+"""Records of keys, the audit log, statistics, models, jobs and events."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pydantic import AwareDatetime, Field, StringConstraints
 
 from sceneprint_client.api.base import MAP_OR_EVERY, ApiRecord, Given, JobState, Label, Page
 
-#: What a key may do with a map; each may what those before it may.
+#: Scopes of a key for a map. Each scope includes the previous ones.
 Scope = Literal["read", "write", "admin"]
 SCOPES: tuple[Scope, ...] = ("read", "write", "admin")
-#: In place of the name of a map: all of them, and what is of no map.
+#: Stands for all maps and for operations that belong to no map.
 EVERY = "*"
 
 
@@ -31,11 +31,11 @@ class NewKey(Given):
         examples=[{"warehouse-2": "write"}],
     )
     expires_at: AwareDatetime | None = Field(
-        default=None, description="Time from which it is invalid; null: never."
+        default=None, description="Expiry time; null if the key does not expire."
     )
     tenant: Label | None = Field(
         default=None,
-        description="Tenant that owns it, which must exist; null: a tenant of the key's name.",
+        description="Tenant that owns the key, which must exist; null: a tenant of the key's name.",
     )
 
 
@@ -45,18 +45,18 @@ class Key(ApiRecord):
     name: str
     grants: dict[str, Scope] = Field(description="Scope for each map; `*` for all maps.")
     created_at: datetime
-    expires_at: datetime | None = Field(description="Null if it does not expire.")
+    expires_at: datetime | None = Field(description="Expiry time; null if it does not expire.")
     tenant: str = Field(
-        description="Tenant that owns it. Limits apply to all keys of a tenant together."
+        description="Tenant that owns the key. Limits apply to all keys of a tenant together."
     )
     previous_until: datetime | None = Field(
         default=None,
-        description="Time until which the secret before the last rotation works; null if none "
-        "does.",
+        description="Expiry time of the secret before the last rotation; null if there is no such "
+        "secret.",
     )
     last_used_at: datetime | None = Field(
         default=None,
-        description="Time of the last use, accurate to about an hour; null if never used.",
+        description="Time of the last use, to the hour; null if the key was never used.",
     )
 
 
@@ -64,85 +64,86 @@ class MadeKey(Key):
     """A new key, or a key with a new secret."""
 
     secret: str = Field(
-        description="Send it as `Authorization: Bearer SECRET`. It is shown only once: the "
-        "service stores its hash alone."
+        description="Secret for the header `Authorization: Bearer SECRET`. It is shown only once, "
+        "because the service stores only its hash."
     )
 
 
 class Me(ApiRecord):
-    """The caller as the service sees it."""
+    """The key of a request."""
 
-    name: str | None = Field(description="Name of the key; null if the service requires none.")
+    name: str | None = Field(description="Name of the key; null if no key is required.")
     grants: dict[str, Scope] = Field(description="Scope for each map; `*` for all maps.")
-    expires_at: datetime | None = Field(default=None, description="Null if it does not expire.")
+    expires_at: datetime | None = Field(
+        default=None, description="Expiry time; null if it does not expire."
+    )
 
 
 class AuditLine(ApiRecord):
     """A change and its author, or a refused request."""
 
-    number: int = Field(description="Increases with each line; there may be gaps.")
+    number: int = Field(description="Number of the line. Numbers increase, possibly with gaps.")
     at: datetime
     actor: str | None = Field(
-        description="Name of the key; null if the service requires none; `command` for a "
-        "command on the data folder."
+        description="Name of the key; null if no key is required; `command` for a command on the "
+        "data folder."
     )
-    address: str | None = Field(description="Address of the caller, or of its proxy.")
+    address: str | None = Field(description="IP address of the caller, or of its proxy.")
     tenant: str = Field(description="Tenant of the key; empty without a key.")
     action: str = Field(
-        description="Kind of the change's event, such as `map.deleted`, or an action without an "
-        "event, such as `job.cancelled`; `refused` for a refused request (401 or 403), which "
-        "changed nothing."
+        description="Kind of the event, such as `map.deleted`, or an action without an event, such "
+        "as `job.cancelled`; `refused` for a refused request (401 or 403), which changed nothing."
     )
-    map: str | None = Field(description="Name of the map that was changed.")
-    target: str | None = Field(description="Id or name of the object that was changed.")
+    map: str | None = Field(description="Name of the changed map.")
+    target: str | None = Field(description="Id or name of the changed object.")
     request_id: str | None = Field(description="Id of the request, as in the log.")
-    data: dict[str, Any] = Field(description="Further data of the action.")
+    data: dict[str, Any] = Field(description="More data, depending on the action.")
 
 
-# How a service does, and what it signs with, as JSON.
+# Statistics and models.
 
 
 class Sizes(ApiRecord):
-    """Disk space, bytes."""
+    """Disk space of the parts of a store, bytes."""
 
     database: int | None = Field(
         description="Size of the database with its log; null if it is not a file. For one map: "
-        "of its signatures."
+        "size of its signatures."
     )
     blobs: int = Field(
-        description="Size of uploads and derived files; of many files it is estimated from a "
-        "sample. For one map: of its frames, without archives and meshes."
+        description="Size of uploads and derived files, estimated from a sample if there are many. "
+        "For one map: size of its frames, without archives and meshes."
     )
-    index: int = Field(description="Size of this machine's search indexes, which are a cache.")
+    index: int = Field(description="Size of the search indexes on this machine, which are a cache.")
     free: int | None = Field(description="Free space on the data folder's disk; null for one map.")
     disk: int | None = Field(
         default=None,
-        description="Size of the data folder's disk; null like `free`.",
+        description="Size of the data folder's disk; null for one map.",
     )
 
 
 class IndexRecall(ApiRecord):
-    """Recall of queries without `exact` that use an index, measured at its publication."""
+    """Recall of queries that use an index (without `exact`), measured at its publication."""
 
     share: float = Field(
-        description="Share of the `near` nearest frames that such a query finds; 1 if it "
-        "compares every frame."
+        description="Share of the `near` nearest frames that a query finds; 1 if a query compares "
+        "every frame."
     )
-    near: int = Field(description="Number of nearest frames that each lookup had to find.")
+    near: int = Field(description="Number of nearest frames that each test query had to find.")
     sample: int = Field(
-        description="Number of the map's frames that were looked up, each excluded from its own "
+        description="Number of test queries with frames of the map, each excluded from its own "
         "search; 0 if a query compares every frame."
     )
     probes: int = Field(
-        description="Minimum number of frames that a query compares in a large map: those whose "
-        "sketches (a bit for each byte of a signature) are nearest to its own. 0 if it compares "
-        "every frame."
+        description="Minimum number of frames that a query compares in a large map: those with the "
+        "nearest sketches (one bit for each byte of a signature). 0 if a query compares every "
+        "frame."
     )
-    frames: int = Field(description="Number of frames in the index when it was measured.")
+    frames: int = Field(description="Number of frames in the index at the time of the measurement.")
 
 
 class IndexState(ApiRecord):
-    """State of a map's search index; queries compare newer frames themselves."""
+    """State of a map's search index. Queries compare frames that it lacks one by one."""
 
     map: str
     version: int | None = Field(
@@ -155,19 +156,19 @@ class IndexState(ApiRecord):
     )
     recall: IndexRecall | None = Field(
         default=None,
-        description="Null without an index: a query compares every frame.",
+        description="Null without an index, because a query then compares every frame.",
     )
 
 
 class WorkerSeen(ApiRecord):
     """A worker process that is running."""
 
-    name: str = Field(description="Host and process id.")
-    job_id: str | None = Field(description="Id of its current job.")
+    name: str = Field(description="Host name and process id.")
+    job_id: str | None = Field(description="Id of the current job; null if the worker is idle.")
 
 
 class Latency(ApiRecord):
-    """Percentiles of the time to answer, seconds, accurate to a tenth."""
+    """Percentiles of the response time in seconds, accurate to a tenth."""
 
     p50: float
     p95: float
@@ -179,29 +180,27 @@ class Counted(ApiRecord):
 
     received: int = Field(description="Number of frames that were stored or queued again.")
     indexed: int
-    rejected: int = Field(description="Number of frames in which nothing can be signed.")
+    rejected: int = Field(description="Number of frames that cannot be signed.")
     redundant: int
     failed: int
     deleted: int
     queries: dict[str, int] | None = Field(
-        description="Number of queries by the status of the answer, of the whole service. Null "
-        "for a single map, like the following."
+        description="Number of queries by status of the answer, for the whole service. This and "
+        "the following fields are null for a single map."
     )
     latency: Latency | None = Field(
-        description="Latency of answered queries; null if there were none."
+        description="Latency of answered queries; null without queries."
     )
     requests: int | None = Field(description="Number of requests under /v1, answered or refused.")
-    refused: int | None = Field(description="Number of these with 4xx.")
+    refused: int | None = Field(description="Number of these requests with a 4xx response.")
     busy: int | None = Field(
-        description="Number of these with 503, which ask the caller to retry later."
+        description="Number of these requests with a 503 response, which asks for a retry."
     )
-    broken: int | None = Field(description="Number of these with any other 5xx.")
+    broken: int | None = Field(description="Number of these requests with any other 5xx response.")
 
 
 class Minute(Counted):
-    """Counts over one minute. Requests count for the minute in which they were recorded, up to
-    ten seconds later.
-    """
+    """Counts over one minute. A request may count up to ten seconds after its response."""
 
     at: datetime = Field(description="Start of the minute.")
 
@@ -210,25 +209,25 @@ class MapUse(ApiRecord):
     """A map's use of its quota and retention; see Map."""
 
     frames: int = Field(description="Number of frames that count towards the quota.")
-    bytes: int = Field(description="Size of their uploads as they were sent.")
-    quota_frames: int | None = Field(description="Null without a quota.")
-    quota_bytes: int | None = Field(description="Null without a quota.")
-    retention_days: float | None = Field(description="Null if frames are kept.")
+    bytes: int = Field(description="Size of their uploads as received.")
+    quota_frames: int | None = Field(description="Maximum number of frames; null without a quota.")
+    quota_bytes: int | None = Field(description="Maximum size of uploads; null without a quota.")
+    retention_days: float | None = Field(description="Retention; null if frames do not expire.")
 
 
 class ScrubSeen(ApiRecord):
-    """The progress of verifying stored data."""
+    """Progress of the check of all stored data."""
 
-    began_at: datetime = Field(description="Start of the current pass, or of the last one.")
+    began_at: datetime = Field(description="Start of the current or the last pass.")
     finished_at: datetime | None = Field(
-        description="End of the last complete pass; null if there was none."
+        description="End of the last complete pass; null if no pass has ended."
     )
     blobs: int = Field(description="Number of uploads and artifacts that this pass has read.")
-    bytes: int = Field(description="Size of these.")
+    bytes: int = Field(description="Size of the uploads and artifacts that this pass has read.")
     damaged: int = Field(
-        description="Number of rows, signatures, uploads and artifacts that it found lost or "
-        "damaged. Events `frame.damaged` name the frames of lost data, and `sceneprint fsck` "
-        "lists everything."
+        description="Number of lost or damaged rows, signatures, uploads and artifacts in this "
+        "pass. Events `frame.damaged` name the frames with lost data, and `sceneprint fsck` lists "
+        "everything."
     )
 
 
@@ -238,8 +237,8 @@ class Stats(ApiRecord):
     at: datetime
     counted_at: datetime | None = Field(
         default=None,
-        description="Time at which frames, ended jobs, indexes and bytes were counted. From "
-        "100,000 frames and jobs on, counting takes 1 % of the time at most.",
+        description="Time of the counts of frames, ended jobs, indexes and bytes. Above 100,000 "
+        "frames and jobs, counting takes at most 1 % of the time.",
     )
     map: str | None = Field(description="Name of the map; null for all maps.")
     maps: int
@@ -247,26 +246,26 @@ class Stats(ApiRecord):
     jobs: dict[str, int] = Field(description="Number of jobs in each state.")
     waiting: int = Field(description="Number of jobs that wait for a worker.")
     oldest_waiting_s: dict[str, float] = Field(
-        description="Age of the oldest waiting job of each kind that waits, seconds."
+        description="Age of the oldest waiting job of each kind, seconds."
     )
     indexes: list[IndexState] = Field(
-        description="Indexes of the recently changed maps, those with the longest tail first; "
-        "at most 200."
+        description="Indexes of the recently changed maps, with the longest tails first; at most "
+        "200."
     )
     workers: list[WorkerSeen] | None = Field(
-        description="Workers on every host of a PostgreSQL database, or on this machine with "
+        description="Workers on all hosts of a PostgreSQL database, or on this machine with "
         "SQLite. Null for one map."
     )
-    bytes: Sizes = Field(description="Disk space; measured at most twice a minute.")
+    bytes: Sizes = Field(description="Disk space, measured at most twice per minute.")
     use: MapUse | None = Field(
         default=None, description="Use of quota and retention; null for all maps."
     )
     scrub: ScrubSeen | None = Field(
-        default=None, description="Null if none has started, and for one map."
+        default=None, description="Null before the first pass, and for one map."
     )
     total: Counted = Field(description="Sum of all minutes.")
     minutes: list[Minute] = Field(
-        description="The last minutes, the oldest first; the last is not complete."
+        description="The last minutes, oldest first; the last one is not complete."
     )
 
 
@@ -276,7 +275,7 @@ class ModelInfo(ApiRecord):
     model_id: str
     label: str = Field(description="Name and first digits of the id, as in maps and answers.")
     name: str
-    preset: bool = Field(description="Whether it is part of this version.")
+    preset: bool = Field(description="Whether this version contains the model.")
     components: int = Field(description="G, the number of components of the mixture.")
     levels: int = Field(description="Number of levels of the hierarchy of patches.")
     signature_bytes: int = Field(
@@ -291,12 +290,12 @@ class ModelInfo(ApiRecord):
     parameters: dict[str, Any] = Field(description="Parameters of every stage.")
     provenance: dict[str, Any] = Field(description="Training data and method.")
     maps: list[str] = Field(
-        description="Maps that you may read and that use it, or are switching to it."
+        description="Maps that you may read and that use the model or are switching to it."
     )
 
 
 class NewModel(Given):
-    """The model to which a map is to switch."""
+    """The new model of a map."""
 
     model: Label = Field(
         description="`depth`, `lidar`, `paper`, or the id or label of a model in GET /v1/models.",
@@ -304,28 +303,28 @@ class NewModel(Given):
     )
 
 
-#: Ends that a frame can come to, by the kind of the event that tells it.
+#: Results of frames, by the kind of the event.
 Outcome = Literal["received", "indexed", "rejected", "redundant", "failed", "deleted"]
 OUTCOMES: tuple[Outcome, ...] = (
     "received", "indexed", "rejected", "redundant", "failed", "deleted"
 )  # fmt: skip
 
 
-# Jobs as JSON.
+# Jobs.
 
 
-#: What the import of a map does, in this order.
+#: Phases of the import of a map, in their order.
 ImportPhase = Literal["read", "choose", "render", "sign", "test"]
 
 
 class Progress(ApiRecord):
     """The progress of a long job."""
 
-    done: int = Field(description="Number of completed steps: frames, or members of an archive.")
+    done: int = Field(description="Number of completed steps: frames, or files of an archive.")
     total: int | None = Field(default=None, description="Number of all steps, if known.")
     phase: ImportPhase | None = Field(
         default=None,
-        description="Phase of a map's import; null for other jobs, like the following.",
+        description="Phase of a map import. This and the following fields are null for other jobs.",
     )
     points: int | None = Field(default=None, description="Number of points that were read.")
     views: int | None = Field(default=None, description="Number of selected viewpoints.")
@@ -333,21 +332,19 @@ class Progress(ApiRecord):
         default=None, description="Number of views that were rendered and added."
     )
     signed: int | None = Field(default=None, description="Number of views that were signed.")
-    tested: int | None = Field(
-        default=None, description="Number of test views that were looked up."
-    )
+    tested: int | None = Field(default=None, description="Number of test views that were queried.")
 
 
 class Product(ApiRecord):
-    """What a job computes from a map, or from an answer."""
+    """Result of a job on a map or an answer."""
 
-    #: What it is called, the end of the path that lists it, and the record that asks for it.
+    #: Name of the product, last part of the path that lists it, and class of its request.
     noun: ClassVar[str]
     collection: ClassVar[str]
     request_type: ClassVar[type[Given]]
 
-    job_id: str = Field(description="Id of its job as well: GET /v1/jobs/{job_id}.")
-    map: str | None = Field(description="Null if it may have frames of several maps.")
+    job_id: str = Field(description="Id of the product and of its job: GET /v1/jobs/{job_id}.")
+    map: str | None = Field(description="Null if the result may have frames of several maps.")
     state: JobState
     progress: Progress | None = Field(description="Null before the job starts.")
     error: str | None
@@ -361,12 +358,12 @@ class Job(ApiRecord):
     job_id: str
     kind: str = Field(
         description="`sign`, `import`, `import-map`, `associate`, `coverage`, `difference`, "
-        "`surface`, `reconstruct`, or `reencode`, which signs an indexed frame again, with the "
-        "map's next model or because its signature is damaged."
+        "`surface`, `reconstruct`, or `reencode`, which signs an indexed frame again, for the "
+        "map's next model or to replace a damaged signature."
     )
     state: JobState
-    map: str | None = Field(description="Map that it works on.")
-    frame_id: str | None = Field(description="Frame that it signs; null for other jobs.")
+    map: str | None = Field(description="Map of the job.")
+    frame_id: str | None = Field(description="Frame that the job signs; null for other jobs.")
     priority: int = Field(description="Jobs of higher priority run first.")
     attempts: int
     created_at: datetime
@@ -376,21 +373,21 @@ class Job(ApiRecord):
     traceback: str | None
     progress: Progress | None = Field(
         default=None,
-        description="Progress of a long job, which runs in slices; null before it starts.",
+        description="Progress of a long job, which runs in slices; null before the job starts.",
     )
     result: dict[str, Any] | None = Field(
         default=None,
-        description="Summary of a long job's result, when it has succeeded.",
+        description="Summary of the result of a long job that has succeeded.",
     )
     followed_by: str | None = Field(
         default=None,
-        description="Latest job that does the same for the same frame, such as a retry; null "
-        "for the latest itself.",
+        description="Latest job with the same task for the same frame, such as a retry; null if "
+        "this is the latest job.",
     )
 
 
 class RefusedRetry(ApiRecord):
-    """A dead job that cannot be tried again."""
+    """A dead job that cannot be retried."""
 
     job_id: str
     reason: str
@@ -406,72 +403,71 @@ class RetriedJobs(ApiRecord):
     )
 
 
-# Events as JSON: what happened, in the order in which it happened.
+# Events.
 
-#: Every kind of event with what it means. A test holds the code to it.
+#: Every kind of event and its meaning. A test compares it with the code and the documentation.
 KINDS = {
-    "map.created": "A map was made.",
-    "map.edited": "Its title or what else may change of it was changed.",
-    "map.deleted": "A map was removed with all that was in it.",
+    "map.created": "A map was created.",
+    "map.edited": "The title or another property of a map was changed.",
+    "map.deleted": "A map was deleted with everything in it.",
     "map.reencoding": "A map is being signed with another model, `data.model`.",
-    "map.reencoding_cancelled": "It was told to keep its model.",
-    "map.reencoded": "It has switched from `data.before` to `data.model`.",
-    "frame.received": "A frame is stored durably and waits for a worker, or is tried again.",
-    "frame.indexed": "Queries find it from now on.",
-    "frame.rejected": "Nothing in it can be signed.",
-    "frame.redundant": "It was not kept, as asked: the map already covers its place.",
-    "frame.failed": "Signing it broke down in every try, or was given up.",
-    "frame.edited": "Its metadata was changed.",
-    "frame.damaged": "What was made of it is damaged, and a worker signs it again from its upload; "
-    "or `data.upload`: that is lost or damaged, and sending it again heals.",
-    "frame.reencoded": "It was signed once more, for the model to come or what was damaged.",
+    "map.reencoding_cancelled": "The change of a map's model was cancelled.",
+    "map.reencoded": "A map has switched from `data.before` to `data.model`.",
+    "frame.received": "A frame is stored durably and waits for a worker, or is being retried.",
+    "frame.indexed": "A frame was signed, and queries find it.",
+    "frame.rejected": "A frame cannot be signed, because it contains too little.",
+    "frame.redundant": "A frame with `if_novel` was not kept: the map already covers its place.",
+    "frame.failed": "Signing a frame failed in every attempt, or was cancelled.",
+    "frame.edited": "The metadata of a frame was changed.",
+    "frame.damaged": "Data derived from a frame is damaged, and a worker derives it again from the "
+    "upload. With `data.upload`, the upload is lost or damaged; sending it again repairs it.",
+    "frame.reencoded": "A frame was signed again, for a new model or to repair a signature.",
     "frame.deleted": (
-        "It was removed; no query finds it. `data.reason` is `retention` where its map keeps none "
-        "so old."
+        "A frame was deleted, and no query finds it. `data.reason` is `retention` if it exceeded "
+        "the retention time of its map."
     ),
-    "frame.restored": "Its deletion was undone; queries find it again at once if it was indexed.",
+    "frame.restored": "The deletion of a frame was undone; queries find it if it was indexed.",
     "query.answered": (
-        "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` where "
-        "it was found, and more about it."
+        "A query was answered, or failed; `data` has `query_id`, `status`, `robot`, `pose` if it "
+        "was found, and more."
     ),
-    "import.done": "An archive or a map was imported, as far as it could be; `data` is its result.",
-    "association.found": "A job that looked for associations is over; `data` is its result.",
-    "association.undone": "The join of an association was undone: frames have other poses.",
-    "surface.updated": "A job that fused the surface of a map is over; `data` has `frames` and "
-    "`tiles`.",
-    "coverage.measured": "A job that measured a map's coverage is over; `data` is its result.",
-    "difference.found": "A job that compared two sessions is over; `data` is its result.",
-    "key.created": "A key was made; belongs to no map.",
-    "key.rotated": "A key has a new secret; the one before ends soon. Belongs to no map.",
-    "key.revoked": "A key was revoked and no longer works; belongs to no map.",
+    "import.done": "The import of an archive or a map has ended; `data` is its result.",
+    "association.found": "A search for associations has ended; `data` is its result.",
+    "association.undone": "The join of an association was undone, which changed poses of frames.",
+    "surface.updated": "An update of a map's surface has ended; `data` has `frames` and `tiles`.",
+    "coverage.measured": "A measurement of a map's coverage has ended; `data` is its result.",
+    "difference.found": "A comparison of two sessions has ended; `data` is its result.",
+    "key.created": "A key was created. The event belongs to no map.",
+    "key.rotated": "A key has a new secret, and the old one expires soon. It belongs to no map.",
+    "key.revoked": "A key was revoked and no longer works. The event belongs to no map.",
 }
-#: Stands in a stream where events are not there any more; kept by nobody.
+#: Kind of the event that replaces expired events in a stream. It is not stored.
 MISSED = "events.missed"
 
 
 class Event(ApiRecord):
-    """An event."""
+    """An event of the service."""
 
     id: str = Field(
-        description="Opaque id: send it as `Last-Event-ID` to a stream, or as `after` to a "
-        "request. Ids have no order; events are returned in theirs."
+        description="Opaque id. Send it as `Last-Event-ID` to a stream, or as `after` to a "
+        "request. The ids themselves have no order, but lists of events do."
     )
     at: datetime
     kind: str = Field(
-        description="Kind, such as frame.indexed; docs/operations.md lists all. Clients must "
-        "accept unknown kinds. `events.missed` replaces requested events that are no longer "
-        "kept: read the maps themselves, then continue."
+        description="Kind, such as frame.indexed; docs/operations.md lists all kinds. Clients must "
+        "accept unknown kinds. `events.missed` replaces requested events that have expired: "
+        "refresh the state of your maps, then continue."
     )
     map: str | None = Field(description="Name of the map.")
     frame_id: str | None
     job_id: str | None
-    data: dict[str, Any] = Field(description="Further data of the kind.")
+    data: dict[str, Any] = Field(description="More data, depending on the kind.")
 
 
 class EventPage(Page[Event]):
-    """A page of the kept events."""
+    """A page of stored events."""
 
     newest: str = Field(
-        description="Id of the newest event of your maps, of any kind, at the time of the "
-        "request; 0 if there is none. A stream with this id as `after` continues from here."
+        description="Id of the newest event of your maps, of any kind, at the time of the request; "
+        "0 if there is none. A stream with this id as `after` continues from here."
     )

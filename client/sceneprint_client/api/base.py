@@ -1,5 +1,4 @@
-"""What records of the API share: names, cameras, poses, and what is said of a frame beside its
-samples."""
+"""Records that the whole API shares: names, cameras, poses, states and metadata of frames."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ else:
     from enum import Enum
 
     class StrEnum(str, Enum):
-        """As the one of Python 3.11."""
+        """The class of the same name in Python 3.11."""
 
         __str__ = str.__str__
 
@@ -41,13 +40,13 @@ else:
 T = TypeVar("T")
 Record = TypeVar("Record", bound=BaseModel)
 
-#: Rules of names by their patterns, which errors put in the place of the pattern.
+#: Rules for names by their patterns. Messages show the rule in place of the pattern.
 NAME_RULES = {
     (ONE_LINE := r"^[^\x00-\x1f\x7f]+$"): "characters of one line, without control characters",
     (_FILE_NAME := r"^[^\x00-\x1f\x7f\\]+$"): "characters of one line, without backslashes",
     (_TEXT := r"^[^\x00]*$"): "text without the character NUL",
     (FOLDER_NAME := r"^[^/\\\x00-\x1f\x7f.][^/\\\x00-\x1f\x7f]*$"): (
-        "characters of one line, without slashes and without a dot in front"
+        "characters of one line, without slashes and without a leading dot"
     ),
     (MAP_NAME := r"^[a-z0-9][a-z0-9_-]{0,62}$"): (
         "1 to 63 lower-case letters, digits, hyphens and underscores, the first a letter or digit"
@@ -63,47 +62,47 @@ def fault_reason(fault: Mapping[str, Any]) -> str:
     return f"must be {rule}" if rule else str(fault["msg"]).removeprefix("Value error, ")
 
 
-#: Names that people give: printable, one line.
+#: Printable names of one line.
 Label = Annotated[str, StringConstraints(min_length=1, max_length=128, pattern=ONE_LINE)]
 
 
-#: Characters of the name of a frame.
+#: Maximum length of the name of a frame.
 MOST_OF_NAME = 255
 
 
-def _without_a_way_out(name: str) -> str:
+def _require_relative(name: str) -> str:
     if "\\" in name or any(part in ("", ".", "..") for part in name.split("/")):
-        raise ValueError("relative, with `/` between its parts, and without `.`, `..` and `\\`")
+        raise ValueError("must be relative, with `/` as separator, without `.`, `..` and `\\`")
     return name
 
 
-#: What an original file or message was called: a label, never a path that anybody opens.
+#: Name of an original file or message. It is a label and never opened as a path.
 FileName = Annotated[
     str,
     StringConstraints(min_length=1, max_length=MOST_OF_NAME, pattern=_FILE_NAME),
-    AfterValidator(_without_a_way_out),
+    AfterValidator(_require_relative),
 ]
 
 
-#: What people write about something: no database has a text with NUL.
+#: Free text without NUL, which databases cannot store.
 Note = Annotated[str, StringConstraints(max_length=200, pattern=_TEXT)]
 
 
 class Given(BaseModel):
-    """A record that a caller sends: unknown fields are errors, as they would have no effect."""
+    """A record of a request. Unknown fields are errors, because they would have no effect."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class ApiRecord(BaseModel):
-    """A record that the service answers with; a client may meet fields it does not know yet."""
+    """A record of a response. Clients must accept unknown fields."""
 
-    # the many records that answers are made of, built when one is first made: a start is quicker
+    # Validators are built on first use, which makes the start faster.
     model_config = ConfigDict(frozen=True, defer_build=True)
 
 
 class Page(ApiRecord, Generic[T]):
-    """A part of a list."""
+    """A page of a list."""
 
     items: list[T]
     next_cursor: str | None = Field(
@@ -117,17 +116,17 @@ class Problem(ApiRecord):
     model_config = ConfigDict(frozen=True, extra="allow")
 
     type: str = Field(description="URI of the kind of problem.")
-    title: str = Field(description="The kind of problem in words.")
+    title: str = Field(description="Kind of problem in words.")
     status: int
     detail: str = Field(description="What happened, why, and what to do.")
     instance: str = Field(default="", description="Id of the request, as in the service's log.")
 
 
-# Rigid transforms as JSON.
+# Rigid transforms.
 
 
 class Vector(ApiRecord):
-    """Metres."""
+    """A vector in metres."""
 
     x: float
     y: float
@@ -143,7 +142,7 @@ class Direction(ApiRecord):
 
 
 class Quaternion(ApiRecord):
-    """Unit quaternion, w >= 0."""
+    """A unit quaternion with w >= 0."""
 
     x: float
     y: float
@@ -152,20 +151,20 @@ class Quaternion(ApiRecord):
 
 
 class Transform(ApiRecord):
-    """x_parent = matrix @ x_child, in metres. Camera frames (`ID.optical`): x right, y down, z
-    ahead; a cloud (`ID.sensor`) keeps the axes of its sensor.
+    """A rigid transform: x_parent = matrix @ x_child, in metres. Camera frames (`ID.optical`) have
+    x right, y down, z forward; a cloud (`ID.sensor`) has the axes of its sensor.
     """
 
     parent_frame: str
     child_frame: str
     translation: Vector
     rotation: Quaternion
-    matrix: list[list[float]] = Field(description="4 x 4, row by row.")
+    matrix: list[list[float]] = Field(description="4 x 4 matrix, row by row.")
 
 
-# Which way is up, as a caller gives it.
+# Directions in requests.
 
-#: How far from 1 the length of a given direction may be.
+#: Tolerance of the length of a unit vector.
 _UNIT = 1e-2
 
 
@@ -177,30 +176,30 @@ class GivenDirection(Given):
     z: float
 
     @model_validator(mode="after")
-    def _of_unit_length(self) -> GivenDirection:
+    def _require_unit_length(self) -> GivenDirection:
         length = math.hypot(self.x, self.y, self.z)
         if not abs(length - 1.0) <= _UNIT:
             raise ValueError(
-                f"its length is {length:.3g}, not 1; divide it by its length, as an "
-                "accelerometer at rest measures 9.81 upwards"
+                f"the length is {length:.3g}, not 1; divide the vector by its length (an "
+                "accelerometer at rest measures 9.81 m/s2 upwards)"
             )
         return self
 
     @property
     def unit(self) -> list[float]:
-        """Its three numbers, of length 1 as exactly as can be."""
+        """The components, normalised exactly."""
         length = math.hypot(self.x, self.y, self.z)
         return [self.x / length, self.y / length, self.z / length]
 
 
-def _from_list(given: object) -> object:
-    if isinstance(given, list | tuple) and len(given) == len("xyz"):
-        return dict(zip("xyz", given, strict=True))
-    if not isinstance(given, GivenDirection | dict):
-        raise ValueError(  # noqa: TRY004  (pydantic wants it)
+def _from_list(value: object) -> object:
+    if isinstance(value, list | tuple) and len(value) == len("xyz"):
+        return dict(zip("xyz", value, strict=True))
+    if not isinstance(value, GivenDirection | dict):
+        raise ValueError(  # noqa: TRY004  (pydantic requires it)
             "neither {x, y, z} nor a list of three numbers"
         )
-    return given
+    return value
 
 
 #: A direction as `{x, y, z}`, or as a list of three numbers.
@@ -218,7 +217,7 @@ Up = Annotated[
 
 
 class FrameState(StrEnum):
-    """State of an uploaded frame; `sentence` describes it for people."""
+    """State of an uploaded frame."""
 
     RECEIVED = "received"
     SIGNING = "signing"
@@ -230,12 +229,12 @@ class FrameState(StrEnum):
 
     @property
     def sentence(self) -> str:
-        """The state in a sentence."""
-        return _OF_FRAMES[self]
+        """Description of the state."""
+        return _FRAME_STATES[self]
 
 
 class JobState(StrEnum):
-    """State of a job; `sentence` describes it for people."""
+    """State of a job."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -246,51 +245,52 @@ class JobState(StrEnum):
 
     @property
     def sentence(self) -> str:
-        """The state in a sentence."""
-        return _OF_JOBS[self]
+        """Description of the state."""
+        return _JOB_STATES[self]
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will happen to the job."""
+        """Whether the job has ended."""
         return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
-_OF_FRAMES = {
-    FrameState.RECEIVED: "Stored durably, and waiting for a worker.",
-    FrameState.SIGNING: "A worker is signing it.",
-    FrameState.INDEXED: "Signed, and found by queries from now on.",
-    FrameState.REJECTED: "Nothing in it can be signed; `reason` says why. Trying again is no use.",
-    FrameState.FAILED: "Signing broke down again and again; the job has the traceback.",
+_FRAME_STATES = {
+    FrameState.RECEIVED: "The frame is stored durably and waits for a worker.",
+    FrameState.SIGNING: "A worker is signing the frame.",
+    FrameState.INDEXED: "The frame is signed, and queries find it.",
+    FrameState.REJECTED: "The frame cannot be signed; `reason` says why. A retry does not help.",
+    FrameState.FAILED: "Signing the frame failed in every attempt; the job has the traceback.",
     FrameState.REDUNDANT: (
-        "Not kept, as asked: the map already covers this place; `reason` names the frame."
+        "The frame was not kept, because of `if_novel`: the map already covers this place; "
+        "`reason` names the frame."
     ),
     FrameState.DELETED: (
-        "Removed on request, or as older than its map keeps frames; found by no query."
+        "The frame was deleted on request or by the retention time of its map; no query finds it."
     ),
 }
 
-_OF_JOBS = {
-    JobState.QUEUED: "Waiting for a worker, for the first time or for another try.",
-    JobState.RUNNING: "A worker holds its lease.",
-    JobState.SUCCEEDED: "Done, and what it made is stored.",
-    JobState.FAILED: "Its input cannot be used; `error` says why.",
-    JobState.CANCELLED: "Given up on request, such as by deleting its frame.",
-    JobState.DEAD: "Given up after too many tries; `traceback` has the last one.",
+_JOB_STATES = {
+    JobState.QUEUED: "The job waits for a worker, for the first attempt or a retry.",
+    JobState.RUNNING: "A worker runs the job.",
+    JobState.SUCCEEDED: "The job is done, and its result is stored.",
+    JobState.FAILED: "The input of the job cannot be used; `error` says why.",
+    JobState.CANCELLED: "The job was cancelled, for example because its frame was deleted.",
+    JobState.DEAD: "The job failed in every attempt; `traceback` shows the last failure.",
 }
 
 
 def checked(kind: type[Record], what: str, **fields: Any) -> Record:
-    """Return a record of the API; the error lists its invalid fields.
+    """Return a record of the API.
 
     Raises
     ------
-    InvalidRequest : a field is missing, unknown or out of its range.
+    InvalidRequest : If a field is missing, unknown or out of range. It lists the invalid fields.
     """
     return record_of(kind, fields, what)
 
 
 def record_of(kind: type[Record], fields: object, what: str) -> Record:
-    """Return the record of an untrusted mapping, which may have any keys; raises as `checked`."""
+    """Return the record of an untrusted mapping; errors are those of `checked`."""
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
@@ -298,39 +298,39 @@ def record_of(kind: type[Record], fields: object, what: str) -> Record:
 
 
 def invalid_record(error: ValidationError, what: str) -> InvalidRequest:
-    """Return the error of a record that pydantic refused."""
-    found = error.errors(include_url=False, include_input=False)
-    return invalid_request(found, what)
+    """Return the error for a record that pydantic refused."""
+    faults = error.errors(include_url=False, include_input=False)
+    return invalid_request(faults, what)
 
 
-#: Fields that are listed at most, and characters of the name of one: a caller may invent more.
+#: Maximum number of listed fields, and maximum length of their names: clients may invent any.
 MOST_FIELDS, MOST_OF_FIELD = 20, 80
 
 
-def invalid_request(found: Sequence[Mapping[str, Any]], what: str) -> InvalidRequest:
-    """Return an error that names the first of the fields at fault."""
+def invalid_request(faults: Sequence[Mapping[str, Any]], what: str) -> InvalidRequest:
+    """Return an error that lists the first invalid fields of pydantic's faults."""
     fields = tuple(
         (
             ".".join(str(part) for part in one["loc"] if part != "query")[:MOST_OF_FIELD],
             fault_reason(one),
         )
-        for one in found[:MOST_FIELDS]
+        for one in faults[:MOST_FIELDS]
     )
     first = "; ".join(f"{place or 'it'}: {reason}" for place, reason in fields[:3])
-    more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
-    if len(found) > MOST_FIELDS:
-        more = f" (and {len(found) - 3} more; {MOST_FIELDS} of {len(found)} are listed)"
+    more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
+    if len(faults) > MOST_FIELDS:
+        more = f" (and {len(faults) - 3} more; {MOST_FIELDS} of {len(faults)} are listed)"
     return InvalidRequest(f"{what} is not valid: {first}{more}. See /docs for its fields.", fields)
 
 
-#: Most samples a depth image may have (an 8-megapixel sensor); more is refused unread.
+#: Maximum number of samples of a depth image (an 8-megapixel sensor). Larger files are not read.
 MAXIMUM_SAMPLES = 8_388_608
 
 
 # The camera.
 
 
-#: Longest focal length and farthest principal point that are believed, pixels.
+#: Maximum focal length and maximum distance of the principal point, pixels.
 MAXIMUM_PIXELS = 1e7
 
 
@@ -348,8 +348,8 @@ class Intrinsics:
 
     Raises
     ------
-    InvalidIntrinsics : a size below 1, a focal length that is not positive and finite, a
-        principal point that is not finite, or a number of coefficients other than 0, 4, 5.
+    InvalidIntrinsics : If a size is below 1, a focal length is not positive and finite, the
+        principal point is not finite, or the number of coefficients is not 0, 4 or 5.
     """
 
     width: int
@@ -364,7 +364,7 @@ class Intrinsics:
         if self.width < 1 or self.height < 1:
             raise InvalidIntrinsics(
                 f"The image size {self.width} x {self.height} is empty. "
-                "Give the width and height of the depth image in pixels."
+                "Specify the width and height of the depth image in pixels."
             )
         if self.width * self.height > MAXIMUM_SAMPLES:
             raise InvalidIntrinsics(
@@ -375,52 +375,52 @@ class Intrinsics:
             if not (math.isfinite(value) and value > 0):
                 raise InvalidIntrinsics(
                     f"The focal length {name} = {value} is not a positive number, so pixels "
-                    "have no direction. Give it in pixels, as the sensor's calibration states."
+                    "have no direction. Specify it in pixels, as in the sensor's calibration."
                 )
             if not 1e-3 <= value <= MAXIMUM_PIXELS:
                 raise InvalidIntrinsics(
-                    f"The focal length {name} = {value:g} is that of no camera. "
-                    "Give it in pixels, as the sensor's calibration states."
+                    f"The focal length {name} = {value:g} is impossible for a camera. "
+                    "Specify it in pixels, as in the sensor's calibration."
                 )
         if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
             raise InvalidIntrinsics(
                 f"The principal point ({self.cx}, {self.cy}) is not finite. "
-                "Give cx and cy in pixels, as the sensor's calibration states."
+                "Specify cx and cy in pixels, as in the sensor's calibration."
             )
         if max(abs(self.cx), abs(self.cy)) > MAXIMUM_PIXELS:
             raise InvalidIntrinsics(
-                f"The principal point ({self.cx:g}, {self.cy:g}) is that of no camera. "
-                "Give cx and cy in pixels, as the sensor's calibration states."
+                f"The principal point ({self.cx:g}, {self.cy:g}) is impossible for a camera. "
+                "Specify cx and cy in pixels, as in the sensor's calibration."
             )
         if len(self.distortion) not in (0, 4, 5):
             raise InvalidIntrinsics(
-                f"{len(self.distortion)} distortion coefficients were given. "
-                "Give k1, k2, p1, p2 and optionally k3, or none."
+                f"There are {len(self.distortion)} distortion coefficients. "
+                "Specify k1, k2, p1, p2 and optionally k3, or none."
             )
         if not all(math.isfinite(k) for k in self.distortion):
             raise InvalidIntrinsics(
                 f"The distortion coefficients {self.distortion} are not all finite. "
-                "Give k1, k2, p1, p2 and optionally k3 as the calibration states."
+                "Specify k1, k2, p1, p2 and optionally k3, as in the sensor's calibration."
             )
 
     def without_distortion(self) -> Intrinsics:
-        """Return the same camera after its images have been undistorted."""
+        """Return the camera of the undistorted image."""
         return replace(self, distortion=())
 
 
-#: Tags of a frame.
+#: Maximum number of tags of a frame.
 MOST_TAGS = 32
 
-#: A frame's place in its session is at most this, which every reader of JSON reads exactly.
+#: Maximum index of a frame in its session. Every JSON parser reads it exactly.
 MOST_SEQUENCE = 2**53 - 1
-#: Place of a frame within its session.
+#: Index of a frame in its session.
 Place = Annotated[int, Field(ge=0, le=MOST_SEQUENCE)]
 
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
 class CameraIntrinsics(Given):
-    """The camera: pixel = (fx x/z + cx, fy y/z + cy), pixel centres at integers."""
+    """A pinhole camera: pixel = (fx x/z + cx, fy y/z + cy), with pixel centres at integers."""
 
     width: int = Field(ge=1, le=65535)
     height: int = Field(ge=1, le=65535)
@@ -436,7 +436,7 @@ class CameraIntrinsics(Given):
 
 
 class GivenVector(Given):
-    """Metres."""
+    """A vector in metres."""
 
     x: float
     y: float
@@ -444,12 +444,12 @@ class GivenVector(Given):
 
 
 class GivenQuaternion(GivenVector):
-    """Unit quaternion."""
+    """A unit quaternion."""
 
     w: float
 
 
-#: What ROS calls the parts of a pose, and what we do.
+#: Names of the parts of a pose in ROS and in this API.
 ROS_NAMES = {"position": "translation", "orientation": "rotation"}
 
 
@@ -457,26 +457,26 @@ class GivenTransform(Given):
     """A rigid transform, as `translation` and `rotation` or as `matrix`."""
 
     translation: GivenVector | None = Field(
-        default=None, description="ROS's name `position` is accepted as well."
+        default=None, description="Translation; the name `position` of ROS is also accepted."
     )
     rotation: GivenQuaternion | None = Field(
-        default=None, description="ROS's name `orientation` is accepted as well."
+        default=None, description="Rotation; the name `orientation` of ROS is also accepted."
     )
     matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _as_ros_calls_it(cls, given: object) -> object:
-        if not isinstance(given, dict):
-            return given
-        ours = {name: own for name, own in ROS_NAMES.items() if name in given and own not in given}
-        return {ours.get(name, name): value for name, value in given.items()}
+    def _rename_from_ros(cls, value: object) -> object:
+        if not isinstance(value, dict):
+            return value
+        ours = {name: own for name, own in ROS_NAMES.items() if name in value and own not in value}
+        return {ours.get(name, name): part for name, part in value.items()}
 
     @model_validator(mode="after")
-    def _one_way(self) -> GivenTransform:
+    def _require_one_form(self) -> GivenTransform:
         parts = (self.translation is not None, self.rotation is not None)
         if parts not in ((True, True), (False, False)) or parts[0] == (self.matrix is not None):
-            raise ValueError("give translation and rotation, or matrix")
+            raise ValueError("specify either translation and rotation, or matrix")
         return self
 
 
@@ -485,17 +485,17 @@ class GivenPose(GivenTransform):
 
     parent_frame: Label | None = Field(
         default=None,
-        description="Poses are only combined within one parent frame; default: ROBOT/SESSION.",
+        description="Parent frame. Poses are only combined within one; default: ROBOT/SESSION.",
     )
     of: Literal["sensor", "base"] = Field(
         default="sensor",
-        description="`base`, for an upload with `T_base_sensor`: the pose is T_parent_base, and "
-        "is stored as that of the sensor.",
+        description="Frame whose pose this is. `base` requires `T_base_sensor`; the pose is then "
+        "T_parent_base, and is stored as that of the sensor.",
     )
 
 
 class GivenBase(GivenTransform):
-    """T_base_sensor: the pose of the sensor on the robot; x_base = T_base_sensor @ x_sensor."""
+    """T_base_sensor, the pose of the sensor on the robot: x_base = T_base_sensor @ x_sensor."""
 
     base_frame: Label = Field(default="base_link", description="Name of the robot's base frame.")
 
@@ -505,33 +505,33 @@ class FrameMeta(Given):
 
     intrinsics: CameraIntrinsics | None = Field(
         default=None,
-        description="Camera of a depth image, which requires it; a point cloud has none.",
+        description="Camera of a depth image; point clouds do not have one.",
     )
     depth_scale: float = Field(
         default=1000.0,
         gt=0,
-        description="Stored units per metre; ignored for floating NPY files, which are in metres.",
+        description="Stored units per metre; ignored for floating-point NPY files in metres.",
     )
     depth_along_ray: bool = Field(
         default=False, description="Whether samples are ranges along the pixel's ray."
     )
     trust_depth: bool = Field(
         default=False,
-        description="Whether to accept a depth image that does not look like one, such as with "
+        description="Whether to accept a depth image that fails the sanity check, such as one with "
         "more noise than any known sensor has.",
     )
     viewpoint: GivenVector | Literal["file"] | None = Field(
         default="file",
-        description="Viewpoint of a point cloud in its own axes, metres; null without one, as "
-        "for clouds fused from many views. `file`: the viewpoint in the file (a PCD's "
-        "VIEWPOINT), else the origin of its coordinates.",
+        description="Viewpoint of a point cloud in its own axes, metres; null without a viewpoint, "
+        "as for clouds fused from many views. `file`: the viewpoint in the file (VIEWPOINT of a "
+        "PCD), otherwise the origin of its coordinates.",
     )
     units_per_metre: float = Field(
-        default=1.0, gt=0, description="Units of a point cloud: 1000 for millimetres."
+        default=1.0, gt=0, description="Units per metre of a point cloud: 1000 for millimetres."
     )
     format: CloudFormat | None = Field(
         default=None,
-        description="Format of a point cloud. KITTI's files cannot be recognised: set `kitti`.",
+        description="Format of a point cloud; default: recognised. KITTI files require `kitti`.",
     )
     robot: Label | None = Field(default=None, description="Robot that took the frame.")
     session: Label | None = Field(default=None, description="Name of the run.")
@@ -541,26 +541,26 @@ class FrameMeta(Given):
     )
     name: FileName | None = Field(
         default=None,
-        description="Name of the original file or message, such as `frame-000123.depth.png`, by "
-        "which you find the frame again. It is a label, and never used as a path.",
+        description="Name of the original file or message, such as `frame-000123.depth.png`. It is "
+        "a searchable label, and never used as a path.",
     )
     sequence: Place | None = Field(
         default=None,
-        description="Position in the session, such as the number of the file or message. It "
-        "orders frames without `captured_at`, whatever the order of upload.",
+        description="Index in the session, such as the number of the file or message. It orders "
+        "frames without `captured_at`, independently of the order of upload.",
     )
     pose: GivenPose | None = None
     T_base_sensor: GivenBase | None = Field(
         default=None,
-        description="Pose of the sensor on the robot; answers then state the pose of its base "
-        "as well. A cloud with a `viewpoint` other than its origin gets the base frame `cloud` "
-        "by default: the coordinates as they were sent.",
+        description="Pose of the sensor on the robot; answers then also contain the pose of the "
+        "robot's base. For a cloud with a `viewpoint` other than its origin, the default is the "
+        "base frame `cloud`, the coordinates of the upload.",
     )
     up: Up | None = Field(
         default=None,
-        description="Up direction as an IMU measures it: a unit vector in the sensor's axes, of "
-        "a camera x right, y down, z forward. A level camera has (0, -1, 0). It excludes "
-        "transforms that tilt a query against a frame.",
+        description="Up direction as an IMU measures it: a unit vector in the sensor's axes (for a "
+        "camera x right, y down, z forward; a level camera has (0, -1, 0)). It excludes transforms "
+        "that tilt a query against a frame.",
     )
     tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
 
@@ -568,58 +568,58 @@ class FrameMeta(Given):
     @classmethod
     def _in_utc(cls, captured_at: datetime | None) -> datetime | None:
         if captured_at is not None:
-            try:  # as it will be told
+            try:  # responses convert it like this
                 datetime.fromtimestamp(captured_at.timestamp(), timezone.utc)
             except (ValueError, OverflowError) as error:
-                raise ValueError("not within the years 1 to 9999 of UTC") from error
+                raise ValueError("must be within the years 1 to 9999 of UTC") from error
         return captured_at
 
     @model_validator(mode="after")
-    def _named_parent(self) -> FrameMeta:
+    def _require_parent(self) -> FrameMeta:
         if self.pose is not None and self.pose.parent_frame is None and self.session is None:
-            raise ValueError("pose: name its parent_frame, or the session it belongs to")
+            raise ValueError("pose: specify its parent_frame, or the session of the frame")
         if self.pose is not None and self.pose.of == "base" and self.T_base_sensor is None:
-            raise ValueError("pose: of the base; give T_base_sensor, where the sensor sits on it")
+            raise ValueError("pose: a pose of the base requires T_base_sensor")
         return self
 
 
-# What `if_novel` of an upload means, however it is given.
+# The option `if_novel` of an upload.
 
-#: Where `if_novel` is just true: consecutive frames of a slow Kinect lie nearer than this, mostly
-#: by the noise of their depth, and what is left of a recording answers as well (docs/).
+#: Value of `if_novel` for true. Consecutive frames of a slow Kinect differ by less, mostly by the
+#: noise of their depth, and the remaining frames of a recording answer queries as well.
 NOVEL = 0.25
 
 
-def novelty_of(given: bool | float | str | None) -> float | None:
-    """Return the minimum distance of a new place, as a share of that of unrelated frames.
+def novelty_of(value: bool | float | str | None) -> float | None:
+    """Return the minimum distance of a new place, as a share of the distance of unrelated frames.
 
     Parameters
     ----------
-    given : the share, as number or text; true for the default; false or None for every frame
+    value : share as number or text; true for the default; false or None keeps every frame
 
     Raises
     ------
-    InvalidRequest : none of these.
+    InvalidRequest : If the value is none of these.
     """
-    if given is None or given is False or given == "false":
+    if value is None or value is False or value == "false":
         return None
-    if given is True or given == "true":
+    if value is True or value == "true":
         return NOVEL
     try:
-        share = float(given)
+        share = float(value)
     except (TypeError, ValueError):
         share = -1.0
-    if not 0 < share <= 1:  # nor for NaN
+    if not 0 < share <= 1:  # true for NaN
         raise InvalidRequest(
-            f"`if_novel` is {given!r:.40}. Give true, or a share of the distance of unrelated "
-            "frames: above 0, up to 1.",
-            (("if_novel", "neither true nor false nor a number above 0, up to 1"),),
+            f"`if_novel` is {value!r:.40}. Specify true, or a share of the distance of unrelated "
+            "frames above 0 and up to 1.",
+            (("if_novel", "must be true, false, or a number above 0 and up to 1"),),
         )
     return share
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a name or address, without port or brackets, is only ever this machine."""
+    """Return whether a host name or address, without port and brackets, is the loopback."""
     if host.lower() == "localhost":
         return True
     try:

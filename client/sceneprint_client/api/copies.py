@@ -1,4 +1,4 @@
-"""One map for a robot's own store: its head, and parts of rows that are named by digest."""
+"""Records for copying a map to a robot: a header, and parts of rows named by their digest."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import Field
 
 from sceneprint_client.api.base import DIGEST, ApiRecord
 
-#: Most parts that a robot says it has: of a map of three million frames.
+#: Maximum number of parts in a request, enough for a map of three million frames.
 MOST_PARTS = 3_500
 
 Digest = Annotated[str, Field(pattern=DIGEST)]
@@ -21,22 +21,22 @@ class CopyRequest(ApiRecord):
 
 
 class CopyPart(ApiRecord):
-    """A part of a map: rows of some frames, one after the other in the order they came."""
+    """A part of a map: the rows of consecutive frames in the order of their upload."""
 
-    digest: Digest = Field(description="SHA-256 of its bytes.")
+    digest: Digest = Field(description="SHA-256 of the bytes of the part.")
     bytes: int
     rows: int
-    sent: bool = Field(description="Its bytes follow the head.")
+    sent: bool = Field(description="Whether the bytes of the part follow the header.")
 
 
 class MapCopy(ApiRecord):
-    """The head of a copy: the map at one moment, and all parts of its rows."""
+    """The header of a copy: the state of the map at one moment, and all parts of its rows."""
 
     name: str
     title: str | None
     up: Annotated[list[float], Field(min_length=3, max_length=3)] | None
-    created_at: float = Field(description="Seconds since 1970.")
+    created_at: float = Field(description="Creation time, seconds since 1970.")
     revision: int
     model_id: str
-    model: str = Field(description="The model's name.")
+    model: str = Field(description="Name of the model.")
     parts: list[CopyPart]

@@ -1,4 +1,4 @@
-"""Localisation coverage of a map as JSON: where a robot would be found, and where it would not."""
+"""Records of the localisation coverage of a map."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from sceneprint_client.api.admin import Product
 from sceneprint_client.api.base import ApiRecord, Given, Label, Vector
 from sceneprint_client.api.query import Cause
 
-#: Most frames that one coverage job queries.
+#: Maximum number of frames that one coverage job queries.
 MOST_QUERIED = 5000
-#: What became of a frame that was queried.
+#: Outcome of the query of a frame.
 CoverageOutcome = Literal["found", "wrong", "ambiguous", "not_found", "unchecked"]
 COVERAGE_OUTCOMES: tuple[CoverageOutcome, ...] = get_args(CoverageOutcome)
-#: Whence the up axis of a plan comes.
+#: Source of the up axis of a plan.
 UpSource = Literal["map", "frames", "cameras"]
-#: How a cell compares with an earlier result.
+#: Change of a cell since an earlier result.
 CellTrend = Literal["better", "worse", "same", "new", "gone"]
 CELL_TRENDS: tuple[CellTrend, ...] = ("better", "worse", "same", "new", "gone")
 
@@ -26,7 +26,7 @@ class NewMapCoverage(Given):
     """Frames of a map to query against the others, and tolerances for a right answer."""
 
     session: Label | None = Field(
-        default=None, description="Query only frames of this session; default: all."
+        default=None, description="Query only frames of this session; default: all sessions."
     )
     robot: Label | None = Field(default=None, description="Query only frames of this robot.")
     every: int = Field(
@@ -45,8 +45,8 @@ class NewMapCoverage(Given):
         default=10.0,
         ge=0.0,
         le=1e9,
-        description="Exclude frames of the queried frame's own session within this many seconds "
-        "of it; 0 excludes only the frame itself, as for frames without a session or time.",
+        description="Exclude frames of the queried frame's own session within this number of "
+        "seconds; 0 excludes only the frame itself, as do frames without a session or time.",
     )
     other_sessions: bool = Field(
         default=False,
@@ -57,30 +57,30 @@ class NewMapCoverage(Given):
         default=0.5,
         gt=0.0,
         le=100.0,
-        description="Maximum distance from the frame's own pose at which a found pose is right.",
+        description="Maximum distance of a correct pose from the frame's own pose, metres.",
     )
     tolerance_deg: float = Field(
-        default=15.0, gt=0.0, le=180.0, description="Maximum rotation from the frame's own pose."
+        default=15.0, gt=0.0, le=180.0, description="Maximum rotation of a correct pose, degrees."
     )
     cell_m: float | None = Field(
         default=None,
         ge=0.1,
         le=1000.0,
-        description="Width of the plan's cells; default: 0.25, 0.5, 1, 2, 5 m and so on, with "
-        "about 20 along the longer side. Two results can be compared only if their cells have "
-        "the same width.",
+        description="Width of the plan's cells, metres; default: one of 0.25, 0.5, 1, 2, 5 m and "
+        "so on, for approximately 20 cells along the longer side. Only results with equal widths "
+        "can be compared.",
     )
     seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of the queries' random choices.")
 
     @model_validator(mode="after")
-    def _sensible(self) -> NewMapCoverage:
+    def _reject_conflict(self) -> NewMapCoverage:
         if self.other_sessions and "not_within_s" in self.model_fields_set:
-            raise ValueError("not_within_s: other_sessions leaves out the whole session already")
+            raise ValueError("not_within_s: other_sessions already excludes the whole session")
         return self
 
 
 class OutcomeCounts(ApiRecord):
-    """How many queried frames had each outcome."""
+    """Number of queried frames with each outcome."""
 
     found: int = Field(description="Number of frames that were found at the right pose.")
     wrong: int = Field(description="Number of frames that were found at a wrong pose.")
@@ -88,13 +88,13 @@ class OutcomeCounts(ApiRecord):
     not_found: int
     unchecked: int = Field(
         default=0,
-        description="Number of frames that were found but cannot be checked, as frame and "
+        description="Number of frames that were found but cannot be checked, because frame and "
         "answer have no poses in one parent frame. Exclude them from percentages.",
     )
 
 
 class CoverageResult(OutcomeCounts):
-    """Summary of a coverage job's result."""
+    """Summary of the result of a coverage job."""
 
     frames: int = Field(description="Number of queried frames.")
     skipped: int = Field(
@@ -107,23 +107,23 @@ class CoverageResult(OutcomeCounts):
         "that is indexed or deleted."
     )
     last_revision: int = Field(
-        description="Revision of the map when the job ended; if it differs, frames were added "
-        "or deleted meanwhile."
+        description="Revision of the map when the job ended. If it differs, frames were indexed or "
+        "deleted meanwhile."
     )
     map_frames: int = Field(description="Number of indexed frames of the map when the job ended.")
-    cell_m: float = Field(description="Width of the cells.")
+    cell_m: float = Field(description="Width of the cells, metres.")
 
 
 class CoverageCell(OutcomeCounts):
-    """A square of a plan."""
+    """A square cell of a plan."""
 
     column: int = Field(
-        description="The cell extends from `column` times `cell_m` to `column` + 1 times along "
-        "`x_axis`."
+        description="Index along `x_axis`: the cell extends from `column` * `cell_m` to "
+        "(`column` + 1) * `cell_m`."
     )
-    row: int = Field(description="The same along `y_axis`.")
+    row: int = Field(description="Index along `y_axis`, like `column`.")
     frames: int = Field(
-        description="Number of the map's indexed frames that were taken in the cell."
+        description="Number of the map's indexed frames whose sensor was in the cell."
     )
 
 
@@ -138,8 +138,8 @@ class CoveragePlan(ApiRecord):
         min_length=3, max_length=3, description="Unit vector to the top of the plan."
     )
     up_from: UpSource = Field(
-        description="Source of the vertical. `map`: the map's `up`. `frames`: the `up` of its "
-        "frames. `cameras`: estimated, the axis nearest to the upright of the cameras."
+        description="Source of the up axis. `map`: the map's `up`. `frames`: the `up` of its "
+        "frames. `cameras`: an estimate, the axis nearest to the vertical of the camera images."
     )
     cells: list[CoverageCell] = Field(
         description="The cells in which frames were taken, by row, then by column."
@@ -147,7 +147,7 @@ class CoveragePlan(ApiRecord):
 
 
 class MapCoverage(Product):
-    """A coverage job of a map and its result. Its steps are queried frames."""
+    """A coverage job of a map and its result. Its progress counts queried frames."""
 
     noun, collection, request_type = "coverage", "coverage", NewMapCoverage
 
@@ -156,47 +156,47 @@ class MapCoverage(Product):
     result: CoverageResult | None = Field(description="The result of a job that has succeeded.")
     plans: list[CoveragePlan] | None = Field(
         default=None,
-        description="One plan for each parent frame, that with most queried frames first; null "
-        "in lists, and until the job has succeeded.",
+        description="One plan for each parent frame, sorted by number of queried frames; null in "
+        "lists, and until the job has succeeded.",
     )
 
 
 class CoverageFrame(ApiRecord):
-    """A queried frame and its result."""
+    """A queried frame and its outcome."""
 
-    number: int = Field(description="Number from 0 in the order of the queries.")
+    number: int = Field(description="Index in the order of the queries, from 0.")
     frame_id: str
     robot: str | None
     session: str | None
     outcome: CoverageOutcome
-    reason: str = Field(description="Reason of the answer, in a sentence.")
-    cause: Cause | None = Field(description="If `not_found`: the most likely cause.")
+    reason: str = Field(description="Explanation of the answer in a sentence.")
+    cause: Cause | None = Field(description="Most likely cause of a `not_found`.")
     parent_frame: str | None = Field(
         description="Parent frame of its own pose; null without a pose."
     )
     position: Vector | None = Field(
-        description="Position of its sensor in the parent frame when it was queried."
+        description="Position of the frame's sensor in the parent frame at the time of the query."
     )
     error_m: float | None = Field(
-        description="Distance of the found pose from the frame's own; null if nothing was "
-        "found, or it cannot be checked."
+        description="Distance of the found pose from the frame's own pose, metres; null if nothing "
+        "was found or the pose cannot be checked."
     )
-    error_deg: float | None
+    error_deg: float | None = Field(description="Angle between the two poses, degrees.")
     look_alikes: list[str] = Field(
-        description="Ids of frames that it is confused with: if `ambiguous`, the match for each "
-        "pose but its own; if `wrong`, the match at the found pose."
+        description="Ids of frames of similar places: if `ambiguous`, the match for each wrong "
+        "pose; if `wrong`, the match at the found pose."
     )
 
 
 class CellChange(ApiRecord):
-    """The results of a cell in two coverage jobs."""
+    """Change of a cell between two coverage jobs."""
 
     column: int
     row: int
     trend: CellTrend = Field(
-        description="Change of the mean over the cell's queried frames: 1 for found, -1 for "
-        "wrong, 0 otherwise. `new` and `gone`: only one of the results has queried frames in "
-        "the cell."
+        description="Change of the mean score of the cell's queried frames (1 for found, -1 for "
+        "wrong, 0 otherwise). `new` and `gone`: only one of the jobs has queried frames in the "
+        "cell."
     )
     before: CoverageCell | None = Field(description="Null if the cell had no frames.")
     after: CoverageCell | None
@@ -206,14 +206,14 @@ class PlanChanges(ApiRecord):
     """The cells of one parent frame that have queried frames in either result."""
 
     parent_frame: str
-    cells: list[CellChange] = Field(description="By row, then by column.")
+    cells: list[CellChange] = Field(description="Cells by row, then by column.")
 
 
 class CoverageChanges(ApiRecord):
-    """The cells in which a map improved or degraded between two results."""
+    """Changes of a map's coverage between two jobs."""
 
-    before: str = Field(description="Ids of the earlier and the later result:")
-    after: str
+    before: str = Field(description="Id of the earlier job.")
+    after: str = Field(description="Id of the later job.")
     cell_m: float
     trends: dict[CellTrend, int] = Field(description="Number of cells with each trend.")
     result_before: CoverageResult

@@ -1,4 +1,4 @@
-"""Maps as JSON."""
+"""Records of maps."""
 
 from __future__ import annotations
 
@@ -9,83 +9,83 @@ from pydantic import AfterValidator, Field, StringConstraints, WithJsonSchema
 
 from sceneprint_client.api.base import MAP_NAME, ApiRecord, Direction, Given, Note, Up
 
-#: Names of the models that ship with the service, the default first.
+#: Names of the models that the service contains, the default first.
 PRESETS = ("depth", "lidar", "paper")
-#: A map's name: an immutable slug.
+#: Name of a map, which cannot be changed.
 Slug = Annotated[str, StringConstraints(pattern=MAP_NAME)]
 
 
-def _shipped(name: str) -> str:
+def _require_preset(name: str) -> str:
     if name not in PRESETS:
         *most, last = map(repr, PRESETS)
-        raise ValueError(f"Input should be {', '.join(most)} or {last}")  # as pydantic says it
+        raise ValueError(f"Input should be {', '.join(most)} or {last}")  # pydantic's wording
     return name
 
 
-#: A model that ships with the package.
+#: Name of a model that the service contains.
 Preset = Annotated[
-    str, AfterValidator(_shipped), WithJsonSchema({"type": "string", "enum": list(PRESETS)})
+    str, AfterValidator(_require_preset), WithJsonSchema({"type": "string", "enum": list(PRESETS)})
 ]
 
 
-#: Most that a quota can say: JavaScript knows no larger whole number.
+#: Maximum value of a quota, the largest exact integer of JavaScript.
 MOST_QUOTA = 2**53 - 1
-#: Longest retention, days: a hundred years.
+#: Maximum retention, days: a hundred years.
 MOST_DAYS = 36_525.0
 Quota = Annotated[int, Field(ge=0, le=MOST_QUOTA)]
 Days = Annotated[float, Field(gt=0, le=MOST_DAYS)]
-_INHERITED = "omitted: the quota of a deleted map of this name."
+_INHERITED = "omitted: the quota of a deleted map of the same name."
 
 
 class NewMap(Given):
     """A map to create."""
 
     name: Slug = Field(
-        description="Lower-case letters, digits, - and _, at most 63; it cannot be changed.",
+        description="At most 63 lower-case letters, digits, - and _. It cannot be changed.",
         examples=["warehouse-2"],
     )
     title: Note | None = Field(default=None, description="A label for people.")
     model: Preset = Field(
         default="depth",
-        description="Model that signs its frames, until `sceneprint reencode` changes it: "
-        "`depth` for depth cameras indoors, `lidar` for LiDAR scanners, `paper` for research, "
-        "which stores the long signatures of the paper and compares all of them.",
+        description="Model that signs the frames; `sceneprint reencode` changes it later. `depth` "
+        "is for depth cameras indoors, `lidar` for LiDAR scanners, and `paper` for research: it "
+        "stores the long signatures of the paper and compares all of them.",
     )
     quota_frames: Quota | None = Field(
         default=None,
         description="Maximum number of frames; null: no limit; "
-        f"{_INHERITED} Only the operator sets it: `admin` for `*`.",
+        f"{_INHERITED} It requires `admin` for `*`.",
     )
     quota_bytes: Quota | None = Field(
         default=None,
-        description="Maximum size of uploads, bytes: frames as they were sent, and archives "
-        "until their imports end; see `quota_frames`.",
+        description="Maximum size of the uploads, bytes: frames as received, and archives until "
+        "their imports end; see `quota_frames`.",
     )
     retention_days: Days | None = Field(
         default=None,
-        description="Days after which a frame is deleted, counted from when it was received; "
+        description="Number of days after the upload at which a frame is permanently deleted; "
         "null: never.",
     )
     up: Up | None = Field(
         default=None,
-        description="Up direction in the parent frames of its poses, (0, 0, 1) if z points up, "
-        "for frames with a pose but without `up`. Null: estimated from frames that have both.",
+        description="Up direction in the parent frames of the poses, such as (0, 0, 1) if z points "
+        "up, for frames with a pose but without `up`. Null: estimated from frames with both.",
     )
 
 
 class Reencoding(ApiRecord):
     """The progress of a map's switch to another model."""
 
-    model: str = Field(description="Name and first digits of the next model's id.")
+    model: str = Field(description="Label of the next model: name and first digits of its id.")
     model_id: str
-    done: int = Field(description="Number of frames that it has signed.")
+    done: int = Field(description="Number of frames signed with the next model.")
     left: int = Field(description="Number of frames that wait.")
     failed: int = Field(
-        description="Number of frames without anything to sign, which are rejected at the switch."
+        description="Number of frames that cannot be signed; the switch rejects them."
     )
     dead: int = Field(
-        description="Number of frames whose jobs failed in every attempt: the switch waits "
-        "until they are tried again or deleted."
+        description="Number of frames whose jobs failed in every attempt. The switch waits until "
+        "they are retried or deleted."
     )
 
 
@@ -94,49 +94,53 @@ class Map(ApiRecord):
 
     name: str
     title: str | None
-    model: str = Field(description="Name and first digits of the id of its model.")
+    model: str = Field(description="Label of the model: name and first digits of its id.")
     model_id: str
     reencoding: Reencoding | None = Field(
-        default=None, description="Progress of a switch to another model."
+        default=None, description="Progress of a switch to another model; null without a switch."
     )
     created_at: datetime
-    revision: int = Field(description="Increases with every frame that is indexed or deleted.")
+    revision: int = Field(description="Counter of indexed and deleted frames.")
     frames: dict[str, int] = Field(description="Number of frames in each state.")
     posed_frames: int = Field(
         default=0,
-        description="Number of indexed frames with a pose. Without any, answers have no pose.",
+        description="Number of indexed frames with a pose. At 0, answers have no pose.",
     )
     parent_frames: int = Field(
         default=0,
-        description="Parent frames of these poses. If there are several, answers are in that of "
-        "their matches, until an association joins them.",
+        description="Number of parent frames of the poses. If there are several, answers use the "
+        "parent frame of their matches, until an association joins them.",
     )
     used_frames: int = Field(
         default=0,
-        description="Number of frames that count towards the quota: neither deleted nor redundant.",
+        description="Number of frames that count towards the quota: all but deleted and redundant.",
     )
     used_bytes: int = Field(
         default=0,
-        description="Size of its uploads as they were sent, and of archives that are being "
-        "imported; without signatures, artifacts and indexes.",
+        description="Size of the uploads as received, and of archives during their import, without "
+        "signatures, artifacts and indexes.",
     )
-    quota_frames: int | None = Field(default=None, description="Null without a quota.")
-    quota_bytes: int | None = Field(default=None, description="Null without a quota.")
+    quota_frames: int | None = Field(
+        default=None, description="Maximum number of frames; null without a quota."
+    )
+    quota_bytes: int | None = Field(
+        default=None, description="Maximum size of the uploads; null without a quota."
+    )
     retention_days: float | None = Field(
-        default=None, description="Days after which a frame is deleted; null: never."
+        default=None, description="Days until a frame is permanently deleted; null: never."
     )
     up: Direction | None = Field(
         default=None,
-        description="Up direction in the parent frames of its poses; null: estimated from its "
+        description="Up direction in the parent frames of the poses; null: estimated from the "
         "frames.",
     )
     overdue: int | None = Field(
         default=None,
-        description="Number of frames older than `retention_days`, which are deleted next; null "
-        "without that.",
+        description="Number of frames older than `retention_days`, which workers delete next; null "
+        "without retention.",
     )
     etag: str | None = Field(
         default=None,
-        description="Version of what PATCH can change. Sent in If-Match, in quotes, it prevents "
-        "an edit from overwriting another.",
+        description="Entity tag of the editable fields. Send it in If-Match, in quotes, so that "
+        "your edit does not overwrite another edit.",
     )

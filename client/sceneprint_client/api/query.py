@@ -1,4 +1,4 @@
-"""Queries, matches and answers as JSON; where the defaults are from: docs/evaluation.md."""
+"""Records of queries, matches and answers. docs/evaluation.md explains the defaults."""
 
 from __future__ import annotations
 
@@ -13,93 +13,95 @@ from sceneprint_client.api.listing import Filter, parsed
 Stage = Literal["retrieve", "diversify", "validate"]
 STAGES: tuple[Stage, ...] = ("retrieve", "diversify", "validate")
 
-#: Most maps that one query asks.
+#: Maximum number of maps in one query.
 MOST_MAPS = 64
 
-#: A map's name or a frame's id as it is asked for; whether there is such a one is found out later.
+#: Name of a map or id of a frame in a request, which may not exist.
 Named = Annotated[str, StringConstraints(min_length=1, max_length=128)]
 
-#: A part of a whole.
+#: Share of a whole, 0 to 1.
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
-#: An object in JSON; a form and a query string give it as text.
+#: Validator of an object in JSON; forms and query strings have it as text.
 JsonText = BeforeValidator(parsed)
 
 
 class NamedFrame(Given):
-    """A stored frame, named in a request."""
+    """A stored frame in a request."""
 
-    map: Named = Field(description="Name of its map.")
+    map: Named = Field(description="Name of the map.")
     frame_id: Named
 
 
 class FrameName(ApiRecord):
-    """A stored frame that the request named."""
+    """A stored frame in a response."""
 
     map: str
     frame_id: str
 
 
 class Diversity(Given):
-    """The scales of the determinantal point process, Eq. 3 of the paper."""
+    """Scales of the determinantal point process, Eq. 3 of the paper."""
 
     sigma: float = Field(
         default=1.0,
         ge=0.01,
         le=100.0,
-        description="Factor on the median distance within the ranking: with a greater one, more "
+        description="Factor of the median distance within the ranking. A greater factor makes more "
         "frames count as similar.",
     )
     omega: float = Field(
         default=4.0,
         ge=0.01,
         le=1000.0,
-        description="Factor on the ranking's span of distances: a greater one gives diversity "
-        "more weight than rank.",
+        description="Factor of the range of distances in the ranking. A greater factor gives "
+        "diversity more weight than rank.",
     )
 
 
 class ValidationOptions(Given):
     """Requirements on accepted matches.
 
-    Omitted values are those of the map's model; the stated defaults are those of `depth`.
+    Omitted values are those of the map's model; the defaults below are those of `depth`.
     """
 
     mode: Literal["full", "paper"] = Field(
         default="full",
-        description="`paper`: only the residual of the two directions decides, and more wrong "
-        "matches are accepted.",
+        description="`full`: all checks. `paper`: only the residual of the two directions, which "
+        "accepts more wrong matches.",
     )
     residual_m: float = Field(
-        default=0.08, gt=0, le=1.0, description="Maximum distance between both directions."
+        default=0.08, gt=0, le=1.0, description="Maximum distance of the two directions, metres."
     )
     residual_deg: float = Field(
-        default=5.0, gt=0, le=45.0, description="Maximum rotation between both directions."
+        default=5.0, gt=0, le=45.0, description="Maximum angle between the two directions, degrees."
     )
     evidence: Share = Field(
         default=0.2,
-        description="Minimum `overlap` - `violation_weight` x `free_space_violations`. By "
-        "default, half of it suffices for a weak match if little is shared and all of it "
-        "agrees.",
+        description="Minimum of `overlap` - `violation_weight` x `free_space_violations`. By "
+        "default, half of it is enough for a weak match if the frames share little but agree in "
+        "all of it.",
     )
-    violation_weight: float = Field(default=5.0, ge=0.0, le=100.0)
+    violation_weight: float = Field(
+        default=5.0, ge=0.0, le=100.0, description="Weight of `free_space_violations`."
+    )
     plane_overlap: Share = Field(
-        default=0.15, description="Minimum overlap with every plane counting the same."
+        default=0.15, description="Minimum overlap if every plane has the same weight."
     )
     strong: Share = Field(
         default=0.3, description="Evidence below which an accepted match is weak."
     )
     weak: Share = Field(
-        default=0.05, description="`ambiguity` from which on an accepted match is weak."
+        default=0.05, description="`ambiguity` at and above which an accepted match is weak."
     )
     ambiguous: Share = Field(
-        default=0.14, description="`ambiguity` from which on no match is accepted."
+        default=0.14, description="`ambiguity` at and above which no match is accepted."
     )
     ambiguous_share: float = Field(
         default=0.5,
         ge=0.0,
         le=10.0,
-        description="Share of `plane_overlap` from which on no match is accepted.",
+        description="Share of `plane_overlap` at and above which no match is accepted.",
     )
 
 
@@ -109,7 +111,7 @@ ValidationStatus = Literal["accepted", "rejected", "ambiguous", "skipped"]
 
 
 class Residual(ApiRecord):
-    """Both directions composed: the identity if they agree."""
+    """Composition of both directions, which is the identity if they agree."""
 
     translation_m: float
     rotation_deg: float
@@ -118,12 +120,12 @@ class Residual(ApiRecord):
 class Validation(ApiRecord):
     """The result of aligning the query with a match.
 
-    An accepted pair is evidence that two frames look alike, not that they show the same place: the
-    answer's `status` weighs it against the map.
+    Acceptance means that the two frames look alike, not that they show the same place. The
+    `status` of the answer also considers the rest of the map.
     """
 
     status: ValidationStatus = Field(
-        description="`skipped`: it was not tried, and `reason` says why."
+        description="`skipped`: validation was not tried, for the given `reason`."
     )
     strength: Literal["strong", "weak"] | None = Field(
         default=None, description="Strength of an accepted match."
@@ -134,36 +136,36 @@ class Validation(ApiRecord):
         default=None, description="Share of both frames' points that agree."
     )
     plane_overlap: float | None = Field(
-        default=None, description="`overlap` with every plane counting the same."
+        default=None, description="`overlap` if every plane has the same weight."
     )
     free_space_violations: float | None = Field(
         default=None,
-        description="Share of points that the other frame saw through; null if neither frame "
-        "has a viewpoint.",
+        description="Share of points that the other frame saw through; null if neither frame has a "
+        "viewpoint.",
     )
     planes: float | None = Field(
-        default=None, description="Number of distinct planes that agree, the mean of both frames."
+        default=None, description="Number of distinct planes that agree (mean of both frames)."
     )
     plane_violations: float | None = Field(
-        default=None, description="`free_space_violations` with every plane counting the same."
+        default=None, description="`free_space_violations` if every plane has the same weight."
     )
     inliers: int | None = Field(
         default=None, description="Number of points of both frames that agree."
     )
     ambiguity: float | None = Field(
         default=None,
-        description="Share of the points that the best rival explains.",
+        description="Share of the points that the best rival transform explains.",
     )
     search: Literal["correspondences", "plans", "guided"] | None = Field(
         default=None,
-        description="Source of the transform: patches with similar surroundings, or the plans "
-        "of two scans. `guided`: other matches and the map's poses; it was refined and checked "
-        "but not searched for, so it is no independent vote.",
+        description="Source of the transform: `correspondences` of patches with similar "
+        "surroundings, or `plans` of two scans. `guided`: other matches and the map's poses; the "
+        "transform was refined and checked, but is not an independent vote.",
     )
     directions: list[Literal["query_to_match", "match_to_query"]] = Field(
         default=[],
-        description="Number of search directions that found it. One direction alone makes an "
-        "accepted match weak.",
+        description="Search directions that found the transform. With only one, an accepted match "
+        "is weak.",
     )
     tilt_deg: float | None = Field(
         default=None,
@@ -175,36 +177,36 @@ class Validation(ApiRecord):
 class FreeDirection(ApiRecord):
     """A direction in which a transform is poorly constrained, as along a corridor.
 
-    Both parts together have unit length: the error's metres and radians along the direction.
+    The two parts together have unit length: metres of translation and radians of rotation.
     """
 
     translation: Vector
     rotation: Vector
     deviation: float = Field(
-        description="Standard deviation along it: metres of a shift, radians of a turn; at most "
-        "10, if nothing constrains it."
+        description="Standard deviation along the direction: metres for a translation, radians for "
+        "a rotation; at most 10, if nothing constrains it."
     )
 
 
 class Uncertainty(ApiRecord):
-    """The likely error of a transform, if it is not wrong altogether.
+    """The likely error of a transform, provided that the transform is roughly right.
 
     Errors are (x, y, z, rx, ry, rz): the displacement of the child's origin along the axes of the
-    transform's parent frame, metres, then a rotation vector about the parent's axes, radians,
-    multiplied from the left. ROS's PoseWithCovariance has the same order and meaning.
+    transform's parent frame in metres, then a rotation vector about the parent's axes in radians,
+    multiplied from the left. PoseWithCovariance of ROS has the same order and meaning.
     """
 
     covariance: list[float] = Field(
-        min_length=36, max_length=36, description="6 x 6, row by row, in that order."
+        min_length=36, max_length=36, description="6 x 6 matrix, row by row, in this order."
     )
     method: Literal["information-scaled", "votes-and-spread"] = Field(
-        description="`information-scaled`: for one match, the inverse information of its "
-        "refinement, scaled to the errors in synthetic rooms. `votes-and-spread`: for several "
-        "matches, from their uncertainties and spread. See docs/uncertainty.md."
+        description="`information-scaled`, for one match: inverse information of the refinement, "
+        "scaled to the errors in synthetic rooms. `votes-and-spread`, for several matches: their "
+        "uncertainties and spread. See docs/uncertainty.md."
     )
     degenerate: list[FreeDirection] = Field(
-        description="Directions at least 30 times as uncertain as the most certain one, the "
-        "most uncertain first."
+        description="Directions at least 30 times as uncertain as the most certain one, most "
+        "uncertain first."
     )
 
 
@@ -216,58 +218,58 @@ class Match(ApiRecord):
     robot: str | None
     session: str | None
     name: str | None = Field(default=None, description="Name of the original file or message.")
-    sequence: int | None = Field(default=None, description="Position in the session.")
-    rank: int = Field(description="Place in the ranking R, from 1.")
+    sequence: int | None = Field(default=None, description="Index in the session.")
+    rank: int = Field(description="Position in the ranking R, from 1.")
     distance: int = Field(description="Distance of the signatures.")
     similarity: float = Field(description="1 - distance / distance of unrelated frames, 0 to 1.")
     selected: bool | None = Field(
-        description="Whether it is in the diverse selection C; null without that stage. False: "
-        "a frame of another place, which was validated because it looks like the query as well."
+        description="Whether the match is in the diverse selection C; null without that stage. "
+        "False: a frame of another place that was validated because it also resembles the query."
     )
     diversity_gain: float | None = Field(
-        description="1 for the first match; near 0 for a duplicate."
+        description="Diversity of the match: 1 for the first one, near 0 for a duplicate."
     )
     validation: Validation
     transform: Transform | None = Field(
-        description="Transform from query to match; trust it only if accepted."
+        description="Transform from query to match. Use it only if the match is accepted."
     )
     predicted: Transform | None = Field(
         default=None,
-        description="For a guided match: `transform` as predicted from the map's poses and the "
-        "earlier matches, with an error of up to 15 cm and 6 deg.",
+        description="For a guided match, the prediction of `transform` from the map's poses and "
+        "the earlier matches, with an error of up to 15 cm and 6 deg.",
     )
     parent_frame: str | None = Field(
         default=None,
-        description="Parent frame in which the frame's pose was sent; null without a pose. If "
-        "the map joined it to another, `pose_in_map` is in that one.",
+        description="Parent frame of the frame's pose as uploaded; null without a pose. If the map "
+        "joined it to another parent frame, `pose_in_map` uses that one.",
     )
     pose_in_map: Transform | None = Field(
-        description="Pose of the query in the parent frame of the match's pose, if that is "
-        "known and the match is not rejected."
+        description="Pose of the query in the parent frame of the match's pose; null without a "
+        "pose or if the match is rejected."
     )
     uncertainty: Uncertainty | None = Field(
-        default=None, description="Uncertainty of `transform`, if the match is accepted."
+        default=None, description="Uncertainty of `transform` for an accepted match."
     )
     base_in_map: Transform | None = Field(
         default=None,
-        description="`pose_in_map` for the robot's base, if the query has T_base_sensor.",
+        description="Pose of the robot's base like `pose_in_map`, if the query has T_base_sensor.",
     )
 
 
-#: What decided on a pose.
+#: Evidence that decided on a pose.
 Verifier = Literal["matches", "map", "prior"]
 
 
 class EvidenceRecord(ApiRecord):
-    """Evidence for and against a pose, from which its `confidence` is computed."""
+    """Evidence for and against a pose, the input of its `confidence`."""
 
     score: float = Field(
-        description="Degree to which the map's frames confirm the pose: `share`, less the share "
+        description="Degree to which the map's frames confirm the pose: `share` minus the share "
         "that they saw through; at most 1."
     )
     share: float = Field(
-        description="Share of the query's surface that the map shows there; every plane counts "
-        "the same."
+        description="Share of the query's surface that the map contains at the pose; every plane "
+        "has the same weight."
     )
     planes: float = Field(
         description="Number of distinct planes of the query that agree with the map."
@@ -275,89 +277,90 @@ class EvidenceRecord(ApiRecord):
     frames: int = Field(description="Number of the map's frames that agree.")
     viewpoints: int = Field(description="Number of different viewpoints of these frames.")
     excess: float = Field(
-        description="Share of the surface that should be in sight and is missing, in the query "
-        "or the map, beyond what the map's own frames miss among themselves."
+        description="Share of the surface that should be visible in the query or the map but is "
+        "missing, beyond what the map's own frames miss among themselves."
     )
     weight: float = Field(
-        description="Weight of the matches that vote for the pose, one for each viewpoint: 1 "
+        description="Total weight of the matches that vote for the pose, one for each viewpoint: 1 "
         "for a strong match, 0.4 for a weak or ambiguous one."
     )
     strong: int = Field(
-        description="Number of different viewpoints of strong matches that vote for it."
+        description="Number of different viewpoints of strong matches that vote for the pose."
     )
     accepted: int = Field(
-        description="Number of different viewpoints of accepted matches that lead to it, guided "
-        "or not."
+        description="Number of different viewpoints of accepted matches that lead to the pose, "
+        "including guided ones."
     )
     suggested: int = Field(
-        description="Number of different viewpoints of candidates that suggest it, accepted or not."
+        description="Number of different viewpoints of candidates that suggest the pose, accepted "
+        "or not."
     )
     similarity: float = Field(
         description="Similarity of the signatures of the query and the nearest of these "
         "candidates, 0 to 1."
     )
     rival: float = Field(
-        description="Score of the best pose at another place relative to `score`; 0 without "
-        "one. If the prior decided, of the places that it expects."
+        description="Score of the best pose at another place divided by `score`; 0 without one. If "
+        "the prior decided, only among places that the prior expects."
     )
     rival_weight: float = Field(
-        description="Largest weight of matches that vote for another place."
+        description="Maximum weight of the matches that vote for another place."
     )
     rendered: bool = Field(
         default=False,
-        description="Whether most of these frames are rendered views of an imported map, for "
-        "which the same numbers give another confidence.",
+        description="Whether most of these frames are rendered views of an imported map, for which "
+        "the same evidence means another confidence.",
     )
 
 
 _CONFIDENCE = (
-    "Probability that the pose is right, 0 to 1. Null if it was not compared with the map."
+    "Probability that the pose is right, 0 to 1; null if the pose was not compared with the map."
 )
 
 
 class Alternative(ApiRecord):
-    """A pose of the query that the evidence supports; at most one of several is right."""
+    """A pose that the evidence supports. At most one of several alternatives is right."""
 
     pose: Transform
     confidence: float | None = Field(default=None, description=_CONFIDENCE)
     evidence: EvidenceRecord | None = Field(
         default=None,
-        description="The numbers from which `confidence` is computed; null if that is null.",
+        description="Evidence behind `confidence`; null if `confidence` is null.",
     )
-    map: str | None = Field(default=None, description="Map whose parent frame the pose is in.")
+    map: str | None = Field(default=None, description="Map of the pose's parent frame.")
     support: int = Field(
-        description="Number of matches from different viewpoints that vote for it; 0 if only "
+        description="Number of matches from different viewpoints that vote for the pose; 0 if only "
         "the map suggests it."
     )
 
 
 class Location(ApiRecord):
-    """The query's pose averaged over the accepted matches that agree on it."""
+    """The query's pose, averaged over the accepted matches that agree on it."""
 
     pose: Transform
     confidence: float | None = Field(default=None, description=_CONFIDENCE)
     evidence: EvidenceRecord | None = Field(
         default=None,
-        description="The numbers from which `confidence` is computed; null if that is null.",
+        description="Evidence behind `confidence`; null if `confidence` is null.",
     )
     map: str | None = Field(default=None, description="Map of the matches.")
     support: int = Field(
-        description="Number of matches that agree on it; 1 is a single view, and 0 means that "
-        "only the map confirms it."
+        description="Number of matches that agree on the pose: 1 is a single view, and 0 means "
+        "that only the map confirms it."
     )
     guided: int = Field(
         default=0,
-        description="Number of these that were guided by the others: they make the pose more "
-        "precise, and are no independent evidence.",
+        description="Number of these matches that were guided by the others. They make the pose "
+        "more precise, but are not independent evidence.",
     )
-    votes: int = Field(description="Number of accepted matches, whatever pose they vote for.")
+    votes: int = Field(description="Number of accepted matches, for any pose.")
     strength: Literal["strong", "weak"] = Field(
-        default="strong", description="`strong` if a strong match votes for it."
+        default="strong", description="`strong` if a strong match votes for the pose."
     )
     verified_by: Verifier = Field(
         default="matches",
         description="`matches`: a strong match votes for the pose. `map`: no strong match does, "
-        "but the map's frames confirm it. `prior`: the frames confirm several poses, and the "
+        "but the map's frames confirm the pose. `prior`: the frames confirm several poses, and the "
         "prior expects this one.",
     )
     spread_m: float
@@ -365,11 +368,11 @@ class Location(ApiRecord):
     uncertainty: Uncertainty | None = Field(default=None, description="Uncertainty of `pose`.")
     base: Transform | None = Field(
         default=None,
-        description="`pose` for the robot's base, if the query has T_base_sensor.",
+        description="Pose of the robot's base like `pose`, if the query has T_base_sensor.",
     )
 
 
-# Why a query found what it found, and not another frame, as JSON.
+# Explanations of the result of a query.
 
 Outcome = Literal["accepted", "ambiguous", "rejected", "skipped", "not_selected", "ranked"]
 Lost = Literal[
@@ -379,57 +382,57 @@ Lost = Literal[
 
 
 class Explanation(ApiRecord):
-    """The last stage that a frame of the ranking reached."""
+    """The last stage that a frame of the ranking reached, and why."""
 
     frame_id: str
     map: str
     name: str | None = Field(default=None, description="Name of the original file or message.")
-    rank: int = Field(description="Place in the ranking R, from 1.")
+    rank: int = Field(description="Position in the ranking R, from 1.")
     distance: int
     similarity: float
-    stage: Stage = Field(description="The last stage that it reached.")
+    stage: Stage = Field(description="Last stage that the frame reached.")
     outcome: Outcome = Field(
-        description="`skipped`: a candidate that was not validated; `not_selected`: not a "
-        "candidate; `ranked`: only the ranking was requested."
+        description="`skipped`: a candidate that was not validated. `not_selected`: not a "
+        "candidate. `ranked`: only the ranking was requested."
     )
     reason: str
 
 
 class ExplainedFrame(ApiRecord):
-    """The reason why a frame is, or is not, among the matches."""
+    """Reason why a frame is, or is not, among the matches."""
 
     frame_id: str
     map: str
     name: str | None = Field(default=None, description="Name of the original file or message.")
-    state: str = Field(description="State of the frame; only indexed frames are searched.")
+    state: str = Field(description="State of the frame. Only indexed frames are searched.")
     passes_filter: bool | None = Field(description="Null if the frame is not searchable.")
     distance: int | None = Field(
         description="Exact distance, whether or not the query computed it."
     )
     similarity: float | None
     rank: int | None = Field(
-        description="Rank from 1 among all frames that pass the filter, by exact distance; of a "
-        "frame that does not pass, the rank that it would have."
+        description="Rank from 1 among all frames that match the filter, by exact distance. For a "
+        "frame that does not match, the rank that it would have."
     )
-    of: int | None = Field(description="Number of frames that pass the filter.")
+    of: int | None = Field(description="Number of frames that match the filter.")
     shortlisted: bool | None = Field(
-        description="False if an approximate index missed a frame that is near enough for the "
+        description="False if the approximate index missed a frame that is near enough for the "
         "ranking."
     )
-    ranked: bool | None = Field(description="Whether it is in the ranking R.")
+    ranked: bool | None = Field(description="Whether the frame is in the ranking R.")
     selected: bool | None = Field(
-        description="Whether it is a candidate: in the selection C, or, without that stage, "
-        "among the first of R."
+        description="Whether the frame is a candidate: in the selection C, or, without that stage, "
+        "among the first frames of R."
     )
     validation: Validation | None = Field(
-        description="Validation of the frame, computed for this explanation even if the query "
-        "did not reach it; null if validation was not requested."
+        description="Validation of the frame, computed for this explanation even if the query did "
+        "not reach it; null if validation was not requested."
     )
     transform: Transform | None = Field(description="Transform from the query to the frame.")
     lost_at: Lost | None = Field(
-        description="Stage at which it was dropped; null for a match. `turn`: enough frames "
-        "were accepted before it, or `k` others are listed before it; `query`: it is the query "
-        "itself."
+        description="Stage at which the frame was dropped; null for a match. `turn`: enough frames "
+        "were accepted before it, or `k` others are listed before it. `query`: the frame is the "
+        "query itself."
     )
     reason: str
 
@@ -437,14 +440,14 @@ class ExplainedFrame(ApiRecord):
 # Queries and answers.
 
 AnswerStatus = Literal["found", "ambiguous", "not_found", "unvalidated"]
-#: Frames of a sequence that is asked at once, at most.
+#: Maximum number of frames of a sequence in one query.
 MOST_OF_SEQUENCE = 10
-#: Deviations of a prior, from and to, metres and radians: what is beyond means nothing, or cannot
-#: be computed with.
+#: Minimum and maximum deviations of a prior, metres and radians. Values outside are meaningless or
+#: not computable.
 LEAST_DEVIATION, MOST_DEVIATION = 1e-6, 1000.0
-#: How far from the origin of its parent frame a prior may lie, metres.
+#: Maximum distance of a prior from the origin of its parent frame, metres.
 FARTHEST_PRIOR = 1e9
-#: The likeliest cause of an answer `not_found`.
+#: Most likely causes of an answer `not_found`.
 Cause = Literal[
     "no_frames", "deadline", "too_little_in_view", "one_plane", "gravity", "other_sensor", "scale",
     "nothing_alike",
@@ -452,162 +455,166 @@ Cause = Literal[
 
 
 class Prior(Given):
-    """The robot's belief about its pose: T_parent_query and its uncertainty."""
+    """The expected pose of a robot, T_parent_query, and its uncertainty."""
 
     pose: GivenPose = Field(
-        description="Pose of the query's sensor in a parent frame of the map; `parent_frame` is "
-        f"required. At most {FARTHEST_PRIOR:,.0f} m from the origin along each axis."
+        description="Pose of the query's sensor in a parent frame of the map. It requires "
+        f"`parent_frame`, and is at most {FARTHEST_PRIOR:,.0f} m from the origin along each axis."
     )
     covariance: Annotated[list[float], Field(min_length=36, max_length=36)] | None = Field(
         default=None,
-        description="6 x 6, row by row, of errors (x, y, z, rx, ry, rz) along the parent's axes, "
-        "ordered as in ROS's PoseWithCovariance: metres and radians. The square roots of its "
+        description="6 x 6 matrix, row by row, of errors (x, y, z, rx, ry, rz) along the parent's "
+        "axes in metres and radians, as in PoseWithCovariance of ROS. The square roots of its "
         f"diagonal are from {LEAST_DEVIATION} to {MOST_DEVIATION:.0f}.",
     )
     deviation_m: float = Field(
         default=0.3,
         ge=LEAST_DEVIATION,
         le=20,
-        description="Instead of `covariance`: deviation along each axis.",
+        description="Standard deviation along each axis, metres; replaces `covariance`.",
     )
     deviation_deg: float = Field(
         default=10.0,
         ge=1e-4,
         le=180,
-        description="Instead of `covariance`: deviation about each axis.",
+        description="Standard deviation about each axis, degrees; replaces `covariance`.",
     )
 
     @model_validator(mode="after")
-    def _in_a_parent_frame(self) -> Prior:
+    def _require_parent_frame(self) -> Prior:
         if self.pose.parent_frame is None:
-            raise ValueError("a prior needs pose.parent_frame: the one of the map's poses")
+            raise ValueError(
+                "a prior requires pose.parent_frame, a parent frame of the map's poses"
+            )
         if self.pose.of != "sensor":
-            raise ValueError("a prior is the pose of the sensor: leave `of` out")
+            raise ValueError("a prior is a pose of the sensor: omit `of`")
         return self
 
 
 class Query(Given):
-    """How to ask; the same whether the frame is uploaded or named."""
+    """Options of a query, for an uploaded or a stored frame."""
 
     k: int = Field(
         default=5,
         ge=1,
         le=50,
-        description="Accepted matches to list, at most (or matches, unvalidated). The status and "
-        "the pose do not depend on it: they rest on the first 5 that are accepted.",
+        description="Maximum number of accepted matches in the answer (of all matches, without "
+        "validation). Status and pose do not depend on it: they use the first 5 accepted matches.",
     )
     stages: tuple[Stage, ...] = Field(
         default=STAGES,
-        description="R, DR, VR or VDR of the paper: always from `retrieve`, in this order.",
+        description="Stages in their order, starting with `retrieve`: R, DR, VR or VDR of the "
+        "paper.",
     )
     exact: bool = Field(
         default=False,
-        description="Compare every frame of the map that passes the filter. Most queries do so "
-        "anyway: only in a large map are some left out.",
+        description="Whether to compare every frame that matches the filter. Most queries do so "
+        "anyway; only in a large map are frames left out.",
     )
     filter: Filter | None = Field(
         default=None,
-        description="Only frames that pass it are searched, and as many are found as exist.",
+        description="Conditions on the searched frames. A narrow filter does not shorten the "
+        "ranking.",
     )
     seed: int = Field(
-        default=0, ge=0, lt=2**32, description="Of the random choices; the answer echoes it."
+        default=0, ge=0, lt=2**32, description="Seed of the random choices, repeated in the answer."
     )
     candidates: int | None = Field(
         default=None,
         ge=1,
         le=200,
-        description="How many of the ranking are selected, and validated until 5 are accepted, "
-        "some 20 ms each; default: 10. Where `k` is more than 5, validation goes on until `k` are "
-        "accepted, and by default among `k` candidates. Without validation `k` counts.",
+        description="Number of frames of the ranking that are selected and validated until 5 are "
+        "accepted, approximately 20 ms each; default: 10. If `k` exceeds 5, validation continues "
+        "until `k` are accepted, by default among `k` candidates. Without validation, `k` applies.",
     )
     diversity: Annotated[Diversity | None, JsonText] = Field(
-        default=None, description="The scales of the selection."
+        default=None, description="Scales of the selection."
     )
     validation: Annotated[ValidationOptions | None, JsonText] = Field(
-        default=None, description="What a match must stand to be accepted."
+        default=None, description="Requirements on accepted matches."
     )
     prior: Annotated[Prior | None, JsonText] = Field(
         default=None,
-        description="What the robot believes of its pose. Candidates near it are tried first, and "
-        "it is refined on the map beside the search over all; it decides only between poses that "
-        "the map bears out alike.",
+        description="Expected pose of the robot. Candidates near it are tried first, and it is "
+        "refined on the map beside the global search. It decides only between poses that the map "
+        "supports equally.",
     )
     confidence: float = Field(
         default=0.99,
         ge=0.5,
         le=0.999,
-        description="Least confidence of a pose that is `found`. All other places together have "
-        "at most the rest.",
+        description="Minimum confidence of a `found` pose. All other places together have at most "
+        "the remainder.",
     )
     deadline_ms: int | None = Field(
         default=None,
         ge=1,
         le=600_000,
-        description="Counted from when the request came. No candidate is begun that would likely "
-        "be validated too late; the ranking and the selection are always made.",
+        description="Time limit from the arrival of the request. Candidates that would probably "
+        "exceed it are not validated; ranking and selection are always completed.",
     )
     explain: bool = Field(
-        default=False, description="Say of every frame of the ranking how far it came, and why."
+        default=False, description="Whether to explain how far each frame of the ranking came."
     )
     explain_frame: Named | None = Field(
         default=None,
-        description="A frame of the map: say where it was lost. It is compared and validated for "
-        "this even where the query did not. Of several maps, the first that has one of this id.",
+        description="Id of a frame of the map for which to explain the result. It is compared and "
+        "validated even if the query did not reach it. With several maps, the first such frame.",
     )
     keep: bool = Field(
         default=True,
-        description="Store the answer, so that GET /v1/queries/{query_id} returns it.",
+        description="Whether to store the answer for GET /v1/queries/{query_id}.",
     )
     record: bool = Field(
         default=True,
-        description="List the query in GET /v1/queries, report it as an event, and count it.",
+        description="Whether to list the query in GET /v1/queries, send an event and count it.",
     )
 
     @field_validator("stages", mode="before", json_schema_input_type=str | tuple[Stage, ...])
     @classmethod
     def _from_text(cls, stages: object) -> object:
-        """As a form and a command line give them: one text with commas."""
+        """Split the comma-separated stages of a form or a command line."""
         if isinstance(stages, str):
             return [one.strip() for one in stages.split(",")]
         if isinstance(stages, list | tuple):
             return stages
-        # pydantic would speak of tuples, as Python does
-        raise ValueError("give a list of stages, or a text with commas between them")
+        # pydantic's own message would be about tuples.
+        raise ValueError("must be a list of stages, or a text with commas between them")
 
     @field_validator("filter", mode="before", json_schema_input_type=str | Filter | None)
     @classmethod
-    def _from_json(cls, given: object) -> object:
-        return parsed(given)
+    def _from_json(cls, value: object) -> object:
+        return parsed(value)
 
     @field_validator("stages")
     @classmethod
-    def _in_order(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    def _require_order(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
         if stages != tuple(stage for stage in STAGES if stage in stages) or not stages:
-            raise ValueError("name stages once, in the order retrieve, diversify, validate")
+            raise ValueError("list stages once, in the order retrieve, diversify, validate")
         if stages[0] != "retrieve":
-            raise ValueError("every query begins with retrieve")
+            raise ValueError("every query starts with retrieve")
         return stages
 
 
 class SeveralQuery(Query):
-    """How to ask several maps of one model at once."""
+    """Options of a query in several maps of one model."""
 
     maps: Literal["*"] | Annotated[list[Named], Field(min_length=1, max_length=MOST_MAPS)] = Field(
-        description=f"Their names, at most {MOST_MAPS}; `*` for all that you may read. A form and "
-        "a query string have them with commas between."
+        description=f"Names of the maps, at most {MOST_MAPS}, or `*` for all that you may read. "
+        "Forms and query strings separate them by commas."
     )
     frame: NamedFrame | None = Field(
-        default=None, description="A stored frame, in place of an upload; it does not find itself."
+        default=None, description="Stored frame in place of an upload. It does not match itself."
     )
     query_id: str | None = Field(
         default=None,
-        description="An earlier query whose answer is stored, in place of an upload: its frame "
-        "with these options. The answer has an id of its own.",
+        description="Id of an earlier query in place of an upload. Its stored frame is queried "
+        "again with these options; the answer has its own id.",
     )
 
     @field_validator("maps", mode="before")
     @classmethod
-    def _names(cls, maps: object) -> object:
+    def _split(cls, maps: object) -> object:
         if isinstance(maps, str) and maps.strip() != "*":
             return [one.strip() for one in maps.split(",")]
         return maps.strip() if isinstance(maps, str) else maps
@@ -617,7 +624,7 @@ class Counts(ApiRecord):
     """Number of frames at each stage."""
 
     map: int = Field(description="Number of searchable frames in the map.")
-    passed: int = Field(description="Number of these that pass the filter; all without a filter.")
+    passed: int = Field(description="Number of these that match the filter; all without a filter.")
     compared: int = Field(description="Number of these whose distance was computed.")
     ranked: int
     selected: int
@@ -628,7 +635,7 @@ class Counts(ApiRecord):
 class OfMap(ApiRecord):
     """The result of a query in one of several maps."""
 
-    index_version: int = Field(description="0 where it was searched without an index of this node.")
+    index_version: int = Field(description="Index that was searched; 0 without one on this node.")
     counts: Counts
 
 
@@ -637,55 +644,55 @@ class Answer(ApiRecord):
 
     query_id: str
     status: AnswerStatus = Field(
-        description="`found`: the confidence of one pose reaches that of the query; if no "
+        description="`found`: the confidence of one pose reaches that of the query; or, if no "
         "accepted match has a pose, at least one match is accepted. `ambiguous`: the evidence "
-        "supports one or several poses, none with that confidence: never drive on it. "
-        "`not_found`: the evidence supports no pose, see `cause`. `unvalidated`: validation was "
+        "supports one or several poses, but none with that confidence; never drive on it. "
+        "`not_found`: the evidence supports no pose; see `cause`. `unvalidated`: validation was "
         "not requested, or the deadline passed before a match was accepted."
     )
     reason: str = Field(
-        default="", description="The reason in a sentence; if `not_found`, with advice."
+        default="", description="Explanation in a sentence; for `not_found`, with advice."
     )
-    cause: Cause | None = Field(default=None, description="If `not_found`: the most likely cause.")
+    cause: Cause | None = Field(default=None, description="Most likely cause of a `not_found`.")
     matches: list[Match] = Field(
-        description="The accepted matches, strong before weak, then the most precise first (for "
-        "full-turn scans, the nearest first); then the other matches that were validated."
+        description="Accepted matches, strong before weak, then the most precise first (for "
+        "full-turn scans, the nearest first), followed by the other validated matches."
     )
     location: Location | None = Field(
-        description="Pose of the query, if the answer is `found` and the matches have poses."
+        description="Pose of the query if the answer is `found` and the matches have poses."
     )
     alternatives: list[Alternative] = Field(
         default=[],
-        description="If `ambiguous`: the poses that the evidence supports, the best first.",
+        description="Poses of an `ambiguous` answer that the evidence supports, best first.",
     )
     seed: int
     model: str
     index_version: int = Field(
-        description="0 where the map was searched without an index of this node: a small one, "
-        "one that PostgreSQL searched, or one whose model stores psi. Of several maps the least."
+        description="Index that was searched; 0 for a small map, a search by PostgreSQL, or a "
+        "model that stores psi. With several maps, the minimum."
     )
-    exact: bool = Field(description="Whether every frame that passes the filter was compared.")
+    exact: bool = Field(description="Whether every frame that matches the filter was compared.")
     counts: Counts
     milliseconds: dict[str, float] = Field(
-        description="`prepare` (signature and geometry of the query), `retrieve`, `diversify`, "
-        "`validate`, `locate`, `explain` where it was asked for, `earlier` for the earlier frames "
-        "of a sequence, `total`."
+        description="Time of each stage: `prepare` (signature and geometry of the query), "
+        "`retrieve`, `diversify`, `validate`, `locate`, `explain` if requested, `earlier` for the "
+        "earlier frames of a sequence, `total`."
     )
-    maps: list[str] = Field(default=[], description="The maps that were searched.")
+    maps: list[str] = Field(default=[], description="Names of the searched maps.")
     frame: FrameName | None = Field(
         default=None,
-        description="The stored frame of the query; null for an upload. Transforms name its "
-        "sensor by its id if only its own map was searched, and `query` otherwise.",
+        description="Stored frame of the query; null for an upload. In transforms, its sensor is "
+        "named after its id if only its own map was searched, and `query` otherwise.",
     )
     kind: Kind = Field(
         default="depth",
-        description="Kind of the query's frame. Transforms name the sensor of a depth image "
-        "`ID.optical` (x right, y down, z forward), and that of a cloud, which keeps its axes, "
+        description="Kind of the query's frame. In transforms, the sensor of a depth image is "
+        "`ID.optical` (x right, y down, z forward), and that of a cloud, which keeps its axes, is "
         "`ID.sensor`.",
     )
     frames: int = Field(
         default=1,
-        description="Number of frames in the query. With a sequence, `matches` are those of the "
+        description="Number of frames in the query. For a sequence, `matches` are those of the "
         "last frame.",
     )
     per_map: dict[str, OfMap] | None = Field(
@@ -693,74 +700,74 @@ class Answer(ApiRecord):
     )
     deadline_reached: bool | None = Field(
         default=None,
-        description="Whether candidates were omitted because of the deadline; null without a "
+        description="Whether candidates were left out because of the deadline; null without a "
         "deadline.",
     )
     explanations: list[Explanation] | None = Field(
         default=None,
-        description="With `explain`: explanations of all frames of the ranking, the nearest first.",
+        description="Explanations of all frames of the ranking, nearest first, with `explain`.",
     )
     explained_frame: ExplainedFrame | None = Field(
-        default=None, description="With `explain_frame`: the explanation of that frame."
+        default=None, description="Explanation of the frame in `explain_frame`."
     )
 
 
-# Where a robot is, in one record.
+# The pose of a robot in one record.
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]
 
 
 class Localization(ApiRecord):
-    """The pose of the query, if it is known."""
+    """The pose of the query and its reliability."""
 
     status: LocalizationStatus = Field(
-        description="`found`: the confidence of one pose reaches that of the query. "
-        "`ambiguous`: none does, see `alternatives`: move, and query again. `not_found`: no "
-        "pose is supported, see `cause`, or the deadline passed before."
+        description="`found`: the confidence of one pose reaches that of the query. `ambiguous`: "
+        "no pose reaches it; see `alternatives`, move, and query again. `not_found`: no pose is "
+        "supported, or the deadline passed; see `cause`."
     )
     reason: str
-    cause: Cause | None = Field(default=None, description="If `not_found`: the most likely cause.")
+    cause: Cause | None = Field(default=None, description="Most likely cause of a `not_found`.")
     map: str
     pose: Transform | None = Field(
-        description="T_parent_query: the query's camera in the parent frame of its matches' "
-        "poses. Null unless `found`, and if no accepted match has a pose: see `best`."
+        description="T_parent_query, the pose of the query's sensor in the parent frame of its "
+        "matches' poses. Null unless `found`, or if no accepted match has a pose; see `best`."
     )
     confidence: float | None = Field(
         default=None,
-        description="Probability that `pose` is right, 0 to 1; if `ambiguous`, of the first of "
-        "`alternatives`. Null without a pose, or if it was not compared with the map.",
+        description="Probability that `pose` is right, 0 to 1; for `ambiguous`, that of the first "
+        "alternative. Null without a pose, or if the pose was not compared with the map.",
     )
     evidence: EvidenceRecord | None = Field(
         default=None,
-        description="The numbers from which `confidence` is computed; null if that is null.",
+        description="Evidence behind `confidence`; null if `confidence` is null.",
     )
     support: int = Field(
-        description="Number of matches that agree on the pose; 1 is a single view, and 0 means "
+        description="Number of matches that agree on the pose: 1 is a single view, and 0 means "
         "that only the map confirms it."
     )
-    votes: int = Field(description="Number of accepted matches, whatever pose they vote for.")
-    spread_m: float | None = Field(description="Spread of the votes; null without a pose.")
+    votes: int = Field(description="Number of accepted matches, for any pose.")
+    spread_m: float | None = Field(description="Spread of the votes, metres; null without a pose.")
     spread_deg: float | None
     uncertainty: Uncertainty | None = Field(default=None, description="Uncertainty of `pose`.")
     base: Transform | None = Field(
         default=None,
-        description="`pose` for the robot's base, if the query has T_base_sensor.",
+        description="Pose of the robot's base like `pose`, if the query has T_base_sensor.",
     )
     strength: Literal["strong", "weak"] | None = Field(
         description="`strong` if a strong match votes for the pose; null unless `found`."
     )
     verified_by: Verifier | None = Field(
         default=None,
-        description="What decided the answer, as in `location`; null unless `found`.",
+        description="Evidence that decided, as in `location`; null unless `found`.",
     )
     alternatives: list[Alternative] = Field(
         default=[],
-        description="If `ambiguous`: the poses that the evidence supports, the best first.",
+        description="Poses of an `ambiguous` answer that the evidence supports, best first.",
     )
-    best: Match | None = Field(description="The best accepted match, with the transform to it.")
-    matches: list[str] = Field(description="Ids of the accepted matches, the best first.")
+    best: Match | None = Field(description="Best accepted match, with its transform.")
+    matches: list[str] = Field(description="Ids of the accepted matches, best first.")
     frames: int = Field(
-        default=1, description="Number of frames in the query; those of a sequence count together."
+        default=1, description="Number of frames in the query; for a sequence, of all its frames."
     )
     query_id: str
     seed: int

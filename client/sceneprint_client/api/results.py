@@ -1,4 +1,4 @@
-"""Past queries, and what can be looked at after one, as JSON."""
+"""Records of past queries, stored answers, frame data and comparisons."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sceneprint_client.api.query import (
 
 # Past queries.
 
-#: The outcome of a query: the status of its answer, or that there was none.
+#: Outcome of a query: status of its answer, or `failed`.
 RecordStatus = Literal["found", "ambiguous", "not_found", "unvalidated", "failed"]
 RECORD_STATUSES: tuple[RecordStatus, ...] = (
     "found", "ambiguous", "not_found", "unvalidated", "failed"
@@ -36,7 +36,7 @@ RECORD_STATUSES: tuple[RecordStatus, ...] = (
 
 
 class RecordedPose(ApiRecord):
-    """T_parent_query, metres and a unit quaternion."""
+    """T_parent_query in metres, with a unit quaternion."""
 
     parent_frame: str
     translation: Vector
@@ -44,57 +44,59 @@ class RecordedPose(ApiRecord):
 
 
 class KeepOptions(Given):
-    """Options of keeping an answer."""
+    """Options for keeping an answer."""
 
-    title: Note | None = Field(default=None, description="A label for people.")
+    title: Note | None = Field(default=None, description="Title of the answer, for people.")
 
 
 class QueryRecord(ApiRecord):
-    """A past query and its outcome, without the content of its frame."""
+    """A past query and its outcome, without the data of its frame."""
 
     query_id: str = Field(
-        description="GET /v1/queries/{query_id} returns the answer while `stored` is true."
+        description="Id of the query. GET /v1/queries/{query_id} returns the answer if `stored`."
     )
     at: datetime = Field(description="Time of the query.")
     map: str = Field(
-        description="If several maps were searched: the map in which the query was found, that "
-        "of the first alternative or match, or the first in the request."
+        description="Map that was searched. With several maps: that of the found pose, of the "
+        "first alternative or match, or the first in the request."
     )
-    maps: list[str] = Field(description="All maps that were searched and that you may read.")
-    robot: str | None = Field(description="Robot that sent it, if the query named it.")
+    maps: list[str] = Field(description="Searched maps that you may read.")
+    robot: str | None = Field(description="Robot that sent the query, if known.")
     session: str | None
     key: str | None = Field(
-        description="Name of the API key; null without one, or after its revocation."
+        description="Name of the API key; null without a key, or after its revocation."
     )
     status: RecordStatus = Field(
-        description="Status of the answer. `failed`: there was no answer, and `reason` says why."
+        description="Status of the answer. `failed`: there is no answer, and `reason` says why."
     )
     cause: str | None = Field(
-        description="Cause of `not_found`, or of a deadline, as in the answer; for `failed`, "
-        "the type of the problem, such as `busy`."
+        description="Cause of `not_found`, or of a deadline, as in the answer; for `failed`, the "
+        "type of the problem, such as `busy`."
     )
     reason: str
-    pose: RecordedPose | None = Field(description="Pose if `found` and the matches have poses.")
+    pose: RecordedPose | None = Field(
+        description="Pose of a `found` answer; null if the matches have no poses."
+    )
     confidence: float | None = Field(
-        description="Probability that `pose`, or the best alternative, is right; null if the "
-        "pose was not compared with the map."
+        description="Probability that `pose`, or the best alternative, is right; null if the pose "
+        "was not compared with the map."
     )
     support: int | None = Field(description="Number of matches that agree on `pose`.")
     alternatives: int = Field(
-        description="If `ambiguous`: number of poses that the evidence supports."
+        description="Number of poses of an `ambiguous` answer that the evidence supports."
     )
     milliseconds: float
     kind: Kind | None = Field(description="Kind of the frame; null if it was not read.")
     frame: FrameName | None = Field(
-        description="The stored frame of the query; null for an upload, and if you may not read "
-        "its map."
+        description="Stored frame of the query; null for an upload, and if you may not read its "
+        "map."
     )
     stored: bool = Field(description="Whether the answer is still stored.")
     expires_at: datetime | None = Field(
-        description="Time at which the record and the answer are removed; the answer may be "
-        "removed earlier to make room. Null for a kept answer."
+        description="Expiry time of the record and the answer; the answer may be deleted earlier "
+        "to free space. Null for a kept answer."
     )
-    kept_at: datetime | None = Field(description="Time since which the answer is kept.")
+    kept_at: datetime | None = Field(description="Time of the request to keep the answer.")
     title: str | None = Field(description="Title of a kept answer.")
 
 
@@ -102,29 +104,29 @@ class StoredQuery(QueryRecord):
     """A past query whose answer is stored, with its options."""
 
     validates: bool = Field(
-        description="Whether its points are stored, so that it can be repeated with the stage "
-        "`validate`."
+        description="Whether the points of the query are stored, so that it can be repeated with "
+        "the stage `validate`."
     )
     model: str
     options: dict[str, Any] = Field(
-        description="Options that the request set; the others had their defaults."
+        description="Options in the request; all others had their defaults."
     )
 
 
-# What a frame is made of, as JSON.
+# Data derived from a frame.
 
-#: In which coordinates a frame's cloud is told.
+#: Coordinate frame of a cloud.
 CloudFrame = Literal["optical", "parent", "base"]
 CLOUD_FRAMES: tuple[CloudFrame, ...] = ("optical", "parent", "base")
 
-#: What a picture of a frame shows.
+#: Content of a picture of a frame.
 View = Literal["depth", "normals", "patches"]
 VIEWS: tuple[View, ...] = ("depth", "normals", "patches")
-#: Least and most columns of a picture, and how many it has by default.
+#: Minimum, maximum and default width of a picture, pixels.
 WIDTHS = (64, 1280)
 WIDTH = 320
 
-#: Points of a surface that are sent to be drawn, unless another number is asked for.
+#: Default number of surface points for drawing.
 MOST_DRAWN = 20_000
 
 Triple = tuple[float, float, float]
@@ -137,25 +139,25 @@ class PatchLevel(ApiRecord):
     square centimetre.
     """
 
-    mean: list[Triple] = Field(description="x, y, z in metres.")
-    normal: list[Triple] = Field(description="Unit length, towards the sensor.")
+    mean: list[Triple] = Field(description="Mean x, y, z in metres.")
+    normal: list[Triple] = Field(description="Unit normal towards the sensor.")
     area_m2: list[float]
     size: list[int] = Field(
-        description="Number of pixels of the surface map, which is about 160 x 120."
+        description="Number of pixels in the surface map, which has approximately 160 x 120."
     )
 
 
 class FramePatches(ApiRecord):
-    """The patches of a frame, as its model segments them."""
+    """The patches of a frame, as segmented for its model."""
 
     frame_id: str
     map: str
-    frame: str = Field(description="Name of the sensor's frame, in which the coordinates are.")
+    frame: str = Field(description="Name of the sensor's frame, which the coordinates refer to.")
     model: str
     levels: list[PatchLevel] = Field(
-        description="The hierarchy that the signature describes, the finest first."
+        description="Levels of the hierarchy that the signature describes, finest first."
     )
-    validation: PatchLevel = Field(description="The patches used to validate matches.")
+    validation: PatchLevel = Field(description="Patches for the validation of matches.")
 
 
 class FrameSignature(ApiRecord):
@@ -168,64 +170,69 @@ class FrameSignature(ApiRecord):
         description="Id of the model. Signatures of different models cannot be compared."
     )
     dtype: Literal["uint8"] = "uint8"
-    length: int = Field(description="Number of bytes.")
-    n_patches: list[int] = Field(description="Number of patches at each level, the finest first.")
+    length: int = Field(description="Length of the signature, bytes.")
+    n_patches: list[int] = Field(description="Number of patches at each level, finest first.")
     n_pairs: list[int] = Field(description="Number of ordered pairs of patches at each level.")
     base64: str = Field(
-        description="The bytes of the signature. Compare two by the sum of absolute differences."
+        description="Bytes of the signature. The distance of two is the sum of absolute "
+        "differences."
     )
 
 
-#: What an overlay's colours tell.
+#: Meaning of an overlay's colours.
 OverlayColour = Literal["source", "normal", "residual"]
-#: By which transform an overlay's clouds are laid on each other.
+#: Transform between the clouds of an overlay.
 OverlayTransform = Literal["aligned", "rival", "none"]
-#: Whose points.
+#: Frame whose points are returned.
 PointsSide = Literal["query", "match"]
 COLOURS: tuple[OverlayColour, ...] = ("source", "normal", "residual")
 TRANSFORMS: tuple[OverlayTransform, ...] = ("aligned", "rival", "none")
 
-#: Most points of a kind that are listed, and most patches.
+#: Maximum number of listed points of each kind, and of listed patches.
 MOST_POINTS = 2000
 
 
 class Similarities(ApiRecord):
-    """Similarities of a query and the frames of its ranking, each to each, for a heat map."""
+    """Pairwise similarities of a query and the frames of its ranking, for a heat map."""
 
     query_id: str
     model: str
     frames: list[FrameName] = Field(
-        description="Frames of the ranking, the nearest first, without those deleted since."
+        description="Frames of the ranking, nearest first, without frames deleted since."
     )
     names: list[str | None] = Field(
-        default=[], description="Names of the files of `frames`, in their order."
+        default=[], description="Names of the files of `frames`, in the same order."
     )
     similarity: list[list[float]] = Field(
-        description="1 - distance / distance of unrelated frames, 0 to 1. The first row and "
-        "column are the query's, the others those of `frames`, in their order."
+        description="1 - distance / distance of unrelated frames, 0 to 1. The first row and column "
+        "are the query's, the others those of `frames` in the same order."
     )
 
 
 class Coincidences(ApiRecord):
-    """Patches of both frames that coincide under the transform. Each list has one entry for each
-    pair.
+    """Patches of both frames that coincide under the transform, with one entry per pair in each
+    list.
     """
 
     query: list[int] = Field(description="Index of the query's validation patch.")
-    match: list[int] = Field(description="Index of the match's patch; see its `/patches`.")
-    query_mean: list[Triple] = Field(description="Metres, in the frame of the query's sensor.")
+    match: list[int] = Field(description="Index of the match's validation patch; see `/patches`.")
+    query_mean: list[Triple] = Field(
+        description="Means in the frame of the query's sensor, metres."
+    )
     query_normal: list[Triple]
-    match_mean: list[Triple] = Field(description="Metres, in the frame of the match's sensor.")
+    match_mean: list[Triple] = Field(
+        description="Means in the frame of the match's sensor, metres."
+    )
     match_normal: list[Triple]
     distance_m: list[float] = Field(
-        description="Distance of the means under the transform, in increasing order."
+        description="Distance of the means under the transform, metres, in increasing order."
     )
 
 
 class Points(ApiRecord):
-    """Points of one frame, in its sensor's frame, on which the evidence is counted."""
+    """Sampled points of one frame that count as evidence, in the frame of its sensor."""
 
-    sampled: int = Field(description="Number of points that were looked up in the other frame.")
+    sampled: int = Field(description="Number of points that were compared with the other frame.")
     inliers: list[Triple] = Field(
         description=f"Points on the other frame's surface; at most {MOST_POINTS}."
     )
@@ -235,56 +242,58 @@ class Points(ApiRecord):
 
 
 class MatchDetails(ApiRecord):
-    """One match of a query, validated again as in the query, with its evidence."""
+    """One match of a query, validated again with its options, and its evidence."""
 
     query_id: str
     frame_id: str
     map: str
     name: str | None = Field(default=None, description="Name of the original file or message.")
-    sequence: int | None = Field(default=None, description="Position in the session.")
+    sequence: int | None = Field(default=None, description="Index in the session.")
     validation: Validation
     transform: Transform | None = Field(
-        description="Transform from query to match; null if the frames gave no hypothesis."
+        description="Transform from query to match; null without a hypothesis."
     )
     uncertainty: Uncertainty | None = Field(
-        description="Uncertainty of `transform`, if it is accepted."
+        description="Uncertainty of `transform` for an accepted match."
     )
     rival: Transform | None = Field(
-        description="The best other transform that explains the frames and is not refuted."
+        description="Best other transform that explains the frames and is not refuted."
     )
-    patches: Coincidences | None = Field(description="Null without a transform.")
+    patches: Coincidences | None = Field(
+        description="Coincident patches; null without a transform."
+    )
     query: Points | None
     match: Points | None
     seed: int
 
 
-# Two frames compared, as JSON.
+# Comparisons of two frames.
 
 
 class Comparison(Given):
-    """Which frames to compare, and how."""
+    """Two frames to compare, and options."""
 
     frame_a: Annotated[NamedFrame | None, JsonText] = Field(
-        default=None, description="A stored frame, in place of an upload `a`."
+        default=None, description="Stored frame in place of an upload `a`."
     )
     frame_b: Annotated[NamedFrame | None, JsonText] = Field(
-        default=None, description="A stored frame, in place of an upload `b`."
+        default=None, description="Stored frame in place of an upload `b`."
     )
     aligned: bool = Field(
         default=True,
         alias="validate",
-        description="Align them, and say whether they see one place.",
+        description="Whether to align the frames and decide whether they show one place.",
     )
     validation: Annotated[ValidationOptions | None, JsonText] = Field(
-        default=None, description="What the alignment must stand to be accepted."
+        default=None, description="Requirements on an accepted alignment."
     )
     seed: int = Field(
-        default=0, ge=0, lt=2**32, description="Of the random choices; the answer echoes it."
+        default=0, ge=0, lt=2**32, description="Seed of the random choices, repeated in the result."
     )
     model: Preset | None = Field(
         default=None,
-        description="That signs two uploads; default: `depth`; of a LiDAR, `lidar`. A stored frame "
-        "brings its own.",
+        description="Model for two uploads; default: `depth`, or `lidar` for LiDAR scans. Stored "
+        "frames have their own model.",
     )
 
 
@@ -292,21 +301,21 @@ class Similarity(ApiRecord):
     """The similarity of two frames."""
 
     distance: int = Field(
-        description="Distance of their signatures: squared L2, or L1 if psi itself is stored."
+        description="Distance of the signatures: squared L2, or L1 if psi itself is stored."
     )
     similarity: float = Field(description="1 - distance / distance of unrelated frames, 0 to 1.")
     model: str
-    a: FrameName | None = Field(description="The stored frame; null for an upload.")
-    b: FrameName | None
-    validation: Validation | None = Field(description="Null if it was not requested.")
+    a: FrameName | None = Field(description="Stored frame a; null for an upload.")
+    b: FrameName | None = Field(description="Stored frame b; null for an upload.")
+    validation: Validation | None = Field(description="Validation; null if not requested.")
     transform: Transform | None = Field(
-        description="x_a = matrix @ x_b. If it is accepted, it is right if both frames show the "
-        "same place, which a pair alone cannot prove."
+        description="x_a = matrix @ x_b. An accepted transform is right if both frames show the "
+        "same place, which one pair cannot prove."
     )
     uncertainty: Uncertainty | None = Field(
-        default=None, description="Uncertainty of `transform`, if it is accepted."
+        default=None, description="Uncertainty of an accepted `transform`."
     )
     seed: int
     milliseconds: dict[str, float] = Field(
-        description="`prepare` (both frames), `validate`, `total`."
+        description="Time of each stage: `prepare` (both frames), `validate`, `total`."
     )

@@ -1,4 +1,4 @@
-"""Sessions associated and compared, as JSON: edges, joins, graphs; what is gone, what is new."""
+"""Records of associations, pose graphs and differences of sessions."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from sceneprint_client.api.base import ApiRecord, Given, Label, Transform
 from sceneprint_client.api.listing import Filter
 from sceneprint_client.api.query import ValidationOptions
 
-#: Frames apart that loop closures are looked for from, unless told otherwise.
+#: Default minimum number of frames between the two frames of a loop closure.
 APART = 100
-#: Files that a graph comes as.
+#: File formats of a pose graph.
 GraphFormat = Literal["g2o", "tum", "json"]
 
 
 class NewAssociation(Given):
-    """Sessions of a map that are to be associated, frame by frame."""
+    """Sessions of a map to associate, frame by frame."""
 
     sessions: Annotated[list[Label], Field(min_length=1, max_length=2)] = Field(
-        description="Two sessions: each frame of the first is looked up in the second. One "
-        "session: loop closures; each frame is looked up among those taken before it."
+        description="Two sessions: each frame of the first is queried against the second. One "
+        "session, for loop closures: each frame is queried against earlier frames."
     )
     robots: Annotated[list[Label], Field(min_length=1, max_length=2)] | None = Field(
         default=None,
@@ -37,29 +37,29 @@ class NewAssociation(Given):
         default=None,
         ge=1,
         le=1_000_000,
-        description="For one session: minimum number of frames in between, in order of time; "
+        description="For one session: minimum number of frames in between, in the order of time; "
         f"default: {APART}, or 1 with `not_within_s`.",
     )
     not_within_s: float | None = Field(
         default=None,
         gt=0,
-        description="For one session: minimum time in between, seconds; frames without a time "
-        "are omitted.",
+        description="For one session: minimum time in between, seconds. Frames without a time are "
+        "omitted.",
     )
     k: int = Field(
-        default=3, ge=1, le=10, description="Number of accepted edges wanted for each frame."
+        default=3, ge=1, le=10, description="Maximum number of accepted edges of each frame."
     )
     candidates: int = Field(
         default=10,
         ge=1,
         le=100,
         description="Number of frames of each ranking that are selected and validated until `k` "
-        "are accepted, some 20 ms each.",
+        "are accepted, approximately 20 ms each.",
     )
     join: bool = Field(
         default=True,
-        description="For two sessions: if the join of their parent frames is strong, move all "
-        "poses of the map into one of them.",
+        description="For two sessions: whether to move all poses of the map into one parent frame "
+        "if the join is strong.",
     )
     seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of the random choices.")
     min_overlap: float = Field(
@@ -70,30 +70,29 @@ class NewAssociation(Given):
     )
 
     @model_validator(mode="after")
-    def _sensible(self) -> NewAssociation:
+    def _reject_conflicts(self) -> NewAssociation:
         if self.robots is not None and len(self.robots) != len(self.sessions):
-            raise ValueError("robots: name one for each session, in the same order")
+            raise ValueError("robots: list one for each session, in the same order")
         if len(self.sessions) == 2:
             robots = self.robots or ["", ""]
             if self.sessions[0] == self.sessions[1] and robots[0] == robots[1]:
-                raise ValueError("sessions: name it once to look for loop closures within it")
+                raise ValueError("sessions: list the session once to search it for loop closures")
             if self.apart is not None or self.not_within_s is not None:
-                raise ValueError("apart, not_within_s: they are for loop closures in one session")
+                raise ValueError("apart, not_within_s: allowed only for one session")
         if self.filter is not None and self.filter.not_within_s is not None:
-            raise ValueError("filter.not_within_s: give not_within_s beside the filter instead")
+            raise ValueError("filter.not_within_s: use not_within_s outside of the filter")
         return self
 
 
 class Edge(ApiRecord):
-    """Two frames that seem to see one place, and how they lie to each other.
+    """Two frames that seem to show one place, and the transform between them.
 
-    An edge alone is evidence that two places look alike, not that they are one: take it only where
-    `consistent` is true.
+    A single edge shows only that two places look alike. Use edges only if `consistent` is true.
     """
 
-    number: int = Field(description="Number from 0 in the order in which edges were found.")
-    from_frame: str = Field(description="The frame that was looked up.")
-    to_frame: str = Field(description="The frame that was found.")
+    number: int = Field(description="Index in the order of discovery, from 0.")
+    from_frame: str = Field(description="Frame that was queried.")
+    to_frame: str = Field(description="Frame that was found.")
     from_session: str | None
     to_session: str | None
     from_robot: str | None
@@ -101,14 +100,14 @@ class Edge(ApiRecord):
     transform: Transform = Field(description="x_to = matrix @ x_from, between the sensors' frames.")
     information: list[float] | None = Field(
         description="36 numbers, row by row in the order x y z rx ry rz, metres and radians: "
-        "the inverse covariance of an error that follows the transform, along the axes of "
-        "`from_frame`: T_true = matrix @ exp(error)."
+        "inverse covariance of an error along the axes of `from_frame`, applied after the "
+        "transform: T_true = matrix @ exp(error)."
     )
     overlap: float = Field(description="Share of both frames' points that agree.")
     residual_m: float = Field(
-        description="Translation of both directions composed: 0 if they agree."
+        description="Distance between the two directions, metres; 0 if they agree."
     )
-    residual_deg: float
+    residual_deg: float = Field(description="Angle between the two directions, degrees.")
     strength: Literal["strong", "weak"]
     inliers: int = Field(description="Number of points of both frames that agree.")
     ambiguity: float = Field(
@@ -116,23 +115,23 @@ class Edge(ApiRecord):
     )
     similarity: float = Field(description="Similarity of the signatures, 0 to 1.")
     from_pose: Transform | None = Field(
-        default=None, description="Pose of `from_frame`, in its present parent frame."
+        default=None, description="Pose of `from_frame` in its present parent frame."
     )
     to_pose: Transform | None = Field(default=None, description="Pose of `to_frame`.")
-    from_name: str | None = Field(default=None, description="Name of its file.")
-    to_name: str | None = None
+    from_name: str | None = Field(default=None, description="Name of the file of `from_frame`.")
+    to_name: str | None = Field(default=None, description="Name of the file of `to_frame`.")
     consistent: bool | None = Field(
-        description="Whether a second edge supports it. `true`: a loop with a nearby edge from "
-        "another viewpoint closes, or the edge agrees with the join. `false`: it was outvoted, "
-        "and is omitted from graphs and joins. Null: nothing from another viewpoint checks it, "
-        "there are no poses, or the association has not ended."
+        description="Whether other evidence supports the edge. `true`: it closes a loop with a "
+        "nearby edge from another viewpoint, or agrees with the join. `false`: it was outvoted, "
+        "and is omitted from graphs and joins. Null: no other viewpoint checks it, there are no "
+        "poses, or the association has not ended."
     )
-    loops: int | None = Field(description="Number of nearby edges that it was compared with.")
-    closed: int | None = Field(description="Number of these that agree with it.")
+    loops: int | None = Field(description="Number of nearby edges that were compared with it.")
+    closed: int | None = Field(description="Number of these edges that agree with it.")
 
 
 class Join(ApiRecord):
-    """The relative pose of the parent frames of two sessions, by consensus of the edges."""
+    """Transform between the parent frames of two sessions, by consensus of the edges."""
 
     from_session: str
     to_session: str
@@ -141,46 +140,44 @@ class Join(ApiRecord):
     from_parent: str = Field(description="Parent frame of the poses of `from_session`.")
     to_parent: str
     transform: Transform | None = Field(
-        description="x_to = matrix @ x_from, between the parent frames; null if the edges do "
-        "not agree on one."
+        description="x_to = matrix @ x_from, between the parent frames; null if the edges do not "
+        "agree."
     )
     strength: Literal["strong", "weak"] | None = Field(
-        description="`strong` if many edges of several frames agree that extend over more than "
-        "a metre; null without a transform."
+        description="`strong` if many edges of several frames agree and extend over more than a "
+        "metre; null without a transform."
     )
-    support: int = Field(description="Number of edges that agree with it.")
+    support: int = Field(description="Number of edges that agree with the transform.")
     votes: int = Field(
         description="Number of edges between the two parent frames that were not outvoted."
     )
     rival: int = Field(description="Number of edges that agree on the best other transform.")
     spread_m: float | None = Field(
-        description="Root mean square of the differences of the agreeing edges, at their frames."
+        description="Root mean square deviation of the agreeing edges at their frames, metres."
     )
-    spread_deg: float | None
+    spread_deg: float | None = Field(description="The same deviation as an angle, degrees.")
     reason: str
     root: str | None = Field(
         default=None,
-        description="Parent frame that the poses of both are in after the join, the one whose "
-        "frames came first; null if no pose was moved, or the join was undone.",
+        description="Parent frame of all poses after the join, that of the session uploaded first; "
+        "null if no pose was moved or the join was undone.",
     )
     undone: bool = Field(
         default=False,
-        description="Whether poses were moved and moved back: no graph and no automatic "
-        "association joins these parent frames.",
+        description="Whether poses were moved and moved back. Graphs and automatic associations do "
+        "not join these parent frames.",
     )
 
 
 class AssociationResult(ApiRecord):
     """The result of an association."""
 
-    frames: int = Field(description="Number of frames that were looked up.")
-    skipped: int = Field(
-        description="Number of frames that were skipped because they were deleted meanwhile."
-    )
+    frames: int = Field(description="Number of queried frames.")
+    skipped: int = Field(description="Number of skipped frames, which were deleted meanwhile.")
     validated: int = Field(description="Number of pairs of frames that were validated.")
     edges: int = Field(
-        description="Number of accepted pairs: places that look alike. Treat only those that "
-        "are `consistent` as the same place."
+        description="Number of accepted pairs, which look alike. Treat only `consistent` ones as "
+        "the same place."
     )
     consistent: int = Field(
         description="Number of edges that a second edge from another viewpoint, or a join, "
@@ -191,13 +188,13 @@ class AssociationResult(ApiRecord):
         description="Number of edges that no nearby edge confirms or contradicts."
     )
     joins: list[Join] = Field(
-        description="Relative poses of the sessions; of a single session, only if its frames "
-        "have several parent frames."
+        description="Joins of the sessions; for a single session, only if its frames have several "
+        "parent frames."
     )
 
 
 class Association(Product):
-    """An association of sessions: a job with its result. Its steps are frames."""
+    """An association job and its result. Its progress counts frames."""
 
     noun, collection, request_type = "association", "associations", NewAssociation
 
@@ -207,28 +204,28 @@ class Association(Product):
 
 
 class Vertex(ApiRecord):
-    """A frame in a graph."""
+    """A frame in a pose graph."""
 
-    vertex: int = Field(description="Its number in g2o.")
+    vertex: int = Field(description="Number of the vertex in g2o.")
     frame_id: str
     robot: str | None
     session: str | None
     captured_at: datetime | None
     name: str | None = Field(default=None, description="Name of the original file or message.")
-    sequence: int | None = Field(default=None, description="Position in the session.")
+    sequence: int | None = Field(default=None, description="Index in the session.")
     pose: Transform | None = Field(
-        description="In `frame` of the graph if the sessions are joined, else in its own parent "
-        "frame. Null if it has none and no edge leads to a frame with one."
+        description="Pose in `frame` of the graph if the sessions are joined, otherwise in its own "
+        "parent frame. Null without a pose, unless edges lead to a frame with a pose."
     )
 
 
 class GraphEdge(ApiRecord):
-    """A constraint between two vertices, as g2o has it."""
+    """A constraint between two vertices, as in g2o."""
 
     kind: Literal["association", "odometry"]
     first: int
     second: int
-    matrix: list[list[float]] = Field(description="T_first_second, 4 x 4.")
+    matrix: list[list[float]] = Field(description="T_first_second, a 4 x 4 matrix.")
     information: list[float] = Field(
         description="36 numbers, row by row in the order x y z rx ry rz, metres and radians, "
         "along the axes of `second`."
@@ -236,7 +233,7 @@ class GraphEdge(ApiRecord):
 
 
 class Graph(ApiRecord):
-    """A pose graph for an optimiser: poses of frames, and relative poses between them."""
+    """A pose graph for an optimiser: poses of frames, and transforms between them."""
 
     frame: str | None = Field(
         description="Parent frame of joined poses; null if no frame has a pose."
@@ -245,11 +242,11 @@ class Graph(ApiRecord):
     edges: list[GraphEdge]
 
 
-# Two sessions of a map compared: what is gone and what is new.
+# Differences between two sessions of a map.
 
-#: Frames of each session that a comparison uses, at most.
+#: Maximum number of frames of each session in a comparison.
 MOST_COMPARED = 500
-#: What the points of a difference are, by their patch index.
+#: Classes of the points of a difference, in their patch index.
 SAME, GONE, NEW, UNSEEN_AFTER, UNSEEN_BEFORE = 0, 1, 2, 3, 4
 
 
@@ -260,42 +257,42 @@ class NewDifference(Given):
     after: Label = Field(description="The later session.")
     parent_frame: Label | None = Field(
         default=None,
-        description="Compare frames with poses in this parent frame; default: the one that most "
-        "frames of both sessions share.",
+        description="Parent frame of the compared poses; default: the one with the most frames of "
+        "both sessions.",
     )
 
     @model_validator(mode="after")
-    def _sensible(self) -> NewDifference:
+    def _require_two(self) -> NewDifference:
         if self.before == self.after:
-            raise ValueError("after: is the same session as before. Name two sessions")
+            raise ValueError("after: the same session as before. Specify two sessions")
         return self
 
 
 class DifferenceResult(ApiRecord):
-    """Number of cells that both sessions have, and that one of them has."""
+    """Numbers of cells of two sessions by class."""
 
-    same: int = Field(description="Number of cells of `after` that `before` has as well.")
+    same: int = Field(description="Number of cells of `after` that are also in `before`.")
     gone: int = Field(description="Number of cells of `before` that frames of `after` saw through.")
     new: int = Field(description="Number of cells of `after` that frames of `before` saw through.")
     unseen_after: int = Field(
-        description="Number of cells of `before` that `after` does not show: hidden, or out of "
-        "view."
+        description="Number of cells of `before` that `after` does not show, because they are "
+        "hidden or out of view."
     )
     unseen_before: int = Field(
         description="Number of cells of `after` that `before` does not show."
     )
-    cell_m: float = Field(description="Width of a cell.")
+    cell_m: float = Field(description="Width of a cell, metres.")
     parent_frame: str = Field(description="Parent frame of all points.")
     up: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector upwards, in the parent frame."
+        min_length=3, max_length=3, description="Unit vector that points up, in the parent frame."
     )
     frames_before: int = Field(description="Number of frames of `before` that were compared.")
     frames_after: int = Field(description="Number of frames of `after` that were compared.")
-    skipped: int = Field(description="Number of frames that were deleted meanwhile or are damaged.")
+    skipped: int = Field(description="Number of frames that are damaged or were deleted meanwhile.")
 
 
 class Difference(Product):
-    """A comparison of two sessions and its result. Its steps are frames; each is used twice."""
+    """A comparison of two sessions and its result. Its progress counts every frame twice."""
 
     noun, collection, request_type = "difference", "differences", NewDifference
 

@@ -1,4 +1,4 @@
-"""Fused surfaces as JSON: that of a map, and reconstructions of the views of an answer."""
+"""Records of the fused surface of a map, and of reconstructions from the views of an answer."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from sceneprint_client.api.coverage import UpSource
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.query import Named
 
-#: Whether a map has a surface, and whether it is that of all its frames.
+#: State of a map's surface.
 SurfaceState = Literal["none", "building", "ready", "stale"]
-#: Longer side of a picture of a surface, pixels: by default, at least, and at most.
+#: Default, minimum and maximum length of the longer side of a plan, pixels.
 PLAN_WIDTH, PLAN_WIDTHS = 1024, (16, 4096)
 
 
@@ -23,17 +23,17 @@ class SurfaceLevel(ApiRecord):
     """All tiles of a parent frame whose cells have the same width."""
 
     level: int = Field(
-        description="0 has the finest cells; those of each next level are 4 times as wide."
+        description="Level; 0 has the finest cells, and each next level has cells 4 times as wide."
     )
-    cell_m: float = Field(description="Width of a cell.")
-    tile_m: float = Field(description="Width of a tile: 64 cells.")
+    cell_m: float = Field(description="Width of a cell, metres.")
+    tile_m: float = Field(description="Width of a tile (64 cells), metres.")
     tiles: int
     cells: int = Field(description="Number of cells of all tiles.")
     bytes: int
 
 
 class SurfacePlan(ApiRecord):
-    """Position of a parent frame's picture, as `plan.png` shows it without `width`."""
+    """Position of the plan of a parent frame, as in `plan.png` with the default width."""
 
     m_per_pixel: float
     width: int = Field(description="Width, pixels.")
@@ -41,7 +41,7 @@ class SurfacePlan(ApiRecord):
     left: float = Field(
         description="Position of the picture's upper left corner along `x_axis`, metres."
     )
-    top: float = Field(description="Position of that corner along `y_axis`, metres.")
+    top: float = Field(description="Position of the same corner along `y_axis`, metres.")
 
 
 class SurfaceParent(ApiRecord):
@@ -49,10 +49,10 @@ class SurfaceParent(ApiRecord):
 
     parent_frame: str
     frames: int = Field(description="Number of fused frames.")
-    up: Vector = Field(description="Unit vector, in the parent frame.")
+    up: Vector = Field(description="Unit vector that points up, in the parent frame.")
     up_from: UpSource = Field(
-        description="Source of the vertical. `map`: the map's `up`. `frames`: the `up` of its "
-        "frames. `cameras`: estimated, the axis nearest to the upright of the cameras."
+        description="Source of the up axis. `map`: the map's `up`. `frames`: the `up` of its "
+        "frames. `cameras`: an estimate, the axis nearest to the vertical of the camera images."
     )
     x_axis: list[float] = Field(
         min_length=3, max_length=3, description="Unit vector to the right of the plan."
@@ -60,55 +60,54 @@ class SurfaceParent(ApiRecord):
     y_axis: list[float] = Field(
         min_length=3, max_length=3, description="Unit vector to the top of the plan."
     )
-    low: Vector = Field(description="Opposite corners of the box that contains all cells:")
-    high: Vector
-    levels: list[SurfaceLevel] = Field(description="Levels, the finest first.")
+    low: Vector = Field(description="Lowest corner of the box that contains all cells.")
+    high: Vector = Field(description="Highest corner of that box.")
+    levels: list[SurfaceLevel] = Field(description="Levels, finest first.")
     plan: SurfacePlan
 
 
 class MapSurface(ApiRecord):
-    """The fused surface of a map's posed frames, and whether it is up to date."""
+    """The fused surface of a map's frames with poses, and whether it is up to date."""
 
     map: str
     state: SurfaceState = Field(
-        description="`none`: not built. `building`: a job builds it, and existing tiles can be "
-        "read. `ready`: it has all indexed frames with poses. `stale`: frames were added, "
-        "removed or moved since."
+        description="`none`: not built. `building`: a job builds it; existing tiles are available. "
+        "`ready`: it contains all indexed frames with poses. `stale`: frames were added, deleted "
+        "or moved since."
     )
     job_id: str | None = Field(description="Id of the latest job: GET /v1/jobs/{job_id}.")
-    error: str | None = Field(description="Error of that job, if it failed.")
+    error: str | None = Field(description="Error of the latest job, if it failed.")
     frames: int = Field(description="Number of fused frames.")
     frames_left: int = Field(description="Approximate number of frames to add or remove.")
     updated_at: datetime | None = Field(description="Time of the last change of a tile.")
     sessions: list[str] = Field(
-        description="Names of sessions; a cell refers to its session by its index in this list."
+        description="Names of the sessions; a cell has the index of its session in this list."
     )
     first_taken: datetime | None = Field(description="Earliest `captured_at` of the fused frames.")
     last_taken: datetime | None
     taken_from: datetime | None = Field(
-        description="A cell was last seen at `taken_from` plus `taken` times `taken_step_s`. "
-        "Null if no fused frame has `captured_at`."
+        description="Time scale of cells: a cell was last seen at `taken_from` + `taken` * "
+        "`taken_step_s`. Null if no fused frame has `captured_at`."
     )
     taken_step_s: float
     parents: list[SurfaceParent] = Field(
-        description="Surfaces in each parent frame, that with most frames first; at most 20."
+        description="Surface in each parent frame, by number of frames; at most 20."
     )
 
 
 class SurfaceTile(ApiRecord):
-    """A cube of 64 cells along each side."""
+    """A cube of cells, 64 along each side."""
 
     column: int = Field(
-        description="The tile extends from `column` times `tile_m` to `column` + 1 times along "
-        "the x axis of the parent frame."
+        description="Index along the x axis of the parent frame: the tile extends from `column` * "
+        "`tile_m` to (`column` + 1) * `tile_m`."
     )
-    row: int = Field(description="The same along y.")
-    floor: int = Field(description="The same along z.")
+    row: int = Field(description="Index along the y axis, like `column`.")
+    floor: int = Field(description="Index along the z axis, like `column`.")
     cells: int = Field(description="Number of cells that are not empty.")
     bytes: int
     digest: str = Field(
-        description="GET /v1/maps/{map}/surface/tiles/{digest} returns its cells. It changes "
-        "with them."
+        description="Digest of the cells. GET /v1/maps/{map}/surface/tiles/{digest} returns them."
     )
 
 
@@ -122,42 +121,42 @@ class SurfaceSighting(ApiRecord):
     session: str | None
     captured_at: datetime | None
     parent_frame: str
-    position: Vector = Field(description="Position of its sensor in the parent frame.")
+    position: Vector = Field(description="Position of the frame's sensor in the parent frame.")
     distance_m: float | None = Field(
-        description="Distance from its sensor to the point; null for a frame that was taken in "
-        "a box."
+        description="Distance from the sensor to the point, metres; null for a frame that was "
+        "taken in a box."
     )
 
 
-# Reconstructions: what is asked for, and what it came to.
+# Reconstructions.
 
-#: Most views that are fused, the query's own among them.
+#: Maximum number of fused views, including that of the query.
 MOST_VIEWS = 32
 
 
 class NewReconstruction(Given):
-    """Views of an answer to fuse, and the kind of result."""
+    """Options of a reconstruction: views to fuse, and kind of output."""
 
     frames: tuple[Named, ...] | None = Field(
         default=None,
         min_length=1,
         max_length=64,
-        description="Ids of accepted matches; default: all accepted ones, at most the first "
-        f"{MOST_VIEWS - 1} of the ranking.",
+        description="Ids of accepted matches; default: the first accepted matches of the ranking, "
+        f"at most {MOST_VIEWS - 1}.",
     )
     strength: Literal["strong", "any"] = Field(
-        default="any", description="`strong`: exclude matches whose acceptance is weak."
+        default="any", description="`strong`: exclude weak matches."
     )
     include_query: bool = Field(
         default=True,
-        description="Whether to fuse the query itself, as the first view; clouds cannot be fused.",
+        description="Whether to fuse the query as the first view. Clouds cannot be fused.",
     )
     voxel_m: float | None = Field(
         default=None,
         ge=0.002,
         le=0.5,
-        description="Edge of a voxel, metres; default: the spacing of the samples, at least "
-        "0.01, as far as memory allows.",
+        description="Edge of a voxel, metres; default: the spacing of the samples, at least 0.01, "
+        "as far as memory allows.",
     )
     output: Literal["mesh", "cloud"] = Field(
         default="mesh", description="Content of mesh.ply: triangles, or points only."
@@ -167,25 +166,22 @@ class NewReconstruction(Given):
 class FusedView(ApiRecord):
     """One view of a reconstruction."""
 
-    frame_id: str | None = Field(description="Null for the query's own view.")
+    frame_id: str | None = Field(description="Id of the frame; null for the query.")
     map: str | None
-    rank: int | None = Field(description="Place in the ranking R, from 1.")
-    strength: Literal["strong", "weak"] | None = Field(
-        description="Strength of the match's acceptance."
-    )
+    rank: int | None = Field(description="Position in the ranking R, from 1.")
+    strength: Literal["strong", "weak"] | None = Field(description="Strength of the match.")
     source: Literal["upload", "geometry"] = Field(
-        description="`upload`: the depth that was sent. `geometry`: the reduced depth that "
-        "validation compares, used for the query and for lost uploads."
+        description="`upload`: the uploaded depth. `geometry`: the reduced depth that validation "
+        "compares, for the query and for lost uploads."
     )
     samples: int = Field(description="Number of depth samples within the fused range.")
     added_m2: float = Field(
-        description="Area of the surface that this view sees and no earlier view does, square "
-        "metres."
+        description="Area that this view sees and no earlier view does, square metres."
     )
 
 
 class LeftOut(ApiRecord):
-    """A match that was not fused; clouds are not fused, as only depth images carve space."""
+    """A match that was not fused. Clouds cannot be fused, because they do not carve space."""
 
     frame_id: str
     map: str
@@ -193,19 +189,19 @@ class LeftOut(ApiRecord):
 
 
 class Coverage(ApiRecord):
-    """The surface and volume that the views show together, as in the paper's last figure."""
+    """Surface and volume that the views see together, as in the last figure of the paper."""
 
     views: list[FusedView] = Field(
-        description="The views in the order of the ranking, the query first."
+        description="Views in the order of the ranking, the query first."
     )
     left_out: list[LeftOut]
-    area_m2: float = Field(description="Area of the fused surface; the sum of all `added_m2`.")
+    area_m2: float = Field(description="Area of the fused surface, the sum of all `added_m2`.")
     observed_volume_m3: float = Field(
-        description="Volume known to be empty or surface: between the cameras and the surfaces "
-        "that they saw."
+        description="Volume that is known to be empty or surface, between the cameras and the "
+        "surfaces that they saw."
     )
     query_explained: float = Field(
-        description="Share of the query's points that the other views see as well, 0 to 1."
+        description="Share of the query's points that other views also see, 0 to 1."
     )
     voxel_m: float
     points: int
@@ -213,7 +209,7 @@ class Coverage(ApiRecord):
 
 
 class Reconstruction(Product):
-    """A fusion of an answer's views: a job with its result."""
+    """A reconstruction job and its result."""
 
     noun, collection, request_type = "reconstruction", "reconstructions", NewReconstruction
 
@@ -221,10 +217,10 @@ class Reconstruction(Product):
     maps: list[str] = Field(description="Maps of the fused frames.")
     request: NewReconstruction
     parent_frame: str = Field(
-        description="Frame of mesh.ply: that of the query's sensor, metres; of a camera x "
-        "right, y down, z forward."
+        description="Frame of the coordinates in mesh.ply: that of the query's sensor, for a "
+        "camera with x right, y down, z forward."
     )
     result: Coverage | None = Field(
-        description="The result of a job that has succeeded; then GET "
-        "/v1/reconstructions/{job_id}/mesh.ply returns the surface."
+        description="Result of a job that has succeeded. GET "
+        "/v1/reconstructions/{job_id}/mesh.ply then returns the surface."
     )

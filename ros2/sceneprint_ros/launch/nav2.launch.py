@@ -1,7 +1,7 @@
-"""Navigation of Nav2 with the relocaliser: ros2 launch sceneprint_ros nav2.launch.py map:=...
+"""Launch file of Nav2 with the relocaliser: ros2 launch sceneprint_ros nav2.launch.py map:=...
 
-With `amcl:=true` AMCL localises, and the relocaliser gives it its initial pose; else the
-relocaliser alone publishes map -> odom.
+With `amcl:=true`, AMCL localises and the relocaliser publishes its initial pose; otherwise the
+relocaliser publishes map -> odom.
 """
 
 from launch import LaunchDescription
@@ -15,13 +15,13 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def _nav2(name: str, **more: object) -> IncludeLaunchDescription:
-    """A launch file of nav2_bringup."""
+    """Return the action that includes a launch file of nav2_bringup."""
     file = PathJoinSubstitution([FindPackageShare("nav2_bringup"), "launch", name])
     return IncludeLaunchDescription(PythonLaunchDescriptionSource(file), **more)
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Nav2 and the relocaliser, of which one alone publishes map -> odom."""
+    """Return the launch description of Nav2 and the relocaliser; only one publishes map -> odom."""
     own = PathJoinSubstitution([FindPackageShare("sceneprint_ros"), "config", "relocaliser.yaml"])
     amcl, sim = LaunchConfiguration("amcl"), LaunchConfiguration("use_sim_time")
     nav2 = {"use_sim_time": sim, "params_file": LaunchConfiguration("nav2_params_file")}
@@ -31,7 +31,7 @@ def generate_launch_description() -> LaunchDescription:
     yaml = LaunchConfiguration("map")
     return LaunchDescription(
         [
-            DeclareLaunchArgument("map", description="map of nav2_map_server, YAML"),
+            DeclareLaunchArgument("map", description="YAML file of a map for nav2_map_server"),
             DeclareLaunchArgument("params_file", default_value=own),
             DeclareLaunchArgument("nav2_params_file", default_value=nav2_own),
             DeclareLaunchArgument("use_sim_time", default_value="false"),

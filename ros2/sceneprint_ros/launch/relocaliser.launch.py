@@ -1,4 +1,4 @@
-"""The relocaliser alone: ros2 launch sceneprint_ros relocaliser.launch.py params_file:=..."""
+"""Launch file of the node: ros2 launch sceneprint_ros relocaliser.launch.py params_file:=..."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -8,7 +8,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    """One node, its parameters in a file."""
+    """Return the launch description of the node with its parameter file."""
     own = PathJoinSubstitution([FindPackageShare("sceneprint_ros"), "config", "relocaliser.yaml"])
     return LaunchDescription(
         [

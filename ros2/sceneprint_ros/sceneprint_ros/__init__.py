@@ -1,1 +1,1 @@
-"""Nodes of ROS 2 over sceneprint_client."""
+"""ROS 2 nodes on top of sceneprint_client."""

@@ -1,7 +1,6 @@
-"""The node `relocaliser`: a robot's topics to `Relocaliser`, and what it says to other nodes.
+"""The node `relocaliser`: parameters, subscriptions and publishers of the class `Relocaliser`.
 
-What decides anything is in sceneprint_client.relocaliser, which knows no ROS; here are parameters,
-subscriptions and publishers alone.
+All decisions are in sceneprint_client.relocaliser, which does not depend on ROS.
 """
 
 from __future__ import annotations
@@ -37,29 +36,29 @@ from sceneprint_client.relocaliser import (
 from sceneprint_client.ros_messages import is_rectified, topic_without_transport
 from sceneprint_client.tracker import TrackerParameters
 
-#: What `kind` may say of the topic of frames.
+#: Message types of the topic of frames, by the parameter `kind`.
 KINDS = {"depth": Image, "compressed_depth": CompressedImage, "points": PointCloud2}
 
 
 @dataclass(frozen=True)
 class NodeParameters:
-    """Parameters of the node; those of the tracker are called `tracker.NAME` beside them.
+    """Parameters of the node. Those of the tracker are named `tracker.NAME`.
 
     Parameters
     ----------
-    url : of the service
-    key : of its API; empty: that of the environment variable SCENEPRINT_KEY
-    map : its name
-    topic, kind : of the frames: `depth`, `compressed_depth` or `points`
-    camera_info_topic : empty: `camera_info` beside the frames
-    imu_topic, odometry_topic : empty: none
+    url : address of the service
+    key : API key; empty: that of the environment variable SCENEPRINT_KEY
+    map : name of the map in the service
+    topic, kind : topic of the frames, and `depth`, `compressed_depth` or `points`
+    camera_info_topic : topic of the camera info; empty: `camera_info` beside the frames
+    imu_topic, odometry_topic : optional topics; empty: none
     map_frame, odom_frame, base_frame, parent_frame, interval_s, wait_s, stale_s, planar : see
-        RelocaliserParameters; `map_frame` is what `map` is called in messages
-    publish_tf : publish map -> odom while tracking; not beside AMCL, which does so too
-    transform_tolerance_s : how far into the future that transform holds
-    initial_pose_topic : where each fix is published; empty: nowhere
-    rate_hz : of all that is published but diagnostics, of which there is one a second
-    log_file : for `sceneprint_client.tracker.replay`; empty: none
+        RelocaliserParameters; `map_frame` is the name of the map's frame in messages
+    publish_tf : whether to publish map -> odom while tracking; false beside AMCL, which does so
+    transform_tolerance_s : time in the future until which that transform is valid
+    initial_pose_topic : topic of the fixes; empty: none
+    rate_hz : publishing rate of everything except diagnostics, which are published once a second
+    log_file : log for `sceneprint_client.tracker.replay`; empty: none
     """
 
     url: str = DEFAULT_URL
@@ -85,18 +84,18 @@ class NodeParameters:
     log_file: str = ""
 
     def relocaliser(self) -> RelocaliserParameters:
-        """Those of the relocaliser."""
+        """Return the parameters of the relocaliser."""
         names = {one.name for one in fields(RelocaliserParameters)} - {"rectified"}
         values = {name: getattr(self, name) for name in names}
         return RelocaliserParameters(rectified=is_rectified(self.topic), **values)
 
 
 class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
-    """Publishes where the robot is; see README.md for its topics and parameters.
+    """A node that publishes the pose of a robot; see README.md for its topics and parameters.
 
     Raises
     ------
-    SceneprintError : a parameter is missing or none of its kind.
+    SceneprintError : If a parameter is missing or invalid.
     """
 
     def __init__(self) -> None:
@@ -106,8 +105,8 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
         if not self._p.map or not self._p.topic or self._p.kind not in KINDS:
             raise InvalidRequest(
                 f"The parameters map = {self._p.map!r}, topic = {self._p.topic!r} and kind = "
-                f"{self._p.kind!r} name no map, no topic of frames, or none of {', '.join(KINDS)}."
-                " Set them in the launch file or with -p."
+                f"{self._p.kind!r} are not valid: map and topic must not be empty, and kind must "
+                f"be one of {', '.join(KINDS)}. Set them in the launch file or with -p."
             )
         self._client = Client(self._p.url, self._p.key or os.environ.get("SCENEPRINT_KEY") or None)
         self._log: TextIO | None = None
@@ -116,7 +115,7 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
             self._log = path.open("w", buffering=1, encoding="utf-8")
         tracker = Tracker(self._client, self._p.map, parameters=tracking, log=self._log)
         self._core = Relocaliser(tracker, self._p.relocaliser())
-        self._told = ("", 0)
+        self._last_report = ("", 0)
         self._subscribe()
         self._poses = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._fixes = None
@@ -131,7 +130,7 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.create_timer(1.0, self._diagnose)
 
     def _declared(self, kind: type[Any], prefix: str = "") -> dict[str, Any]:
-        """Values of parameters that are named as the fields of a record, and have its defaults."""
+        """Declare parameters with the names and defaults of a record, and return their values."""
         return {
             one.name: self.declare_parameter(prefix + one.name, one.default).value
             for one in fields(kind)
@@ -153,16 +152,16 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
         if p.odometry_topic:
             listen(Odometry, p.odometry_topic, self._core.take_odometry, sensor)
 
-    # What is published.
+    # Publishers.
 
     def _tick(self) -> None:
-        """Go on with frames, and tell where the robot is while that is known."""
+        """Process frames, and publish the pose while it is known."""
         self._core.step()
         report = self._report = self._core.report(self._now_ns())
-        is_new = (report.state.status, report.stamp_ns) != self._told
-        if report.state.status != self._told[0]:
+        is_new = (report.state.status, report.stamp_ns) != self._last_report
+        if report.state.status != self._last_report[0]:
             self.get_logger().info(f"{report.state.status}: {report.state.reason}")
-        self._told = (report.state.status, report.stamp_ns)
+        self._last_report = (report.state.status, report.stamp_ns)
         if report.pose is None:
             return
         if self._p.publish_tf:
@@ -175,7 +174,7 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
             self._fixes.publish(pose)
 
     def _transform(self, pose: TrackedPose, stamp_ns: int) -> Any:
-        """map -> odom: it holds a little into the future, so that nobody has to wait for it."""
+        """Return map -> odom, stamped slightly in the future so that no consumer waits for it."""
         message = TransformStamped()
         tolerance_ns = round(self._p.transform_tolerance_s * 1e9)
         write_stamp(message.header.stamp, stamp_ns + tolerance_ns)
@@ -207,17 +206,17 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
         self._diagnostics.publish(message)
 
     def _relocalise(self, _: Any, response: Any) -> Any:
-        """The service: forget the place, and ask for the next frame at once."""
+        """Forget the pose, and query with the next frame at once."""
         self._core.relocalise()
         response.success = True
-        response.message = "The place is forgotten; the next frame is asked for."
+        response.message = "The pose is forgotten; the next frame will be queried."
         return response
 
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
     def destroy_node(self) -> None:
-        """Ask no more, and go."""
+        """Stop all queries and close the log."""
         self._core.close()
         self._client.close()
         if self._log is not None:
@@ -226,7 +225,7 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until it is stopped; returns 2 where its parameters are none."""
+    """Run the node until it is stopped; return 2 if its parameters are not valid."""
     rclpy.init(args=arguments)
     try:
         node = RelocaliserNode()
