@@ -221,7 +221,7 @@ def test_a_reader_that_leaves_does_not_stop_the_writing(
 
 def test_train_for_another_range(tmp_path: Path) -> None:
     done = run("train", "--out", tmp_path / "m", "--range", "9", "3", expect=2)
-    assert "give the smaller distance first" in done.stderr
+    assert "Put the smaller distance first" in done.stderr
     done = run("train", "--out", tmp_path, "--rooms", 2, expect=2)
     assert "is a folder" in done.stderr
     assert "train: error" in run("train", "--out", "m", "--radius", "-1", expect=2).stderr

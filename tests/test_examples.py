@@ -29,7 +29,7 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
     told = ran.stdout
-    assert "driving: 12 frames are uploaded" in told
+    assert "driving: uploading 12 frames" in told
     room, _, cabinet = told.partition("beside a cabinet that looks the same from behind:")
     assert "  do not drive: " in room
     assert re.search(
@@ -37,14 +37,14 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
     )
     assert room.count("not a place of the map (nothing_alike): explore") == 1
     # both sides are told of each view, half a turn about the cabinet apart, and none is driven on
-    alone, _, believed = cabinet.partition("asked again, and odometry says where it is")
+    alone, _, believed = cabinet.partition("queried again with a prior from odometry")
     assert alone.count("do not drive: ") == 2
     assert "found" not in alone
     sides = [complex(*map(float, one)) for one in re.findall(r"x (\S+), y (\S+) m, support", alone)]
     assert len(sides) == 4
     assert max(abs(sides[i] + sides[i + 1]) for i in (0, 2)) < 0.2
     assert "decided by prior" in believed
-    errors = [float(one) for one in re.findall(r"([\d.]+) cm from where it truly is", told)]
+    errors = [float(one) for one in re.findall(r"position error ([\d.]+) cm", told)]
     assert len(errors) == 2
     assert errors[0] < 5
     assert errors[1] < 10
@@ -67,7 +67,7 @@ def test_a_robot_tracks_itself_and_notices_that_it_was_carried() -> None:
     assert lost <= 4  # 2 s at most
     after = second.splitlines()[lost + 1 :]
     assert all(line.startswith("  tracking: room-1") for line in after)
-    off = [int(one) for one in re.findall(r"(\d+) cm from the truth", first + "".join(after))]
+    off = [int(one) for one in re.findall(r"error (\d+) cm", first + "".join(after))]
     assert len(off) > 8
     assert max(off) < 10
 

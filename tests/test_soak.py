@@ -211,7 +211,7 @@ def search(*matches: tuple[str, int], begun: float = 5.0) -> Search:
     return Search("s0", matches, begun, begun + 0.5)
 
 
-OUT_OF_ORDER = "the matches are not in their order, or one is there twice"
+OUT_OF_ORDER = "the matches are not in order, or one is repeated"
 
 
 @pytest.mark.parametrize(
@@ -219,13 +219,13 @@ OUT_OF_ORDER = "the matches are not in their order, or one is there twice"
     [
         (search(("s1", 16), ("w", 32)), []),
         (search(("s1", 16), ("stranger", 20), ("w", 32)), []),  # not acknowledged before the end
-        (search(("s1", 16), ("w", 33)), ["w at 33, which is not its distance"]),
+        (search(("s1", 16), ("w", 33)), ["w has the wrong distance 33"]),
         (search(("w", 32), ("s1", 16)), [OUT_OF_ORDER]),
         (search(("s1", 16), ("s1", 16)), [OUT_OF_ORDER]),
         (search(("w", 32)), ["s1 at 16 is missing"]),
-        (search(), ["0 matches, where 0 can have been deleted meanwhile"]),
+        (search(), ["0 matches, with at most 0 deletions during the search"]),
         (search(begun=6.8), []),  # one was being deleted
-        (search(("s1", 16), ("w", 32), begun=8.0), ["w is found, and was deleted before"]),
+        (search(("s1", 16), ("w", 32), begun=8.0), ["w was deleted before the search"]),
         (search(("s1", 16), ("w", 32), begun=6.5), []),  # it was being deleted
     ],
 )

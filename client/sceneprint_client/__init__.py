@@ -1,11 +1,11 @@
-"""The client of sceneprint: place recognition from depth frames and point clouds, over HTTP.
+"""Client of sceneprint: place recognition from depth frames and point clouds, over HTTP.
 
     with Client("http://robot-server:8008") as client:  # or Client.embedded("maps")
         client.create_map("warehouse")
         client.upload("warehouse", path, wait_s=10)
         answer = client.query("warehouse", path)
 
-Names are loaded when first used, so that importing the package costs nothing.
+Each name is loaded at its first use, so importing the package is fast.
 """
 
 from __future__ import annotations

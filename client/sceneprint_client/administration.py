@@ -1,4 +1,4 @@
-"""A service as its operator sees it: keys, changes, events, figures, models."""
+"""Client methods for operators: keys, audit log, events, statistics and models."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from sceneprint_client.api.admin import (
 )
 from sceneprint_client.api.base import checked
 from sceneprint_client.errors import InvalidRequest
-from sceneprint_client.http import PAGE, follow_stream, given
+from sceneprint_client.http import PAGE, follow_stream, without_none
 from sceneprint_client.jobs import JobMethods
 
 _EVENTS = "/v1/events"
 
 
 class AdminMethods(JobMethods):
-    """Keys, events, figures and models of a service."""
+    """Client methods for keys, events, statistics and models."""
 
     def create_key(
         self, name: str, grants: Mapping[str, Scope], expires_at: datetime | None = None,
@@ -38,17 +38,17 @@ class AdminMethods(JobMethods):
 
         Parameters
         ----------
-        name : unique name of its user
-        grants : map name to `read`, `write` or `admin`; `*` for all maps
-        expires_at : when it expires, with a time zone; default: never
-        tenant : an existing tenant that owns it; default: a new one with the key's name
+        name : unique name of the key
+        grants : scope for each map name: `read`, `write` or `admin`; `*` selects all maps
+        expires_at : expiry time with a time zone; default: the key does not expire
+        tenant : existing tenant that owns the key; default: a new tenant with the key's name
 
         Raises
         ------
-        InvalidRequest : an invalid name or grant.
-        Conflict : a key of that name exists.
-        UnknownTenant : no such tenant.
-        Forbidden : this client's key does not have `admin` for `*`.
+        InvalidRequest : If the name or a grant is invalid.
+        Conflict : If a key of that name exists.
+        UnknownTenant : If the tenant does not exist.
+        Forbidden : If this client's key does not have `admin` for `*`.
         """
         new = checked(
             NewKey, "The key", name=name, grants=dict(grants), expires_at=expires_at,
@@ -61,83 +61,79 @@ class AdminMethods(JobMethods):
         return list(self._items(Page[Key], "/v1/keys"))
 
     def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
-        """Give a key a new secret, which only the returned record contains.
+        """Replace the secret of a key. Only the returned record contains the new secret.
 
         Parameters
         ----------
-        name : of the key
-        overlap_s : seconds for which the old secret still works, up to 30 days; 0: none.
-            A second call within that time keeps its end, and revokes the secret in between
+        overlap_s : period for which the old secret stays valid, seconds, up to 30 days. A second
+            call within this period does not extend it, and revokes the intermediate secret
 
         Raises
         ------
-        UnknownKey : it does not exist.
-        Forbidden : this client's key does not have `admin` for `*`.
-        InvalidRequest : an invalid overlap.
+        UnknownKey : If the key does not exist.
+        Forbidden : If this client's key does not have `admin` for `*`.
+        InvalidRequest : If the overlap is out of range.
         """
         path = f"/v1/keys/{quote(name, safe='')}/rotate"
         return self._ask(MadeKey, "POST", path, params={"overlap_s": overlap_s})
 
     def revoke_key(self, name: str) -> None:
-        """Revoke a key; UnknownKey if there is none of that name."""
+        """Revoke a key; raise UnknownKey if it does not exist."""
         self._delete(f"/v1/keys/{quote(name, safe='')}")
 
     def me(self) -> Me:
-        """What this client's key may do."""
+        """Return the permissions of this client's key."""
         return self._ask(Me, "GET", "/v1/keys/me")
 
     def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[AuditLine]:
-        """Who changed what, newest first.
+        """Yield the entries of the audit log, newest first.
 
         Parameters
         ----------
-        actor : name of the key that made the changes; default: any, or none
-        map_name : the map that was changed; default: any, or none
+        actor : name of the key that made the changes; None selects all changes
+        map_name : name of the changed map; None selects all changes
         """
         return self._items(Page[AuditLine], "/v1/audit", actor=actor, map=map_name)
-
-    # events and figures
 
     def events(
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         follow: bool = True,
     ) -> Iterator[Event]:  # fmt: skip
-        """Events in order: those that are kept, then new ones as they happen.
+        """Yield events in order: first stored events, then new ones as they occur.
 
-        A broken stream is resumed where it broke, however long that takes: no event is
-        lost or repeated. If events are no longer kept, one of the kind
-        `events.missed` replaces them.
+        The client reconnects after a broken stream without losing or repeating an event. If the
+        service no longer stores some of them, one event `events.missed` replaces these.
 
         Parameters
         ----------
-        map_name : only of this map
+        map_name : name of a map whose events are returned; default: all maps
         kinds : prefixes of the kinds to return, such as `frame.`; default: all
-        after : return events after this id; "0": all that are kept. Default: all that are kept,
-            or with `follow` only new ones
-        follow : wait for new events forever; else end with the last kept one
+        after : id of the event before the first one to return; "0" starts with the oldest stored
+            event. Default: "0", or with `follow` only new events
+        follow : whether to wait for new events without end
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : an invalid kind, or an id that is no event's.
-        Unreachable : the service did not answer the first request.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If a kind is invalid, or no event has this id.
+        Unreachable : If the service did not answer the first request.
         """
         if follow:
-            wanted = given(map=map_name, kind=list(kinds))
-            return follow_stream(lambda last: self._open_stream(_EVENTS, last, wanted), after)
+            parameters = without_none(map=map_name, kind=list(kinds))
+            return follow_stream(lambda last: self._open_stream(_EVENTS, last, parameters), after)
         return self._kept_events(map_name, kinds, after)
 
     def event_page(
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         cursor: str | None = None, limit: int = 100, newest_first: bool = True,
     ) -> EventPage:  # fmt: skip
-        """Return a page of kept events, newest first; `cursor` comes from the page before."""
-        asked = given(
+        """Return a page of stored events; `cursor` is the `next_cursor` of the page before."""
+        parameters = without_none(
             map=map_name, kind=list(kinds), after=after, cursor=cursor, limit=limit,
             order="newest" if newest_first else "oldest",
         )  # fmt: skip
         headers = {"Accept": "application/json"}
-        return self._ask(EventPage, "GET", _EVENTS, params=asked, headers=headers)
+        return self._ask(EventPage, "GET", _EVENTS, params=parameters, headers=headers)
 
     def _kept_events(
         self, map_name: str | None, kinds: Sequence[str], after: str | None
@@ -153,20 +149,21 @@ class AdminMethods(JobMethods):
                 return
 
     def stats(self, map_name: str | None = None, *, minutes: int = 60) -> Stats:
-        """Statistics of the service or one map, now and for up to 60 minutes.
+        """Return statistics of the service or one map, and their history of up to 60 minutes.
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : too many minutes, or none.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If `minutes` is out of range.
         """
         if not 1 <= minutes <= 60:
             raise InvalidRequest(
-                f"{minutes} minutes of history were asked for. Give 1 to 60.",
-                (("minutes", "out of its range"),),
+                f"A history of {minutes} minutes was requested. Pass 1 to 60 minutes.",
+                (("minutes", "out of range"),),
             )
-        return self._ask(Stats, "GET", "/v1/stats", params=given(minutes=minutes, map=map_name))
+        parameters = without_none(minutes=minutes, map=map_name)
+        return self._ask(Stats, "GET", "/v1/stats", params=parameters)
 
     def models(self) -> list[ModelInfo]:
-        """Models for maps: those that ship, and those that maps have or had."""
+        """Return the models that ship with the service, and those that its maps use or used."""
         return self._ask(Page[ModelInfo], "GET", "/v1/models").items

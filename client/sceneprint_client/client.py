@@ -1,4 +1,4 @@
-"""The client robots use."""
+"""Synchronous client of a service."""
 
 from __future__ import annotations
 
@@ -22,43 +22,43 @@ from sceneprint_client.uploads import UploadMethods
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-#: Silence that the service in this process may keep, seconds: it is not measured.
+#: Timeout of requests to a service in this process, seconds.
 _EMBEDDED_S = 60.0
-#: What the service in this process is called in messages.
+#: URL in error messages of a service in this process.
 _EMBEDDED_URL = "http://embedded"
-#: Longest silence that a service may keep and be called healthy, seconds.
+#: Timeout of a health check, seconds.
 _HEALTHY_S = 5.0
 
 
 class Status(ApiRecord):
-    """How a service is."""
+    """State of a service."""
 
     version: str
     frames: dict[str, int] | None = Field(
-        description="How many frames of all maps are in each state; None where the key may not "
+        description="Number of frames in each state, over all maps; None if the key may not "
         "read all maps."
     )
     jobs: dict[str, int] | None = Field(
-        description="How many jobs are in each state that has any; None as `frames`."
+        description="Number of jobs in each state; None if the key may not read all maps."
     )
-    read_only: bool = Field(default=False, description="Whether it answers, and takes nothing.")
+    read_only: bool = Field(default=False, description="Whether the service rejects all changes.")
 
 
 class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMethods):
     """Maps, frames and queries of a service; safe to share between threads.
 
-    Brief faults of the network and of a busy service are waited out; uploading twice is safe,
-    as the same frame is kept once.
+    Requests are repeated after brief failures and while the service is busy. Repeating an upload
+    is safe, since a map stores the same frame only once.
 
     Parameters
     ----------
-    url : of the service
-    key : where it asks for one
-    timeout_s : longest silence of the service
+    url : address of the service
+    key : key of the API; None if the service requires none
+    timeout_s : longest time without data from the service
 
     Raises
     ------
-    Unreachable : the address is none; whether anybody answers there, the first call tells.
+    Unreachable : If the URL is invalid. The first request shows whether a service answers.
     """
 
     def __init__(
@@ -68,28 +68,28 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
 
     @classmethod
     def embedded(cls, path: str | Path) -> Self:
-        """Return a client without a service: everything runs in this process, on a data folder.
+        """Return a client that runs the whole service in this process, on a data folder.
 
-        Frames are signed in this process, while you wait for them (`wait`, or
-        `upload` with `wait_s`). Everything is in the folder, whatever SCENEPRINT_DATABASE_URL
-        says, and `sceneprint serve --data` may serve it at the same time. Until you close it,
-        BLAS and OpenMP use one thread in this process, so that sums have one order.
+        Frames are signed in this process while you wait for them (`wait`, or `upload` with
+        `wait_s`). All data is in the folder, and SCENEPRINT_DATABASE_URL has no effect.
+        `sceneprint serve --data` may use the folder at the same time. Until you close the client,
+        BLAS and OpenMP use one thread, which makes floating-point sums reproducible.
 
         Parameters
         ----------
-        path : the folder, created if missing
+        path : data folder, created if missing
 
         Raises
         ------
-        UnusableStore, NewerSchema : the folder cannot be opened.
-        MissingDependency : only the client is installed, not sceneprint.
+        UnusableStore, NewerSchema : If the folder cannot be opened.
+        MissingDependency : If only the client is installed, not sceneprint.
         """
         if find_spec("sceneprint") is None:
             raise MissingDependency(
                 "Client.embedded runs the service in this process, and its package is not "
                 "installed. Run: pip install sceneprint"
             )
-        # by name: this package depends on nothing of ours, and loads it for those alone who ask
+        # The client has no dependency on the service, so its package is imported by name.
         service = import_module("service.embedded").LocalService(Path(path))
         client = cls.__new__(cls)
         ServiceConnection.__init__(client, _EMBEDDED_URL, None, _EMBEDDED_S, service, service)
@@ -109,7 +109,7 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
         return self._ask(Status, "GET", "/readyz")
 
     def healthy(self) -> bool:
-        """Return whether the service answers; asks once, with a short timeout."""
+        """Return whether the service answers one request within a short timeout."""
         try:
             timeout = min(self._timeout_s, _HEALTHY_S)
             response = self._http.get("/healthz", timeout=timeout)

@@ -1,80 +1,81 @@
-"""Everything that a client of sceneprint raises on purpose, and the base of all its errors.
+"""All errors that a client of sceneprint raises deliberately, with their common base.
 
     SceneprintError
-      x FrameError              the caller's frame cannot be used; trying again cannot help
+      x FrameError              the caller's frame is invalid; a retry cannot help
         - UnreadableFrame       its bytes do not decode to a depth image
         - UnreadableCloud       its bytes do not decode to a point cloud
-        - InvalidIntrinsics     its camera is not a camera
+        - InvalidIntrinsics     its intrinsics do not describe a camera
         - InvalidPose           its pose is not a rigid transform
-        - UselessFrame          it decodes, but there is nothing in it to sign
-        - UnreadableArchive     a file of many frames that is none, or is not safe to read
-      x DatasetError            a folder or file that is no sequence of frames
+        - UselessFrame          it decodes, but has no surface to sign
+        - UnreadableArchive     a file of many frames is not an archive, or is unsafe to read
+      x DatasetError            a folder or file is not a sequence of frames
       x ModelError
-        - UnreadableModel       a model file that is none, or of another schema
+        - UnreadableModel       a file is not a model, or has another schema
         - ModelMismatch         signatures or artifacts of two models were compared
-      x UnreadableGeometry      a geometry artifact that is missing, damaged or of another schema
-      x NotFound                there is no such map, frame or job
+      x UnreadableGeometry      a geometry artifact is missing, damaged or has another schema
+      x NotFound                the requested object does not exist
         - UnknownMap, UnknownFrame, UnknownSession, UnknownJob, UnknownQuery
         - UnknownKey            there is no key of that name
         - UnknownTenant         there is no tenant of that name
-        - UnknownDeletion       there is no deletion that could be undone
-      x Conflict                the request contradicts what is there
-        - MapExists             a map of that name, made otherwise
-        - FrameConflict         the same content with other metadata
-        - JobOver               a job that is over cannot be cancelled
-        - CannotRetry           a job that cannot be tried again
-        - JoinStands            poses follow from the join of an association, which has to stay
-        - NotIndexed            a frame or job that has not made yet what is asked of it
-      x InvalidRequest          a field of a request is missing, unknown or out of its range
-        - MalformedBody         its body cannot be parsed at all
-        - UnsupportedType       its body is of a type that is not read
-        - TooLarge              its body is larger than the service takes
-        - SlowBody              its body came too slowly
+        - UnknownDeletion       there is no such deletion, or it can no longer be undone
+      x Conflict                the request contradicts stored data
+        - MapExists             a map of that name has other properties
+        - FrameConflict         the same content has other metadata
+        - JobOver               a finished job cannot be cancelled
+        - CannotRetry           a job cannot be retried
+        - JoinStands            poses depend on the join of an association
+        - NotIndexed            the result of a frame or job does not exist yet
+      x InvalidRequest          a field of a request is missing, unknown or out of range
+        - MalformedBody         its body cannot be parsed
+        - UnsupportedType       the operation does not read bodies of this type
+        - TooLarge              its body exceeds the limit of the service
+        - SlowBody              its body arrived too slowly
         - AmbiguousKey          it has more than one Authorization header
-        - IdempotencyConflict   its Idempotency-Key was used for something else
-      x PreconditionFailed      what is to be edited has been edited meanwhile
-      x KeyRequired             the service asks for a key, and none or a wrong one was given
-      x Forbidden               the key that was shown may not do this
-      x QuotaExceeded           the map holds as many frames or bytes as its quota allows
-      x RateLimited             this caller asks too often; come back
-      x Misdirected             the request is meant for another host than this machine
+        - IdempotencyConflict   its Idempotency-Key was used for another request
+      x PreconditionFailed      the object was edited after the caller read it
+      x KeyRequired             the service requires a key; it is missing or invalid
+      x Forbidden               the key lacks the required scope
+      x QuotaExceeded           the map has reached its quota of frames or bytes
+      x RateLimited             the caller sends too many requests; retry later
+      x Misdirected             the request is addressed to another host
       x ForeignOrigin           a page of another host sent the request
-      x Busy                    as many requests wait as may; come back
+      x Busy                    the queue of requests is full; retry later
       x StoreError
         - UnusableStore         the folder or database cannot be opened or written
-          - StoreFull           the disk has no room for what should be stored
-          - ReadOnlyStore       the folder or database may be read, and not written
-          - StoreLocked         another process has kept the database from writers for long
+          - StoreFull           the disk is full
+          - ReadOnlyStore       the folder or database is read-only
+          - StoreLocked         another process has locked the database for too long
         - NewerSchema           a later version of sceneprint wrote it
-        - DamagedBlob           stored bytes are missing or are not those that were stored
-        - DamagedSignature      a stored signature's checksum does not fit
-      x ServiceError            what a client is told by, or of, a service
-        - Unreachable           no answer came
+        - DamagedBlob           stored bytes are missing or damaged
+        - DamagedSignature      the checksum of a stored signature does not match
+      x ServiceError            a service refused a request or is unreachable
+        - Unreachable           the service did not answer
         - Refused               the answer is a problem document
-      x MissingDependency       an optional part of the machine is absent
+      x MissingDependency       an optional library is missing
+
+A message says what happened, why, and what to do. Commands print it on one line and exit with
+code 2. `ValueError` and `TypeError` indicate mistakes in the calling program.
 
 A message says what happened, why, and what to do. Commands print it on one line
-and end with exit code 2. `ValueError` and `TypeError` stay what they are in Python:
-a mistake of the programmer who calls.
 """
 
 import re
 
 
 def kebab_case(name: str) -> str:
-    """The name of a class as it stands in the type of a problem: UnknownMap is unknown-map."""
+    """Return the name of a class as in the type of a problem: UnknownMap becomes unknown-map."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
 
 
 class SceneprintError(Exception):
-    """Base of every error raised on purpose."""
+    """Base of every error that is raised deliberately."""
 
-    #: Seconds after which a service asked to come back (`Retry-After`); 0 if it did not ask.
+    #: Seconds after which the service requests a retry (`Retry-After`); 0 if it sent none.
     retry_after_s: float = 0.0
 
 
 def printable(text: str) -> str:
-    """A text from outside as it can stand in a line: names in damaged files may be anything."""
+    """Return an external text as one printable line; names in damaged files may hold any bytes."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
@@ -99,11 +100,11 @@ class InvalidPose(FrameError):
 
 
 class UselessFrame(FrameError):
-    """The frame decodes, but holds nothing that can be signed."""
+    """The frame decodes, but has no surface to sign."""
 
 
 class UnreadableArchive(FrameError):
-    """The bytes are not an archive of frames, or are not safe to read."""
+    """The bytes are not an archive of frames, or are unsafe to read."""
 
 
 class DatasetError(SceneprintError):
@@ -127,7 +128,7 @@ class UnreadableGeometry(SceneprintError):
 
 
 class NotFound(SceneprintError):
-    """What the request names does not exist."""
+    """The object that the request names does not exist."""
 
 
 class UnknownMap(NotFound):
@@ -175,15 +176,15 @@ class FrameConflict(Conflict):
 
 
 class JobOver(Conflict):
-    """The job is over, and cannot be cancelled any more."""
+    """The job has ended, so it cannot be cancelled."""
 
 
 class CannotRetry(Conflict):
-    """The job is not over, its frame has a later job, or there is nothing to retry."""
+    """The job has not ended, its frame has a later job, or there is nothing to retry."""
 
 
 class JoinStands(Conflict):
-    """The poses of a map follow from the join of an association, which has to stay."""
+    """The poses of a map depend on the join of an association, which cannot be deleted yet."""
 
 
 class NotIndexed(Conflict):
@@ -195,12 +196,12 @@ class PreconditionFailed(SceneprintError):
 
 
 class InvalidRequest(SceneprintError):
-    """A field of a request is missing, unknown or out of its range.
+    """A field of a request is missing, unknown or out of range.
 
     Parameters
     ----------
-    message : what, why, and what to do
-    fields : (place, reason) of each field at fault
+    message : description of what happened, why, and what to do
+    fields : (place, reason) of each invalid field
     """
 
     def __init__(self, message: str, fields: tuple[tuple[str, str], ...] = ()) -> None:
@@ -213,15 +214,15 @@ class MalformedBody(InvalidRequest):
 
 
 class UnsupportedType(InvalidRequest):
-    """The body of a request has a type that the operation does not read."""
+    """The operation does not read request bodies of this type."""
 
 
 class TooLarge(InvalidRequest):
-    """The body of a request is larger than the service takes."""
+    """The body of a request exceeds the limit of the service."""
 
 
 class SlowBody(InvalidRequest):
-    """The body of a request came too slowly."""
+    """The body of a request arrived too slowly."""
 
 
 class AmbiguousKey(InvalidRequest):
@@ -229,29 +230,29 @@ class AmbiguousKey(InvalidRequest):
 
 
 class IdempotencyConflict(InvalidRequest):
-    """The request's Idempotency-Key was used for another one."""
+    """The Idempotency-Key of the request was used for another request."""
 
 
 class KeyRequired(SceneprintError):
-    """The service requires a key, and the request has none, or one that is unknown, revoked or
+    """The service requires a key, and that of the request is missing, unknown, revoked or
     expired.
     """
 
 
 class Forbidden(SceneprintError):
-    """The key of the request lacks the scope for it."""
+    """The key of the request lacks the required scope."""
 
 
 class QuotaExceeded(SceneprintError):
-    """The map holds as many frames, or bytes of uploads, as its quota allows."""
+    """The map has reached its quota of frames or of uploaded bytes."""
 
 
 class RateLimited(SceneprintError):
-    """The caller sends more requests than it may."""
+    """The caller exceeds its request rate."""
 
 
 class Misdirected(SceneprintError):
-    """The request is meant for another host than this machine."""
+    """The request is addressed to another host."""
 
 
 class ForeignOrigin(SceneprintError):
@@ -259,7 +260,7 @@ class ForeignOrigin(SceneprintError):
 
 
 class Busy(SceneprintError):
-    """The queue of waiting requests is full."""
+    """The queue of requests is full."""
 
 
 class StoreError(SceneprintError):
@@ -271,7 +272,7 @@ class UnusableStore(StoreError):
 
 
 class StoreFull(UnusableStore):
-    """The disk has no room for what should be stored."""
+    """The disk is full."""
 
 
 class ReadOnlyStore(UnusableStore):
@@ -283,27 +284,27 @@ class StoreLocked(UnusableStore):
 
 
 class StoreAway(UnusableStore):
-    """The server of the database, or of the blobs, does not answer, or the connection was lost."""
+    """The database or blob server does not answer, or the connection was lost."""
 
 
 class NewerSchema(UnusableStore):
-    """A later version of sceneprint wrote the database, and this one may not write to it."""
+    """A later version of sceneprint wrote the database, so this version must not write to it."""
 
 
 class DamagedBlob(StoreError):
-    """Stored bytes are missing, or are not those that were stored."""
+    """Stored bytes are missing or damaged."""
 
 
 class DamagedSignature(StoreError):
-    """A stored signature differs from the one that was stored."""
+    """The checksum of a stored signature does not match."""
 
 
 class ServiceError(SceneprintError):
-    """A service refused a request, or could not be reached."""
+    """A service refused a request or could not be reached."""
 
 
 class Unreachable(ServiceError):
-    """No answer came from the service."""
+    """The service did not answer."""
 
 
 class Refused(ServiceError):
@@ -311,9 +312,9 @@ class Refused(ServiceError):
 
     Parameters
     ----------
-    message : its detail
-    status : of HTTP
-    problem : the document
+    message : `detail` of the problem document
+    status : HTTP status
+    problem : problem document
     """
 
     def __init__(self, message: str, status: int, problem: dict[str, object]) -> None:
@@ -323,4 +324,4 @@ class Refused(ServiceError):
 
 
 class MissingDependency(SceneprintError):
-    """A library that this task needs cannot be imported on this machine."""
+    """A library that this operation needs cannot be imported."""

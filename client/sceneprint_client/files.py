@@ -1,7 +1,7 @@
-"""Files of frames: their content up to a limit, headers of NPY files, and messages of ROS 2.
+"""Readers of whole files up to a size limit, of NPY headers, and of ROS 2 messages.
 
 path  --read_bytes | read_text | read_object-->  content
-bytes  --npy_header-->  NpyHeader: type, shape, order, where the numbers begin
+bytes  --npy_header-->  NpyHeader: type, shape, order, offset of the numbers
 bytes  --read_point_cloud-->  SerializedCloud
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 from sceneprint_client.api.base import MAXIMUM_SAMPLES
 from sceneprint_client.errors import FrameError, SceneprintError, UnreadableCloud
 
-#: Bytes that are read at once.
+#: Number of bytes in one read.
 _PIECE = 1 << 20
 
 
@@ -31,36 +31,36 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
 
     Parameters
     ----------
-    path : the file
-    limit : bytes; a larger file is refused unread
-    error : what to raise
+    path : path of the file
+    limit : greatest accepted size, bytes; a larger file is rejected unread
+    error : class of the error to raise
 
     Raises
     ------
-    error : the file is absent, is no regular file (a pipe could wait for ever), is too
-        large, or may not be read.
+    error : If the file is missing, is not a regular file (reading a pipe could block forever),
+        is too large, or is not readable.
     """
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise error(f"{path}: This is no regular file. Name a file that holds the data.")
+            raise error(f"{path}: This is not a regular file. Specify a file that holds the data.")
         with path.open("rb") as file:
             data = _read_some(file, limit + 1)
-    except (OSError, ValueError) as cause:  # ValueError: a NUL in the name
+    except (OSError, ValueError) as cause:  # A NUL in the path raises ValueError.
         reason = getattr(cause, "strerror", None) or cause
         raise error(
-            f"{path}: The file cannot be read ({reason}). Check its name and your rights."
+            f"{path}: The file cannot be read ({reason}). Check its path and its permissions."
         ) from cause
     if len(data) > limit:
         raise error(
-            f"{path}: The file has more than {limit} bytes, the most that is read. "
-            "Check that it is the file you meant."
+            f"{path}: The file has more than {limit} bytes, the limit for this kind of file. "
+            "Check that it is the right file."
         )
     return data
 
 
 def _read_some(file: BinaryIO, most: int) -> bytes:
-    """Return at most so many bytes; `file.read(most)` would allocate as many for a file of ten."""
+    """Return at most `most` bytes; `file.read(most)` would allocate `most` bytes at once."""
     pieces, left = [], most
     while piece := file.read(min(left, _PIECE)):
         pieces.append(piece)
@@ -69,13 +69,13 @@ def _read_some(file: BinaryIO, most: int) -> bytes:
 
 
 def read_text(path: Path, limit: int, error: type[SceneprintError]) -> str:
-    """Return a UTF-8 text file of at most `limit` bytes; raises as `read_bytes`."""
+    """Return a UTF-8 text file of at most `limit` bytes; see `read_bytes` for the errors."""
     try:
         return read_bytes(path, limit, error).decode("utf-8-sig")
     except UnicodeDecodeError as cause:
         raise error(
-            f"{path}: The file is no text ({cause.reason} at byte {cause.start}). "
-            "Check that it is the file you meant."
+            f"{path}: The file is not UTF-8 text ({cause.reason} at byte {cause.start}). "
+            "Check that it is the right file."
         ) from cause
 
 
@@ -87,11 +87,11 @@ def read_object(
     Parameters
     ----------
     path, limit, error : see `read_text`
-    example : what such a file looks like, for errors
+    example : example of such a file for error messages
 
     Raises
     ------
-    SceneprintError : as `read_text`; or it is no JSON, or no object. It names the file.
+    error : If the file cannot be read or does not hold a JSON object. The message names the file.
     """
     text = read_text(path, limit, error)
     with naming(str(path)):
@@ -100,56 +100,56 @@ def read_object(
         except (ValueError, RecursionError) as cause:
             raise error(f"This is not JSON ({cause}). Write it such as {example}.") from cause
         if not isinstance(fields, dict):
-            raise error(f"This is no JSON object. Write it such as {example}.")
+            raise error(f"This is not a JSON object. Write an object such as {example}.")
     return fields
 
 
 def data_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield number and content of the lines that are neither empty nor a # comment."""
+    """Yield number and content of each line that is neither empty nor a # comment."""
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.strip()
         if content and not content.startswith("#"):
             yield number, content
 
 
-#: Longest files of a depth image and of points that are read, bytes.
+#: Greatest size of a file of a depth image and of a file of points, bytes.
 MAXIMUM_IMAGE_BYTES = 8 * MAXIMUM_SAMPLES + 65_536
 MAXIMUM_CLOUD_BYTES = 512 << 20
 
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 NPY_SIGNATURE = b"\x93NUMPY"
-_MAXIMUM_HEADER = 10_000  #: bytes, as in numpy; a literal that long can still be parsed safely
+_MAXIMUM_HEADER = 10_000  #: bytes, as in numpy; parsing a literal of this length is safe
 _FLOATING = ("<f4", "<f8", "<f2", ">f4", ">f8", ">f2")
 _WHOLE = ("<u2", ">u2")
 
 
 @dataclass(frozen=True)
 class NpyHeader:
-    """What an NPY file says of itself: an array of two dimensions, floating or uint16."""
+    """Header of an NPY file with a two-dimensional array of floating-point or uint16 numbers."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, int]
     order: Literal["C", "F"]
-    start: int  #: of its numbers, bytes
+    start: int  #: offset of the numbers, bytes
 
 
 def npy_header(
     data: bytes, error: type[FrameError], advice: str, shapes: str, *, whole: bool = False
 ) -> NpyHeader:
-    """Return the header of an NPY file of floating numbers in rows and columns.
+    """Return the header of an NPY file with a two-dimensional floating-point array.
 
     Parameters
     ----------
     data : the file, or its first 10,016 bytes
-    error : to raise
-    advice : what to write instead of an array of another type; a sentence
-    shapes : what to write instead of one of another shape; two sentences
-    whole : take uint16 too
+    error : class of the error to raise
+    advice : sentence for the error if the array has another type
+    shapes : sentences for the error if the array has another shape
+    whole : whether to accept uint16 too
 
     Raises
     ------
-    error : it cannot be read, or is of another type or shape.
+    error : If the header cannot be read, or the array has another type or shape.
     """
     fields, start = _fields(data, error)
     dtype = _dtype(fields["descr"], error, advice, _FLOATING + _WHOLE if whole else _FLOATING)
@@ -164,7 +164,7 @@ def npy_header(
 
 
 def _fields(data: bytes, error: type[FrameError]) -> tuple[dict[str, object], int]:
-    """Return the header and the place where the numbers begin."""
+    """Return the header and the offset of the numbers."""
     damaged = "The header of the NPY file cannot be read. Write the file with numpy.save."
     size = {1: 2, 2: 4, 3: 4}.get(data[6]) if len(data) >= 12 else None
     if size is None:
@@ -173,8 +173,8 @@ def _fields(data: bytes, error: type[FrameError]) -> tuple[dict[str, object], in
     start = 8 + size + length
     if length > _MAXIMUM_HEADER or start > len(data):
         raise error(
-            f"The NPY header announces {length} bytes of itself, more than it has or may have "
-            f"({_MAXIMUM_HEADER}). Copy or write the file again."
+            f"The NPY header claims a length of {length} bytes, which exceeds the file or the "
+            f"limit ({_MAXIMUM_HEADER}). Copy or write the file again."
         )
     try:
         header = ast.literal_eval(data[8 + size : start].decode("utf-8").strip())
@@ -195,7 +195,7 @@ def _dtype(
             "The NPY file holds pickled Python objects, which could run code. "
             "Write a plain float32 array in metres."
         )
-    # compared, not parsed: np.dtype would take almost anything
+    # The type is compared, not parsed, since np.dtype accepts almost any text.
     if not isinstance(described, str) or described not in types:
         raise error(
             f"The NPY file holds {described if isinstance(described, str) else 'records'!r:.40}, "
@@ -207,13 +207,13 @@ def _dtype(
 LAS_SIGNATURE = b"LASF"
 
 
-# Messages of ROS 2 as its middleware serialises them: PointCloud2 in CDR, of either byte order.
+# ROS 2 messages in the serialisation of its middleware: PointCloud2 in CDR, either byte order.
 
-#: Bytes of the encapsulation: kind and options; positions are aligned from its end.
+#: Length of the encapsulation header, bytes; alignment counts from its end.
 _HEAD = 4
-#: Longest name of a frame or a field, bytes; and most fields of a point.
+#: Greatest length of a frame's or field's name, bytes, and greatest number of fields of a point.
 _LONGEST_NAME, _MOST_FIELDS = 255, 64
-#: Most bytes after the message: middleware fills up to whole words.
+#: Greatest number of bytes after the message: middleware pads to whole words.
 _MOST_PADDING = 7
 
 
@@ -229,16 +229,16 @@ class SerializedField:
 
 @dataclass(frozen=True, eq=False)
 class SerializedCloud:
-    """A sensor_msgs/PointCloud2, whose data are a view of the bytes that it was read from.
+    """A sensor_msgs/PointCloud2 whose data is a view of the serialised bytes.
 
-    Names are those of ROS, so that it may stand where a message does.
+    Attributes have the names of ROS, so an instance can replace a message.
 
     Parameters
     ----------
     stamp_ns : nanoseconds
-    frame_id : of the sensor
-    height, width, point_step, row_step, is_bigendian, fields, data : as ROS has them; whether they
-        fit each other has not been looked at
+    frame_id : frame of the sensor
+    height, width, point_step, row_step, is_bigendian, fields, data : as in the message, without a
+        check that they are consistent
     """
 
     stamp_ns: int
@@ -253,16 +253,16 @@ class SerializedCloud:
 
 
 def read_point_cloud(data: bytes) -> SerializedCloud:
-    """Return the message of a serialised PointCloud2; takes no memory beside its bytes.
+    """Return the message of a serialised PointCloud2 without copying its data.
 
     Raises
     ------
-    UnreadableCloud : the bytes are no such message, end early, or go on after it.
+    UnreadableCloud : If the bytes are not such a message, are truncated, or have trailing data.
     """
     if not _is_encapsulated(data):
         raise UnreadableCloud(
-            "This is no serialised PointCloud2: its first bytes are not those of CDR. Send what "
-            "rclpy.serialization.serialize_message gives."
+            "This is not a serialised PointCloud2: its first bytes are not those of CDR. Send the "
+            "output of rclpy.serialization.serialize_message."
         )
     reader = _Reader(data)
     stamp_ns, frame_id, height, width = _read_header(reader)
@@ -270,10 +270,10 @@ def read_point_cloud(data: bytes) -> SerializedCloud:
     is_bigendian = reader.byte() != 0
     point_step, row_step, size = reader.word(), reader.word(), reader.word()
     points = reader.bytes(size)
-    reader.byte()  # is_dense: points that are missing are found anyway
+    reader.byte()  # is_dense is ignored: missing points are detected by their values
     if reader.left > _MOST_PADDING:
         raise UnreadableCloud(
-            f"{reader.left} bytes follow the end of the PointCloud2, so it is damaged or of "
+            f"{reader.left} bytes follow the end of the PointCloud2, so it is damaged or has "
             "another type. Serialise it again."
         )
     return SerializedCloud(
@@ -282,16 +282,16 @@ def read_point_cloud(data: bytes) -> SerializedCloud:
 
 
 def _is_encapsulated(data: bytes) -> bool:
-    """Whether bytes begin as plain CDR does: 0, byte order, and options that only say padding."""
+    """Return whether bytes begin as plain CDR: 0, byte order, and options with only padding."""
     return len(data) >= _HEAD and data[0] == 0 and data[1] <= 1 and data[2] == 0 and data[3] <= 3
 
 
 def _read_header(reader: _Reader) -> tuple[int, str, int, int]:
-    """Stamp in nanoseconds, frame, height and width."""
+    """Return stamp in nanoseconds, frame, height and width."""
     seconds, nanoseconds = reader.word(), reader.word()
     if nanoseconds >= 1_000_000_000:
         raise UnreadableCloud(
-            f"The stamp of the PointCloud2 has {nanoseconds} nanoseconds, so it is damaged or of "
+            f"The stamp of the PointCloud2 has {nanoseconds} nanoseconds, so it is damaged or has "
             "another type. Serialise it again."
         )
     return seconds * 1_000_000_000 + nanoseconds, reader.text(), reader.word(), reader.word()
@@ -301,8 +301,8 @@ def _read_fields(reader: _Reader) -> tuple[SerializedField, ...]:
     count = reader.word()
     if count > _MOST_FIELDS:
         raise UnreadableCloud(
-            f"The PointCloud2 announces {count} fields, and at most {_MOST_FIELDS} are read. "
-            "Serialise it again, or leave some out."
+            f"The PointCloud2 announces {count} fields, and the limit is {_MOST_FIELDS}. "
+            "Serialise it again with fewer fields."
         )
     return tuple(
         SerializedField(reader.text(), reader.word(), reader.byte(), reader.word())
@@ -311,7 +311,7 @@ def _read_fields(reader: _Reader) -> tuple[SerializedField, ...]:
 
 
 class _Reader:
-    """Values of a message one after the other; UnreadableCloud where it ends before one."""
+    """Reader of the values of a message; raises UnreadableCloud at a premature end."""
 
     def __init__(self, data: bytes) -> None:
         self._data = memoryview(data)
@@ -320,15 +320,15 @@ class _Reader:
 
     @property
     def left(self) -> int:
-        """Bytes that were not read."""
+        """Number of unread bytes."""
         return len(self._data) - self._at
 
     def bytes(self, count: int) -> memoryview:
         """Return the next bytes."""
         if count > self.left:
             raise UnreadableCloud(
-                f"The PointCloud2 ends early: {count} bytes are announced at byte {self._at}, and "
-                f"{self.left} follow. Serialise it again."
+                f"The PointCloud2 is truncated: {count} bytes are due at byte {self._at}, but "
+                f"only {self.left} follow. Serialise it again."
             )
         self._at += count
         return self._data[self._at - count : self._at]
@@ -338,25 +338,25 @@ class _Reader:
         return self.bytes(1)[0]
 
     def word(self) -> int:
-        """Return the next number of four bytes, after what aligns it."""
+        """Return the next number of four bytes, after alignment."""
         self.bytes(-self._at % 4)
         (value,) = self._word.unpack(self.bytes(4))
         return int(value)
 
     def text(self) -> str:
-        """Return the next string, without the zero at its end."""
+        """Return the next string, without its terminating zero."""
         length = self.word()
         if length > _LONGEST_NAME + 1:
             raise UnreadableCloud(
-                f"A name in the PointCloud2 has {length} bytes, and at most {_LONGEST_NAME} are "
-                "read. Serialise it again."
+                f"A name in the PointCloud2 has {length} bytes, and the limit is {_LONGEST_NAME}. "
+                "Serialise it again."
             )
         return bytes(self.bytes(length)).rstrip(b"\0").decode("utf-8", "replace")
 
 
 @contextmanager
 def naming(subject: str) -> Iterator[None]:
-    """Let errors raised inside begin with what they are about."""
+    """Prefix the message of any error that is raised inside with a subject, such as a path."""
     try:
         yield
     except SceneprintError as error:

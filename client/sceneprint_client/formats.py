@@ -1,9 +1,9 @@
-"""The table of file formats. Command line, service, client, dashboard and docs read it.
+"""The table of file formats, which the command line, service, client, dashboard and docs read.
 
-`tests/test_golden.py` writes `docs/formats.md` and the dashboard's `formats.js` from it.
+`tests/test_golden.py` generates `docs/formats.md` and the dashboard's `formats.js` from it.
 
-name of a file  --format_named-->  Format
-first bytes     --format_at-->  Format  --reader_of-->  function
+file name    --format_named-->  Format
+first bytes  --format_at-->  Format  --reader_of-->  function
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from importlib import import_module
 from pathlib import PurePath
 from typing import Any, Literal, cast
 
-#: A depth image; the points of a scan; a whole map; packed frames; a recording of ROS; a file of
-#: another system with frames and poses.
+#: A depth image; the points of one scan; a whole map; an archive of frames; a ROS recording; a
+#: capture of another system with frames and poses.
 Kind = Literal["depth", "cloud", "map", "archive", "recording", "capture"]
 #: Names of the formats of point clouds.
 CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las", "pointcloud2"]
 
-#: Number of first bytes of a file that show its format.
+#: Number of leading bytes of a file that determine its format.
 HEAD = 10_016
 BYTES = "application/octet-stream"
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of files.
+    """A file format.
 
     Parameters
     ----------
     name : unique within its kind
-    kind : what such a file holds
-    title : what people call it
-    suffixes : of file names, in lower case
-    content : data that the reader takes from such a file, in Markdown
-    signature : regular expression for the first bytes, as Latin-1, which Python and JavaScript
-        read alike; empty if they do not show the format. Groups are width and height
-    media_type : of a file over HTTP
-    reader : MODULE:FUNCTION that takes the bytes, or, of a capture, the path and a name; empty if
-        one reader takes all of the kind
-    size : MODULE:FUNCTION that takes the first bytes of a depth image, and returns width and height
-    library : package that reads it; empty if we do
+    kind : kind of content
+    title : name of the format for people
+    suffixes : lower-case suffixes of file names
+    content : description of the data that the reader uses, in Markdown
+    signature : regular expression for the first bytes, as Latin-1, for Python and JavaScript;
+        empty if they do not determine the format. Its groups are width and height
+    media_type : media type over HTTP
+    reader : MODULE:FUNCTION that takes the bytes, or, for a capture, the path and a name; empty if
+        one reader handles all formats of the kind
+    size : MODULE:FUNCTION that returns width and height from the first bytes of a depth image
+    library : package that reads the format; empty if sceneprint itself does
     """
 
     name: str
@@ -72,20 +72,20 @@ _PCD = r"[\r\n]*(?:#[^\n]{0,200}\n[\r\n]*){0,99}(?:VERSION|FIELDS|COLUMNS)[ \t]"
 _PLY = r"ply[\n\r ]"
 _PNG = r"\x89PNG\r\n\x1a\n"
 _NUMPY = r"\x93NUMPY"
-#: With width and height, where the shape has two numbers.
+#: NPY signature that captures width and height if the shape has two numbers.
 _NUMPY_IMAGE = _NUMPY + r"(?:[^}]*'shape': *\((?=\d+, *(\d+)\))(\d+))?"
-#: Beginning of NPY files of floating numbers in rows of three or four.
+#: Signature of NPY files of floating-point numbers with three or four columns.
 _NUMPY_ROWS = (
     _NUMPY + r"[\s\S]{4,6}(?=[^}]*'descr': *'[<>]f[248]')(?=[^}]*'shape': *\(\d+L?, *[34]L?,? *\))"
 )
-#: CDR of either byte order, and the names of three fields somewhere behind.
+#: CDR header of either byte order, followed anywhere by the names of three fields.
 _CDR = r"\x00[\x00\x01]\x00[\x00-\x03]" + "".join(
     rf"(?=[\s\S]*?(?:\x02\x00\x00\x00|\x00\x00\x00\x02){axis}\x00)" for axis in "xyz"
 )
 _ESTIMATED = "Units and up are estimated"
 _SQLITE = r"SQLite format 3\x00"
 
-#: The rows. A format that is recognised by its first bytes precedes those that begin alike.
+#: The formats. Where signatures overlap, the more specific format comes first.
 FORMATS = (
     Format(
         "png", "depth", "PNG", (".png",),
@@ -137,15 +137,15 @@ FORMATS = (
     ),
     Format(
         "kitti", "cloud", "KITTI .bin", (".bin",),
-        "x, y, z, intensity as float32, little-endian. The file does not show its format: say "
-        "`format=kitti`. Other rows are refused unless `row` names their values",
+        "x, y, z, intensity as float32, little-endian. The file does not show its format: pass "
+        "`format=kitti`. Other row layouts are rejected unless `row` names their values",
         "", BYTES, "sceneprint.formats.points.cloud:read_kitti",
     ),
     Format(
         "pointcloud2", "cloud", "PointCloud2 in CDR", (".cdr",),
         "the message of ROS 2 as `rclpy.serialization.serialize_message` or a subscription with "
-        "`raw=True` gives it; of ROS 1 read the bag. Either byte order; `x`, `y`, `z` of any type "
-        "and offset, organised or not, padded rows; points exactly at the sensor are missing",
+        "`raw=True` returns it; for ROS 1, read the bag. Either byte order; `x`, `y`, `z` of any "
+        "type and offset, organised or not, padded rows; points exactly at the sensor are missing",
         _CDR, "application/x-ros-pointcloud2", "sceneprint.formats.points.cloud:read_pointcloud2",
     ),
     Format("pcd", "map", "PCD", (".pcd",), f"points. {_ESTIMATED} (usually z)", _PCD),
@@ -231,51 +231,51 @@ FORMATS = (
 
 
 def formats_of(*kinds: Kind) -> tuple[Format, ...]:
-    """Return the rows of some kinds, in the order of the table."""
+    """Return the formats of the given kinds, in the order of the table."""
     return tuple(one for one in FORMATS if one.kind in kinds)
 
 
 def media_types_of(*kinds: Kind) -> tuple[str, ...]:
-    """Return the media types of some kinds; any file may be sent as `BYTES`, which is the last."""
+    """Return the media types of the given kinds; the last is `BYTES`, valid for any file."""
     found = dict.fromkeys(one.media_type for one in formats_of(*kinds))
     return (*(one for one in found if one != BYTES), BYTES)
 
 
 def titles_of(*kinds: Kind, last: str = "and") -> str:
-    """Return the titles of some kinds as an enumeration, such as "PNG, NPY and PFM"."""
+    """Return the titles of the given kinds as an enumeration, such as "PNG, NPY and PFM"."""
     *most, final = dict.fromkeys(one.title for one in formats_of(*kinds))
     return f"{', '.join(most)} {last} {final}"
 
 
 def format_at(head: bytes, *kinds: Kind) -> Format | None:
-    """Return the format that the first `HEAD` bytes of a file show; None if they show none."""
+    """Return the format that the first `HEAD` bytes of a file indicate, or None."""
     return next((one for one in formats_of(*kinds) if one.begins(head)), None)
 
 
 def format_named(file: str, *kinds: Kind) -> Format | None:
-    """Return the format that the suffix of a file's name stands for; None if it is of none.
+    """Return the format that the suffix of a file name indicates, or None.
 
-    A `.npy` is the first of the kinds that a `.npy` may be, in the order of the table.
+    If several kinds use the suffix, the first one in the table is returned.
     """
     suffix = PurePath(file).suffix.lower()
     return next((one for one in formats_of(*kinds) if suffix in one.suffixes), None)
 
 
 def format_of(head: bytes) -> CloudFormat | None:
-    """Return the format of a point cloud by its first `HEAD` bytes; those of KITTI show none."""
+    """Return the point cloud format that the first `HEAD` bytes indicate; KITTI files have none."""
     found = format_at(head, "cloud")
     return None if found is None else cast(CloudFormat, found.name)
 
 
 def is_cloud(file: str) -> bool:
-    """Return whether a file of this name always holds points; a .npy may be a depth image."""
+    """Return whether a file of this name always holds points; an .npy may be a depth image."""
     found = format_named(file, "depth", "cloud")
     return found is not None and found.kind == "cloud"
 
 
 @lru_cache(maxsize=64)
 def function_at(place: str) -> Callable[..., Any]:
-    """Import and return the function at MODULE:FUNCTION."""
+    """Import and return the function with the name MODULE:FUNCTION."""
     module, _, name = place.partition(":")
     function: Callable[..., Any] = getattr(import_module(module), name)
     return function

@@ -1,4 +1,4 @@
-"""A frame in a file or in an array: what it is, what is known of it, and what is sent of it.
+"""Frames in files and arrays: their bytes and metadata as an upload sends them.
 
 Path  --find_frame_file-->  FrameFile  --meta_of-->  FrameMeta
 bytes | path | FrameFile | array  --sendable-->  bytes, FrameMeta
@@ -54,15 +54,15 @@ from sceneprint_client.sidecars import (
 if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput, MetaInput
 
-#: A depth image of the 7-Scenes layout, whose pose lies beside it.
+#: File names of depth images in the 7-Scenes layout, which has a pose file for each.
 SEVEN_SCENES = re.compile(r"frame-\d+\.depth\.png", re.ASCII)
-#: Time stamps, in seconds, that are dates (2001 to 2096); others count from some start.
+#: Range of stamps, in seconds, that are dates (2001 to 2096); other stamps have another origin.
 _DATES_S = (1e9, 4e9)
 
 
 @runtime_checkable
 class PinholeCamera(Protocol):
-    """The camera of Open3D: PinholeCameraIntrinsic."""
+    """Protocol of Open3D's PinholeCameraIntrinsic."""
 
     width: int
     height: int
@@ -70,29 +70,29 @@ class PinholeCamera(Protocol):
 
 
 class FrameSource(Protocol):
-    """Where the bytes of a frame come from that has no file of its own."""
+    """Source of the bytes of a frame that has no file of its own."""
 
     def read_bytes(self) -> bytes:
-        """What a PNG, NPY or other file of the frame would hold; raises SceneprintError."""
+        """Return the frame as a PNG, NPY or other file; raise SceneprintError on failure."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFile:
-    """The file of one frame, and what lies beside it; not yet read.
+    """Reference to the file of one frame and its sidecar files; its samples are not loaded.
 
     Parameters
     ----------
-    name : of the frame, after its sequence, such as "seq-01/frame-000000"
-    path : the depth image, or the file of points; with `source` a path that no other frame has
-    camera : the sensor; None for points
-    timestamp : seconds, or None where the layout has none
-    pose_source : file of the pose, the pose itself, or None where unknown
-    cloud : how the points are read; None for a depth image. One of this and `camera` is given
-    source : where the bytes come from, if not from the file
-    base : where the sensor sits on the robot; None where not known
-    original : what the file is called within the folder of its sequence, or the message within its
-        bag; default: the file's own name
-    sequence : place within its sequence; None where not known, as of a file that was named alone
+    name : name of the frame, with its sequence, such as "seq-01/frame-000000"
+    path : depth image or file of points; with `source`, a path that is unique to the frame
+    camera : camera of a depth image; None for points
+    timestamp : seconds, or None if the layout has none
+    pose_source : file of the pose, or the pose itself; None if unknown
+    cloud : how to read the points; None for a depth image
+    source : source of the bytes if they are not in the file
+    base : pose of the sensor on the robot; None if unknown
+    original : path of the file within the folder of its sequence, or name of the message within
+        its bag; default: the file's own name
+    sequence : index within the sequence; None if unknown, as for a single file
     """
 
     name: str
@@ -108,20 +108,20 @@ class FrameFile:
 
     def __post_init__(self) -> None:
         if (self.camera is None) == (self.cloud is None):
-            raise ValueError("a frame is a depth image with a camera, or a cloud with its source")
+            raise ValueError("pass either a depth image with `camera`, or points with `cloud`")
 
     @property
     def kind(self) -> Literal["depth", "cloud"]:
-        """What its file holds."""
+        """Kind of the file's content."""
         return "depth" if self.cloud is None else "cloud"
 
     def read_bytes(self) -> bytes:
-        """Bytes of the frame, as they are sent.
+        """Return the bytes of the frame as they are sent.
 
         Raises
         ------
-        UnreadableFrame, UnreadableCloud : they cannot be read, or are too many.
-        DatasetError : what holds them is damaged.
+        UnreadableFrame, UnreadableCloud : If the file cannot be read or is too large.
+        DatasetError : If the recording that contains the frame is damaged.
         """
         if self.source is not None:
             return self.source.read_bytes()
@@ -133,16 +133,16 @@ class FrameFile:
 
     @property
     def row(self) -> tuple[str, ...] | None:
-        """Names of the values of a row, of a .bin file whose rows are described."""
+        """Names of the values in each row of a .bin file, if `clouds.json` specifies them."""
         return self.cloud.row if self.cloud is not None and is_kitti(self.path) else None
 
     @property
     def pose(self) -> NDArray[np.float64] | None:
-        """(4, 4) T_parent_sensor, or None where unknown; read from its file each time.
+        """Return T_parent_sensor (4, 4), or None if unknown; each call reads the file again.
 
         Raises
         ------
-        InvalidPose : the file holds no rigid transform; names the file.
+        InvalidPose : If the file does not hold a rigid transform; names the file.
         """
         if isinstance(self.pose_source, Path):
             return read_pose(self.pose_source)
@@ -150,17 +150,17 @@ class FrameFile:
 
 
 def find_frame_file(file: Path) -> FrameFile:
-    """One frame by its file: a depth image, or points; its pose beside it where it has one.
+    """Return the frame of a depth image or file of points, with its pose if a pose file exists.
 
     Parameters
     ----------
-    file : absolute
+    file : absolute path
 
     Raises
     ------
-    DatasetError : there is no intrinsics.json beside a depth image or above, or clouds.json says
-        what it cannot.
-    InvalidIntrinsics : the intrinsics.json describes no camera.
+    DatasetError : If no intrinsics.json lies beside a depth image or in a folder above it, or
+        clouds.json is invalid.
+    InvalidIntrinsics : If intrinsics.json does not describe a camera.
     """
     folder, number = file.parent, seven_scenes_number(file.name)
     stem = file.name.removesuffix(".depth.png") if SEVEN_SCENES.fullmatch(file.name) else file.stem
@@ -168,26 +168,26 @@ def find_frame_file(file: Path) -> FrameFile:
     if is_cloud(file.name) or _is_npy_of_points(file):
         source = find_cloud_source(folder)
         return FrameFile(name, file, None, pose_source=pose, cloud=source)
-    # what is named outright is taken, whatever its name; its content decides
+    # A path that the user specified is a depth image whatever its name; its content decides.
     return FrameFile(name, file, find_camera(folder), pose_source=pose, sequence=number)
 
 
-#: Folders that hold the poses of the frames beside them.
+#: Names of folders for the pose files of the frames beside them.
 POSE_FOLDERS = ("pose", "poses")
 NO_POSE_FILE = "no NAME.pose.txt is beside them, nor NAME.txt in a folder pose"
 
 
 def find_pose_file(folder: Path, stem: str) -> Path | None:
-    """Return the file of a frame's pose, or None.
+    """Return the path of a frame's pose file, or None.
 
-    It is NAME.pose.txt beside the frame, or NAME.txt in a folder `pose` or `poses`. That lies in
-    the frame's folder, or beside it if the folder is called depth (ScanNet). Of `depth_NAME` it
-    may be called `pose_NAME.txt` too.
+    It is NAME.pose.txt beside the frame, or NAME.txt in a folder `pose` or `poses`. This folder
+    lies in the frame's folder, or beside it if the frame's folder is named depth (ScanNet). The
+    pose of `depth_NAME` may also be named `pose_NAME.txt`.
 
     Parameters
     ----------
-    folder : of the frame
-    stem : name of the frame's file without suffix: NAME, NAME.depth or depth_NAME
+    folder : folder of the frame
+    stem : name of the frame's file without its suffix: NAME, NAME.depth or depth_NAME
     """
     name = stem.removesuffix(".depth")
     renamed = [f"{name.replace('depth', 'pose')}.txt"] if "depth" in name else []
@@ -199,13 +199,13 @@ def find_pose_file(folder: Path, stem: str) -> Path | None:
 
 
 def is_kitti(path: Path) -> bool:
-    """Return whether a file is a KITTI scan by its name, which alone shows it."""
+    """Return whether a file is a KITTI scan. Only its name shows it."""
     found = format_named(path.name, "cloud")
     return found is not None and found.name == "kitti"
 
 
 def _is_npy_of_points(file: Path) -> bool:
-    """Return whether clouds.json is beside it; or no camera, and its content is N x 3 or N x 4."""
+    """Return whether clouds.json describes the file, or it has (N, 3 or 4) values and no camera."""
     if file.suffix.lower() != ".npy":
         return False
     if (file.parent / CLOUDS_FILE).is_file():
@@ -219,7 +219,7 @@ def _is_npy_of_points(file: Path) -> bool:
     try:
         with file.open("rb") as opened:
             return format_of(opened.read(HEAD)) == "npy"
-    except OSError:  # whoever reads the frame says why
+    except OSError:  # reading the frame later raises an error with the reason
         return False
 
 
@@ -236,25 +236,26 @@ def meta_of(
     with_name: bool = True,
     trust_depth: bool = False,
 ) -> FrameMeta:
-    """What a data set knows of one of its frames, as it is sent with an upload.
+    """Return the metadata that an upload sends with a frame of a data set.
 
     Parameters
     ----------
     reference : the frame
     robot, tags : see FrameMeta
-    session : default: the name of the frame's sequence
-    with_pose : send the pose where it is known
-    parent_frame : what its pose leads to; default: the session's name. Sequences of one scene
+    session : name of the session; default: the name of the frame's sequence
+    with_pose : whether to send the pose if it is known
+    parent_frame : parent frame of the pose; default: the session's name. Sequences of one scene
         share it: `Sequence.parent_frame`
-    base : where the sensor sits on the robot; default: as the frame says
-    up : unit vector in the sensor's axes; default: of the sidecar, for all of its frames
-    with_name : send the original name and the place in the sequence; queries have no use for them
-    trust_depth : take a depth image that does not look like one
+    base : pose of the sensor on the robot; default: `base` of the frame
+    up : unit vector in the sensor's axes; default: `up` of the sidecar file
+    with_name : whether to send the original name and the index in the sequence, which queries
+        ignore
+    trust_depth : whether to accept an image that does not look like depth
 
     Raises
     ------
-    InvalidPose : the file of the pose holds none.
-    InvalidRequest : a name is empty, too long or not printable.
+    InvalidPose : If the pose file does not hold a rigid transform.
+    InvalidRequest : If a name is empty, too long or not printable.
     """
     if up is None:
         source = reference.camera or reference.cloud
@@ -269,7 +270,7 @@ def meta_of(
         stamp = None
     return checked(
         FrameMeta,
-        "What is known of the frame",
+        "The metadata of the frame",
         **(_of_depth(reference.camera) if reference.camera else _of_cloud(reference)),
         trust_depth=trust_depth and reference.camera is not None,
         robot=robot,
@@ -285,40 +286,40 @@ def meta_of(
 
 
 def file_name(name: str) -> str | None:
-    """A name of a file as it may be sent, whatever it was: a bad name must not cost the frame.
+    """Return a file name as metadata may hold it; an invalid name must not block the frame.
 
     Returns
     -------
-    name : relative, its parts with `/` between; `_` where a character is not allowed; of a longer
-        one the end. None where nothing is left
+    name : relative path with `/`, `_` for each forbidden character, and only the end of a name
+        that is too long; None if nothing is left
     """
-    text = name.encode("utf-8", "replace").decode()  # half of a surrogate pair is no text
+    text = name.encode("utf-8", "replace").decode()  # a lone surrogate cannot be encoded
     text = re.sub(r"[\x00-\x1f\x7f\\]", "_", text)
     parts = text[-MOST_OF_NAME:].split("/")
     return "/".join(part for part in parts if part not in ("", ".", "..")) or None
 
 
 def seven_scenes_number(name: str) -> int | None:
-    """The number of a frame of the 7-Scenes layout by the name of its file; None of any other."""
+    """Return the frame number in a file name of the 7-Scenes layout, or None for other names."""
     if not SEVEN_SCENES.fullmatch(name):
         return None
     number = name.removeprefix("frame-").removesuffix(".depth.png")
     return int(number) if len(number) <= _MOST_DIGITS else None
 
 
-#: Digits of a number that every reader of JSON reads exactly.
+#: Number of digits of an integer that every JSON parser reads exactly.
 _MOST_DIGITS = 15
 
 
 def _direction(up: Sequence[float] | None) -> GivenDirection | None:
-    """Three numbers as they are sent; InvalidRequest where they are no unit vector."""
+    """Return three numbers as a direction; raise InvalidRequest if it is not a unit vector."""
     if up is None:
         return None
     return checked(GivenDirection, "The up vector", **dict(zip("xyz", up, strict=False)))
 
 
 def _of_depth(camera: Camera) -> dict[str, Any]:
-    """How the samples of a depth image are read."""
+    """Return the metadata that specify how to read the samples of a depth image."""
     lens = camera.intrinsics
     return {
         "intrinsics": CameraIntrinsics(
@@ -336,11 +337,11 @@ def _of_depth(camera: Camera) -> dict[str, Any]:
 
 
 def _of_cloud(reference: FrameFile) -> dict[str, Any]:
-    """How the points of a cloud are read; a KITTI scan's name alone says that it is one."""
+    """Return the metadata that specify how to read the points of a cloud."""
     source = reference.cloud or CloudSource()
     file_format = source.file_format
     if reference.row is not None:
-        file_format = None  # it is sent as NPY, whose content says so
+        file_format = None  # rows_as_npy converts it to NPY, whose header shows the format
     elif file_format is None and is_kitti(reference.path):
         file_format = "kitti"
     fields: dict[str, Any] = {"format": file_format, "units_per_metre": source.units_per_metre}
@@ -355,18 +356,20 @@ def sendable(
     frame: FrameInput, meta: MetaInput | None, *, with_pose: bool,
     up: Sequence[float] | None = None,
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
-    """Bytes of a frame and what is known of it; a path's camera is looked for beside it.
+    """Return the bytes and metadata of a frame; a path's camera is read from its sidecar file.
 
-    `with_pose` sends all that a map keeps: the pose, the file's name, its place in the sequence.
-    Where `up` is given, it stands in the place of what `meta` or a sidecar says.
+    `with_pose` includes the pose, the file's name and its index in the sequence. `up` overrides
+    `meta` and the sidecar file.
 
     Raises
     ------
-    UnreadableFrame, UnreadableCloud : the file cannot be read, or the array is neither depth nor
-        points.
-    DatasetError : there is no intrinsics.json beside a depth image or above, or it is a folder.
-    InvalidIntrinsics, InvalidPose : what is given or lies beside it is none.
-    TypeError : bytes without metadata, and of no point cloud; or no frame or no metadata at all.
+    UnreadableFrame, UnreadableCloud : If the file cannot be read, or the array is neither depth
+        nor points.
+    DatasetError : If no intrinsics.json lies beside a depth image or in a folder above it, or the
+        path is a folder.
+    InvalidIntrinsics, InvalidPose : If the camera or the pose is invalid.
+    TypeError : If `frame` or `meta` has the wrong type, or the bytes of a depth image come
+        without metadata.
     """
     array = library_array(frame)
     if array is not None:
@@ -376,14 +379,14 @@ def sendable(
         known = known.model_copy(update={"up": _direction(up)})
     if isinstance(frame, bytes):
         if known is None and format_of(frame) is None:
-            raise TypeError("the bytes of a depth image need its `meta`, at least the intrinsics")
+            raise TypeError("the bytes of a depth image need `meta` with at least the intrinsics")
         return frame, known or FrameMeta(up=_direction(up))
     if isinstance(frame, FrameFile):
         found = frame
     elif not isinstance(frame, str | os.PathLike):
         raise TypeError(
-            "a frame is a path, the bytes of a file, a FrameFile, a numpy array, or an image or "
-            f"cloud of Open3D or Pillow, not {type(frame).__name__}"
+            "pass a path, the bytes of a file, a FrameFile, a numpy array, or an image or cloud "
+            f"of Open3D or Pillow, not {type(frame).__name__}"
         )
     elif known is not None:
         data, name = _read(Path(frame), is_cloud=known.intrinsics is None), Path(frame).name
@@ -399,8 +402,9 @@ def sendable(
 
 
 def library_array(frame: Any) -> NDArray[Any] | None:
-    """Return the array of a frame that is one, or an image or cloud of Open3D or Pillow; None of
-    anything else. Neither library is imported.
+    """Return the array of a numpy array, or of an image or cloud of Open3D or Pillow; else None.
+
+    Neither library is imported.
     """
     if isinstance(frame, np.ndarray):
         return frame
@@ -423,47 +427,46 @@ def library_array(frame: Any) -> NDArray[Any] | None:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-#: Largest sample of a 16-bit image.
+#: Greatest sample of a 16-bit image.
 _MOST_UNITS = 65_535
 
 
 def _named_as(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
-    """What is known of a frame, with name and place of its file where it says none."""
+    """Add name and sequence index of the file to metadata that have none."""
     labels = {"name": file_name(name), "sequence": sequence}
     missing = {field: label for field, label in labels.items() if getattr(known, field) is None}
     return known.model_copy(update=missing)
 
 
 def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
-    """Return the metadata of a frame that is not an array; TypeError if it is no metadata."""
+    """Return the metadata of a frame in a file; raise TypeError if they have another type."""
     if meta is None or isinstance(meta, FrameMeta):
         return meta
     if isinstance(meta, CameraIntrinsics | PinholeCamera):
         return FrameMeta(intrinsics=camera_of(meta, (1, 1)))
-    if not isinstance(meta, np.ndarray | list | tuple):  # a matrix is one of these
-        raise TypeError(f"meta is a FrameMeta or CameraIntrinsics, not {type(meta).__name__}")
+    if not isinstance(meta, np.ndarray | list | tuple):  # a camera matrix is one of these types
+        raise TypeError(f"pass a FrameMeta or CameraIntrinsics as meta, not {type(meta).__name__}")
     raise TypeError(
-        "a camera matrix does not say how large the image of a file is; give CameraIntrinsics or "
-        "FrameMeta"
+        "a camera matrix lacks the image size that a file needs; pass CameraIntrinsics or FrameMeta"
     )
 
 
 def array_sendable(
     array: NDArray[Any], meta: MetaInput | None, *, up: Sequence[float] | None = None
 ) -> tuple[bytes, FrameMeta]:
-    """Return an array as an NPY file, and its metadata: with a camera it is depth, else points.
+    """Return an array as an NPY file, and its metadata: depth if it has a camera, else points.
 
     Parameters
     ----------
-    array : (H, W) depth, uint16 in stored units (`depth_scale` to a metre, 1000 unless `meta` says
-        otherwise) or floating in metres; without a camera (N, 3) or (N, 4) floating points
-    meta : FrameMeta, or the camera, as for `camera_of`
-    up : as for `sendable`
+    array : (H, W) depth, uint16 in units of 1 / `depth_scale` metres (default 1000), or floating
+        point in metres; without a camera, (N, 3) or (N, 4) floating-point coordinates
+    meta : FrameMeta, or the camera in a form that `camera_of` accepts
+    up : unit vector in the sensor's axes; overrides `meta`
 
     Raises
     ------
-    UnreadableFrame, UnreadableCloud : another shape or type.
-    InvalidIntrinsics : no camera.
+    UnreadableFrame, UnreadableCloud : If the array has another shape or type.
+    InvalidIntrinsics : If `meta` does not describe a camera.
     """
     size = (array.shape[1], array.shape[0]) if array.ndim == 2 else None
     if meta is None or isinstance(meta, FrameMeta):
@@ -476,29 +479,29 @@ def array_sendable(
         return _npy(_checked_points(array), _MOST_LOST_M), known
     if size is None or not array.size or array.dtype.kind + str(array.dtype.itemsize) not in _DEPTH:
         raise UnreadableFrame(
-            f"The array has shape {array.shape} and type {array.dtype}, and depth is (H, W), "
-            "uint16 in stored units or float32 in metres. Convert it."
+            f"The array has shape {array.shape} and type {array.dtype}. Convert it to depth of "
+            "shape (H, W), uint16 in stored units or float32 in metres."
         )
     return _npy(array), known
 
 
-#: Types of depth images: kind and bytes.
+#: Types of depth images: kind and size in bytes.
 _DEPTH = ("u2", "f2", "f4", "f8")
 
 
 def _checked_points(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array of points; raise UnreadableFrame for depth without a camera."""
+    """Return an array of points; raise UnreadableFrame if it is depth without a camera."""
     if array.ndim == 2 and array.shape[1] in (3, 4) and array.dtype.kind == "f":
         if array.dtype.itemsize in (2, 4, 8):
             return array
     elif array.ndim == 2 and array.shape[1] not in (3, 4):
         raise UnreadableFrame(
-            f"The array has shape {array.shape} and no camera. If it is a depth image, give its "
+            f"The array has shape {array.shape} and no camera. If it is a depth image, pass its "
             "camera: CameraIntrinsics, a 3 x 3 matrix, or (fx, fy, cx, cy). Points are (N, 3)."
         )
     raise UnreadableCloud(
-        f"The array has shape {array.shape} and type {array.dtype}, and points are (N, 3), "
-        "float32 or float64 in metres. Convert it."
+        f"The array has shape {array.shape} and type {array.dtype}. Convert it to points of "
+        "shape (N, 3), float32 or float64 in metres."
     )
 
 
@@ -506,17 +509,17 @@ def camera_of(
     camera: CameraIntrinsics | PinholeCamera | Sequence[float] | NDArray[Any],
     size: tuple[int, int],
 ) -> CameraIntrinsics:
-    """Return the camera of an image of a size (width, height).
+    """Return the camera of an image.
 
     Parameters
     ----------
-    camera : CameraIntrinsics as it is, Open3D's PinholeCameraIntrinsic, a (3, 3) matrix without
-        skew, or (fx, fy, cx, cy), pixels
-    size : width and height, pixels, where the camera does not say them
+    camera : CameraIntrinsics, Open3D's PinholeCameraIntrinsic, a (3, 3) matrix without skew, or
+        (fx, fy, cx, cy), pixels
+    size : width and height, pixels, for a `camera` that lacks them
 
     Raises
     ------
-    InvalidIntrinsics : none of these.
+    InvalidIntrinsics : If `camera` has another type or is not a valid camera.
     """
     if isinstance(camera, CameraIntrinsics):
         return camera
@@ -531,7 +534,7 @@ def camera_of(
         K = K[[0, 1, 0, 1], [0, 1, 2, 2]]
     if K.shape != (4,) or not np.isfinite(K).all() or not (K[:2] > 0).all():
         raise InvalidIntrinsics(
-            "The camera is none. Give CameraIntrinsics, a matrix [[fx, 0, cx], [0, fy, cy], "
+            "The camera is invalid. Pass CameraIntrinsics, a matrix [[fx, 0, cx], [0, fy, cy], "
             "[0, 0, 1]], or (fx, fy, cx, cy), in pixels."
         )
     fx, fy, cx, cy = K.tolist()
@@ -542,30 +545,30 @@ def camera_of(
 
 
 def rows_as_npy(data: bytes, row: tuple[str, ...]) -> bytes:
-    """Return x, y and z of rows of float32 as an NPY file.
+    """Return x, y and z of rows of float32 values as an NPY file.
 
     Raises
     ------
-    UnreadableCloud : it is no whole number of rows.
+    UnreadableCloud : If the length is not a multiple of a row's size.
     """
     width = 4 * len(row)
     if len(data) % width or not data:
         raise UnreadableCloud(
-            f"The file has {len(data)} bytes, and rows of {','.join(row)} have {width}. Name what "
-            "a row of it holds."
+            f"The file has {len(data)} bytes, which is not a multiple of {width}, the size of a "
+            f"row of {','.join(row)}. Specify the values of a row with `row`."
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, len(row))
     return _npy(rows[:, [row.index(axis) for axis in "xyz"]])
 
 
-#: What float32 may change in coordinates; those of a map, such as UTM, are sent as float64.
+#: Greatest rounding error of coordinates in float32, metres; large ones such as UTM need float64.
 _MOST_LOST_M = 1e-4
 
 
 def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
-    """Return an NPY file. It is not compressed: to compress takes longer than to send.
+    """Return an NPY file, uncompressed since compressing takes longer than sending.
 
-    float64 is sent as float32 where no number changes by more than `most_lost`.
+    float64 is converted to float32 if no number changes by more than `most_lost`.
     """
     file, compact = io.BytesIO(), array
     if array.dtype.itemsize == 8:
@@ -578,20 +581,20 @@ def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
 
 
 def _named(path: Path) -> FrameFile:
-    """Return the frame of a path, which a caller gave."""
+    """Return the frame of a path that the caller passed."""
     if path.is_dir():
         raise DatasetError(
-            f"{path}: This is a folder, and one frame is wanted. Name a depth image or a cloud, "
-            "or send the frames that sceneprint.find_sequences returns."
+            f"{path}: This is a folder, and a single frame is required. Specify a depth image or "
+            "a cloud, or send the frames that sceneprint.find_sequences returns."
         )
-    # a name such as .. is none; a symlink's own name is what the user knows it by
+    # A name such as .. identifies no file; the user knows a symlink by its own name.
     file = path.resolve() if ".." in path.parts else path.absolute()
     if not file.is_file():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
     several = format_named(file.name, "recording", "capture")
     if several is not None:
         raise DatasetError(
-            f"{path}: The file ({several.title}) may hold several frames, and one is wanted. "
+            f"{path}: The file ({several.title}) may hold several frames; one is required. "
             "Upload it with `sceneprint upload`, or send the frames that "
             "sceneprint.find_sequences returns."
         )

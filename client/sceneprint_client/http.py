@@ -1,8 +1,7 @@
-"""Requests to one service: as they are sent, sent until they are answered, and read as records or
-as errors.
+"""HTTP requests to a service, their retries, and their answers as records or errors.
 
-    frame, options  --named_or_sent, query_of-->  QueryFrame, Query
-    QueryFrame, Query  --query_form, query_json-->  arguments of a request  --_ask-->  a record
+frame, options  --named_or_sent, query_of-->  QueryFrame, Query
+QueryFrame, Query  --query_form, query_json-->  arguments of a request  --_ask-->  a record
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ from sceneprint_client.errors import (
     UnknownQuery,
 )
 
-# What is sent.
+# Requests.
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,22 +65,22 @@ if TYPE_CHECKING:
         @property
         def __array_interface__(self) -> dict[str, Any]: ...
 
-    #: A frame at hand: the content of a file, a path, a frame of `find_sequences`, or an array:
-    #: (H, W) depth, uint16 in stored units or floating in metres; (N, 3) floating points. Images
-    #: and clouds of Open3D and images of Pillow count as arrays.
+    #: A frame: content or path of a file, a frame of `find_sequences`, or an array: (H, W) depth,
+    #: uint16 in stored units or floating point in metres; or (N, 3) points. Images and clouds of
+    #: Open3D and images of Pillow count as arrays.
     FrameInput = bytes | str | PathLike[str] | FrameFile | NDArray[np.generic] | LibraryImage
-    #: What is known of a frame; or its camera alone, also that of Open3D, of an array also as
-    #: (3, 3) matrix or as (fx, fy, cx, cy), pixels.
+    #: Metadata of a frame, or only its camera; for an array, the camera may be a (3, 3) matrix or
+    #: (fx, fy, cx, cy), pixels.
     MetaInput = FrameMeta | CameraIntrinsics | PinholeCamera | Sequence[float] | NDArray[np.generic]
 
-#: Where `sceneprint serve` listens unless told otherwise.
+#: Default address of `sceneprint serve`.
 DEFAULT_URL = "http://127.0.0.1:8008"
-#: A frame that is stored, or one at hand: its bytes and what is known of it.
+#: A stored frame, or the bytes and metadata of a new one.
 QueryFrame = NamedFrame | tuple[bytes, FrameMeta]
 
 
-def given(**parameters: Any) -> dict[str, Any]:
-    """Return those parameters of a request that are not None."""
+def without_none(**parameters: Any) -> dict[str, Any]:
+    """Return the parameters of a request that are not None."""
     return {name: value for name, value in parameters.items() if value is not None}
 
 
@@ -89,14 +88,14 @@ def frame_bytes(
     frame: FrameInput, meta: MetaInput | None, *, with_pose: bool,
     up: Sequence[float] | None = None,
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
-    """Bytes of a frame and what is known of it; see `frame_files.sendable`."""
-    from sceneprint_client.frame_files import sendable  # it takes numpy
+    """Return the bytes and metadata of a frame; see `frame_files.sendable`."""
+    from sceneprint_client.frame_files import sendable  # loads numpy
 
     return sendable(frame, meta, with_pose=with_pose, up=up)
 
 
 def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
-    """Arguments of a request that sends a frame."""
+    """Return the arguments of a request that sends a frame."""
     return {
         "files": {"frame": ("frame", data, "application/octet-stream")},
         "data": {"meta": json.dumps(meta_json(meta))},
@@ -104,7 +103,7 @@ def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
 
 
 def frames_form(frames: Sequence[FrameInput], metas: Sequence[MetaInput | None]) -> dict[str, Any]:
-    """Arguments of a request that sends several frames with their poses; see `frame_bytes`."""
+    """Return the arguments of a request that sends several frames with their poses."""
     sent = [frame_bytes(*one, with_pose=True) for one in zip(frames, metas, strict=True)]
     return {
         "files": [("frame", ("frame", data, "application/octet-stream")) for data, _ in sent],
@@ -113,58 +112,58 @@ def frames_form(frames: Sequence[FrameInput], metas: Sequence[MetaInput | None])
 
 
 def meta_json(meta: FrameMeta) -> dict[str, Any]:
-    """What is known of a frame as it is sent: a viewpoint of null says that there is none."""
+    """Return metadata as JSON; a null viewpoint states that the points have no viewpoint."""
     return meta.model_dump(mode="json", exclude_defaults=True)
 
 
 def map_path(name: str) -> str:
-    """Path of a map; UnknownMap for a name that none can have."""
+    """Return the path of a map; raise UnknownMap for an invalid name."""
     return f"/v1/maps/{_part(name, 'map', UnknownMap)}"
 
 
 def query_path(query_id: str) -> str:
-    """Path of a past query; UnknownQuery where no answer can have that id."""
+    """Return the path of a past query; raise UnknownQuery for an invalid id."""
     return f"/v1/queries/{_part(query_id, 'query', UnknownQuery)}"
 
 
 def match_path(query_id: str, frame_id: str) -> str:
-    """Path of a match of a past query; UnknownQuery or UnknownFrame as `query_path`."""
+    """Return the path of a match of a past query; raise NotFound for an invalid id."""
     return f"{query_path(query_id)}/matches/{_part(frame_id, 'frame', UnknownFrame)}"
 
 
 def frame_path(map_name: str, frame_id: str) -> str:
-    """Path of a frame; UnknownMap or UnknownFrame as `map_path`."""
+    """Return the path of a frame; raise NotFound for an invalid name or id."""
     return f"{map_path(map_name)}/frames/{_part(frame_id, 'frame', UnknownFrame)}"
 
 
 def deletion_path(map_name: str, deletion_id: str) -> str:
-    """Path of a deletion; UnknownMap or UnknownDeletion as `map_path`."""
+    """Return the path of a deletion; raise NotFound for an invalid name or id."""
     return f"{map_path(map_name)}/deletions/{_part(deletion_id, 'deletion', UnknownDeletion)}"
 
 
 def job_path(job_id: str) -> str:
-    """Path of a job; UnknownJob as `map_path`."""
+    """Return the path of a job; raise UnknownJob for an invalid id."""
     return f"/v1/jobs/{_part(job_id, 'job', UnknownJob)}"
 
 
 def product_path(kind: type[Product], map_name: str | None, job_id: str) -> str:
-    """Path of a product; UnknownMap or UnknownJob as `map_path`."""
+    """Return the path of a product; raise NotFound for an invalid name or id."""
     root = "/v1" if map_name is None else map_path(map_name)
     return f"{root}/{kind.collection}/{_part(job_id, kind.noun, UnknownJob)}"
 
 
 def surface_path(map_name: str) -> str:
-    """Path of the surface of a map; UnknownMap as `map_path`."""
+    """Return the path of the surface of a map; raise UnknownMap for an invalid name."""
     return f"{map_path(map_name)}/surface"
 
 
 def surface_tile_path(map_name: str, digest: str) -> str:
-    """Path of a tile; UnknownMap as `map_path`, NotFound where no tile can have that digest."""
+    """Return the path of a tile; raise NotFound for an invalid name or digest."""
     return f"{surface_path(map_name)}/tiles/{_part(digest, 'tile', NotFound)}"
 
 
 def _part(name: str, what: str, error: type[SceneprintError]) -> str:
-    """Return a name that stays one part of a path: `..` would lead to another resource."""
+    """Return a name that is safe as one part of a path; `..` would lead to another resource."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
         raise error(f"There is no {what} {name!r:.80}. Check the name.")
     return name
@@ -174,7 +173,7 @@ def _part(name: str, what: str, error: type[SceneprintError]) -> str:
 
 
 class QueryOptions(TypedDict, total=False):
-    """How to ask; see the fields of Query."""
+    """Options of a query; see the fields of Query."""
 
     k: int
     stages: str | Iterable[Stage]
@@ -194,7 +193,7 @@ class QueryOptions(TypedDict, total=False):
 
 
 def check_options(how: QueryOptions) -> None:
-    """Raise TypeError for options that a query does not have, before the frame is looked at."""
+    """Raise TypeError for unknown options of a query, before the frame is read."""
     unknown = how.keys() - Query.model_fields.keys()
     if unknown:
         raise TypeError(
@@ -204,7 +203,7 @@ def check_options(how: QueryOptions) -> None:
 
 
 def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:
-    """Return a query from options that `check_options` has seen."""
+    """Return a query with options that `check_options` has accepted."""
     stages: Any = how.get("stages")
     if stages is not None and not isinstance(stages, str):
         how = {**how, "stages": tuple(stages)}
@@ -215,22 +214,22 @@ def named_or_sent(
     map_name: str | None, frame: FrameInput | None, meta: MetaInput | None,
     frame_id: str | None, up: Sequence[float] | None = None,
 ) -> tuple[str, QueryFrame]:  # fmt: skip
-    """Return the frame that is asked for, of the map that it is asked of."""
+    """Return the map to search and the frame of the query, stored or as bytes with metadata."""
     if map_name is None:
-        raise TypeError("give `map_name`, or `maps`")
+        raise TypeError("pass `map_name` or `maps`")
     if frame_id is not None and frame is None:
         if up is not None:
-            raise TypeError("a stored frame has the `up` that it was uploaded with")
+            raise TypeError("a stored frame has the `up` of its upload; omit `up`")
         return map_name, NamedFrame.model_construct(map=map_name, frame_id=frame_id)
     if frame is None or frame_id is not None:
-        raise TypeError("give either `frame` or `frame_id`")
+        raise TypeError("pass either `frame` or `frame_id`")
     return map_name, frame_bytes(frame, meta, with_pose=False, up=up)
 
 
 def compared_frame(
     frame: FrameInput | NamedFrame | tuple[str, str], meta: MetaInput | None
 ) -> QueryFrame:
-    """One of two frames to compare."""
+    """Return one of two frames to compare."""
     if isinstance(frame, tuple):
         return checked(NamedFrame, "The frame", map=frame[0], frame_id=frame[1])
     if isinstance(frame, NamedFrame):
@@ -239,19 +238,19 @@ def compared_frame(
 
 
 def query_json(query: Query) -> dict[str, Any]:
-    """Return the fields of a query that are not the default, as JSON."""
+    """Return the non-default fields of a query as JSON."""
     return query.model_dump(mode="json", exclude_defaults=True)
 
 
 def query_form(data: bytes, meta: FrameMeta, query: Query) -> dict[str, Any]:
-    """Arguments of a request that sends a frame and how to ask for it."""
+    """Return the arguments of a request that sends a frame and the options of a query."""
     sent = frame_form(data, meta)
     sent["data"] |= {name: form_text(value) for name, value in query_json(query).items()}
     return sent
 
 
 def form_text(value: object) -> str:
-    """Return a field of a form: names with commas between, else JSON."""
+    """Return the text of a form field: names joined by commas, or else JSON."""
     if isinstance(value, str):
         return value
     if isinstance(value, list):
@@ -264,47 +263,48 @@ def form_text(value: object) -> str:
 Record = TypeVar("Record", bound=BaseModel)
 Item = TypeVar("Item")
 
-#: Records a page.
+#: Number of records on a page.
 PAGE = 500
-#: Tries of one call, and seconds after which none is begun: time for a service to start anew.
+#: Number of attempts of a call, and seconds after which no new one starts: time for a restart of
+#: the service.
 TRIES, LIMIT_S = 8, 30.0
-#: Tries where nobody listens and nobody ever did: an address that is wrong is said soon.
+#: Number of attempts if the service never answered, so that a wrong address fails soon.
 TRIES_UNMET = 2
-#: Seconds before the second try; each further one waits about twice as long, up to the longest.
+#: Seconds before the second attempt; the delay then about doubles, up to the longest.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0
-#: Seconds of silence after which a stream is taken to be dead: it says three times that it lives.
+#: Seconds without data after which a stream counts as broken: three intervals of its heartbeat.
 SILENCE_S = 50.0
-#: Seconds before a stream that ended is asked for again, unless it said otherwise.
+#: Seconds before a stream that ended is opened again, unless the stream specifies another delay.
 STREAM_PAUSE_S = 1.0
 
 _BUSY = (HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE)
-#: What will not be otherwise the next time.
+#: Errors for which a retry is pointless.
 _HOPELESS = (httpx.UnsupportedProtocol, httpx.LocalProtocolError, httpx.ProxyError)
 
 
 class LocalWorker(Protocol):
-    """Who does the jobs where no other process does."""
+    """Protocol of the worker that runs jobs in this process."""
 
     def work(self, pause_s: float) -> None:
-        """Do a job, or wait so long where there is none to do."""
+        """Run a job, or wait `pause_s` seconds if there is none."""
 
 
 class ServiceConnection:
-    """A service, and how to ask it; the base of every topic of the client.
+    """Connection to a service; base class of the client's methods.
 
     Parameters
     ----------
-    url : of it, with http:// or https://
-    key : where it asks for one
-    timeout_s : longest silence of the service
-    transport : what carries the requests; default: the network
-    worker : who does the jobs; default: workers of the service
+    url : address of the service, with http:// or https://
+    key : key of the API; None if the service requires none
+    timeout_s : longest time without data from the service
+    transport : transport of the requests; default: the network
+    worker : worker that runs jobs in this process; default: workers of the service
 
     Raises
     ------
-    Unreachable : the address is none.
-    KeyRequired : the key is none.
-    MissingDependency : a SOCKS proxy is set, and the package for it is not installed.
+    Unreachable : If the URL is invalid.
+    KeyRequired : If the key cannot be sent in an HTTP header.
+    MissingDependency : If a SOCKS proxy is set and its package is not installed.
     """
 
     def __init__(
@@ -314,7 +314,7 @@ class ServiceConnection:
         self._url = url.rstrip("/")
         self._timeout_s = timeout_s
         self._worker = worker
-        self._met = False  # whether it has ever answered
+        self._met = False  # whether the service has ever answered
         headers = {"User-Agent": f"sceneprint-client/{__version__}"}
         if key is not None:
             headers["Authorization"] = f"Bearer {_checked_key(key)}"
@@ -328,7 +328,7 @@ class ServiceConnection:
                 timeout=timeout_s,
                 transport=transport,
                 verify=_authorities(parsed),
-                # no proxy stands before this machine
+                # Requests to this machine bypass any proxy.
                 trust_env=transport is None and not is_loopback(parsed.host),
             )
         except (httpx.InvalidURL, ValueError) as error:
@@ -336,10 +336,10 @@ class ServiceConnection:
                 f"{url!r:.200} is not the address of a service ({error}). Write it like "
                 "http://127.0.0.1:8008."
             ) from error
-        except ImportError as error:  # of socksio
+        except ImportError as error:  # socksio is missing
             raise errors.MissingDependency(
                 "ALL_PROXY, HTTP_PROXY or HTTPS_PROXY names a SOCKS proxy, which needs a package: "
-                "pip install 'httpx[socks]'. Or leave it out for this service with NO_PROXY."
+                "pip install 'httpx[socks]'. Or exclude this service from it with NO_PROXY."
             ) from error
         self._log_filter = RequestLogFilter(self._url)
         logging.getLogger("httpx").addFilter(self._log_filter)
@@ -350,27 +350,27 @@ class ServiceConnection:
         self._http.close()
 
     def _ask(self, kind: type[Record], method: str, path: str, **request: Any) -> Record:
-        """What it answers, as a record."""
+        """Send a request and return its answer as a record."""
         return read_record(kind, self._send(method, path, **request))
 
-    def _begin(self, kind: type[Record], path: str, wanted: BaseModel) -> Record:
-        """Return the job that a record asks for."""
-        document = wanted.model_dump(mode="json", exclude_unset=True)
+    def _begin(self, kind: type[Record], path: str, options: BaseModel) -> Record:
+        """Create a job from a record of its options and return it."""
+        document = options.model_dump(mode="json", exclude_unset=True)
         return self._ask(kind, "POST", path, json=document)
 
     def _bytes(self, path: str, **request: Any) -> bytes:
-        """What it answers to a GET, as it comes."""
+        """Return the bytes of the answer to a GET."""
         return self._send("GET", path, **request).content
 
     def _delete(self, path: str) -> None:
         self._send("DELETE", path)
 
     def _items(self, kind: type[Page[Item]], path: str, **parameters: Any) -> Iterator[Item]:
-        """Yield the items of all pages of a list; the first page is asked for at once."""
+        """Yield the items of all pages of a list; the first page is requested immediately."""
 
         def page_after(cursor: str | None) -> Page[Item]:
-            asked = given(**parameters, cursor=cursor, limit=PAGE)
-            return self._ask(kind, "GET", path, params=asked)
+            query = without_none(**parameters, cursor=cursor, limit=PAGE)
+            return self._ask(kind, "GET", path, params=query)
 
         def items(page: Page[Item]) -> Iterator[Item]:
             yield from page.items
@@ -381,7 +381,7 @@ class ServiceConnection:
         return items(page_after(None))
 
     def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
-        """Every call may be repeated: what is made is found, what was deleted is gone."""
+        """Send a request with retries; 404 counts as success if an earlier DELETE was lost."""
         response, lost = self._persist(lambda: self._http.request(method, path, **request))
         deleted_before = method == "DELETE" and lost > 0 and response.status_code == 404
         if response.is_success or deleted_before:
@@ -396,10 +396,10 @@ class ServiceConnection:
     def _open_stream(
         self, path: str, last: str | None, parameters: dict[str, Any]
     ) -> httpx.Response:
-        """Return a stream of events that begins behind an id."""
+        """Open a stream of events that starts after an id."""
 
         def send() -> httpx.Response:
-            headers = {"Accept": "text/event-stream"} | given(**{"Last-Event-ID": last})
+            headers = {"Accept": "text/event-stream"} | without_none(**{"Last-Event-ID": last})
             request = self._http.build_request(
                 "GET", path, params=parameters, headers=headers, timeout=SILENCE_S
             )
@@ -414,7 +414,7 @@ class ServiceConnection:
         return response
 
     def _let_work(self, pause_s: float) -> None:
-        """Let jobs come nearer to their end: do one, or wait for those who do."""
+        """Run a job in this process, or wait while workers of the service run jobs."""
         if self._worker is None:
             time.sleep(pause_s)
         else:
@@ -422,33 +422,33 @@ class ServiceConnection:
 
 
 class RequestLogFilter(logging.Filter):
-    """Keeps a line a request of one service out of the log of whoever uses the client."""
+    """Filter that removes httpx's line for each request to a service from the log."""
 
     def __init__(self, url: str) -> None:
         super().__init__()
         self._url = url
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """False for what httpx tells of requests to the service."""
+        """Return False for httpx's lines about requests to the service."""
         about = record.args if isinstance(record.args, tuple) else ()
         return not any(str(one).startswith(self._url) for one in about)
 
 
 def _checked_key(key: str) -> str:
-    """Return a key without blanks around it, such as the newline of its file; never show it."""
+    """Return a key without surrounding whitespace; errors must not show the key."""
     key = key.strip()
     if not key or not all(33 <= ord(sign) < 127 for sign in key):
         raise errors.KeyRequired(
-            "The key is empty, or has a blank or a sign in it that no key has. Copy it again, "
+            "The key is empty or contains whitespace or an invalid character. Copy it again, "
             "or unset SCENEPRINT_KEY."
         )
     return key
 
 
 def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
-    """Whose certificates are believed: those of SSL_CERT_FILE and SSL_CERT_DIR, where they are set.
+    """Return the trusted certificates: those of SSL_CERT_FILE and SSL_CERT_DIR, if set.
 
-    httpx looks at them too, but not where it is told to look for no proxies.
+    httpx reads these variables too, but not if it ignores proxies.
     """
     file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
     if url.scheme != "https" or not (file or folder):
@@ -461,31 +461,31 @@ def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
         ) from error
 
 
-#: Statuses of a proxy that reaches nobody, where it is a proxy that answers.
+#: Statuses of a proxy that cannot reach the service.
 _OF_PROXY = (502, 503, 504)
 
-# Trying again where that may help: a busy service, a broken connection.
+# Retries after temporary failures.
 
 
 def persist(
     send: Callable[[], httpx.Response], url: str, *, met: bool
 ) -> tuple[httpx.Response, int]:
-    """Send a request that may be sent twice, until it is answered.
+    """Send an idempotent request until it is answered.
 
     Parameters
     ----------
-    send : does it
-    url : of the service, for the message
-    met : whether it has answered before
+    send : function that sends the request
+    url : address of the service, for the message
+    met : whether the service has answered before
 
     Returns
     -------
-    response : the first that does not ask to come back, or the last
-    lost : tries that may have been carried out although no answer came
+    response : the first response that does not request a retry, or the last one
+    lost : number of unanswered attempts that the service may have executed
 
     Raises
     ------
-    Unreachable : no answer came.
+    Unreachable : If the service does not answer.
     """
     until, lost = time.monotonic() + LIMIT_S, 0
     for tried in range(1, TRIES + 1):
@@ -510,15 +510,15 @@ def persist(
                 return response, lost
             raise unreachable(url, error) from error
         time.sleep(pause)
-    raise AssertionError("the last try returns or raises")
+    raise AssertionError("the last attempt returns or raises")
 
 
 def unreachable(url: str, error: Exception | None) -> errors.Unreachable:
-    """No answer came, in our words."""
+    """Return the error of a service that did not answer."""
     if isinstance(error, httpx.TimeoutException):
         return errors.Unreachable(
-            f"{url} did not answer in time ({type(error).__name__}). Look into the service's log, "
-            "or give it longer."
+            f"{url} did not answer in time ({type(error).__name__}). Check the service's log, or "
+            "increase the timeout."
         )
     if "CERTIFICATE_VERIFY_FAILED" in str(error):
         return errors.Unreachable(
@@ -532,7 +532,7 @@ def unreachable(url: str, error: Exception | None) -> errors.Unreachable:
 
 
 def retry_after_s(text: str) -> float:
-    """Seconds that a header `Retry-After` asks to wait; 0 where it says nothing understood."""
+    """Return the seconds of a `Retry-After` header; 0 if its value is not understood."""
     text = text.strip()
     if text.isascii() and text.isdigit():
         return float(text[:9])
@@ -545,24 +545,24 @@ def retry_after_s(text: str) -> float:
     return max((when - datetime.now(timezone.utc)).total_seconds(), 0.0)
 
 
-# Answers: records, or problem documents back to the errors of our tree.
+# Answers as records, and problem documents as errors.
 
 
 def read_record(kind: type[Record], response: httpx.Response) -> Record:
-    """Return the record in an answer; Refused where the answer is none of ours."""
+    """Return the record in an answer; raise Refused if the answer has another format."""
     try:
         return kind.model_validate_json(response.content)
     except ValidationError as error:
         raise errors.Refused(
-            f"{response.request.url} answered with something else than this version of sceneprint "
-            "understands. Check the address, and the service's version with `sceneprint doctor`.",
+            f"The answer of {response.request.url} is not one of this version of sceneprint. "
+            "Check the address, and the service's version with `sceneprint doctor`.",
             response.status_code,
             {},
         ) from error
 
 
 def error_of(response: httpx.Response) -> errors.SceneprintError:
-    """Return the error that an answer tells of: of the class its `type` names, or else Refused."""
+    """Return the error of an answer, in the class that its `type` names, or else Refused."""
     error = _error_of(response)
     error.retry_after_s = retry_after_s(response.headers.get("Retry-After", ""))
     return error
@@ -575,11 +575,11 @@ def _error_of(response: httpx.Response) -> errors.SceneprintError:
         if response.status_code in _OF_PROXY:
             return errors.Unreachable(
                 f"{response.request.url} answered {response.status_code} {response.reason_phrase}: "
-                "a proxy before the service reaches no process that is ready. Try again later."
+                "a proxy in front of the service reaches no ready process. Try again later."
             )
         return errors.Refused(
             f"{response.request.url} answered {response.status_code} {response.reason_phrase} "
-            "without saying why, so it is hardly sceneprint. Check the address.",
+            "without a reason, so it is probably not sceneprint. Check the address.",
             response.status_code,
             {},
         )
@@ -592,39 +592,39 @@ def _error_of(response: httpx.Response) -> errors.SceneprintError:
 
 
 def problem_kinds() -> dict[str, type[errors.SceneprintError]]:
-    """Return the classes of the tree by the last part of a problem's `type`."""
+    """Return the error classes by the last part of a problem's `type`."""
     return {
         errors.kebab_case(name): kind
         for name, kind in vars(errors).items()
         if isinstance(kind, type)
         and issubclass(kind, errors.SceneprintError)
-        and not issubclass(kind, errors.ServiceError)  # ways of hearing of a service
+        and not issubclass(kind, errors.ServiceError)  # the client itself raises these
     }
 
 
 def _fields(problem: Problem) -> tuple[tuple[str, str], ...]:
-    """(place, reason) of each field at fault, as far as they are told."""
-    told: Any = (problem.model_extra or {}).get("errors")
-    if not isinstance(told, list):
+    """Return (place, reason) of each invalid field, as far as the document names them."""
+    entries: Any = (problem.model_extra or {}).get("errors")
+    if not isinstance(entries, list):
         return ()
     return tuple(
         (str(one["field"]), str(one["reason"]))
-        for one in told
+        for one in entries
         if isinstance(one, dict) and {"field", "reason"} <= one.keys()
     )
 
 
-# Streams of events, read for as long as anybody wants them.
+# Streams of events.
 
 
 @dataclass
 class StreamPosition:
-    """How far a stream has been read.
+    """Position in a stream of events.
 
     Parameters
     ----------
-    last : `id` that came last; None: there was none
-    pause_s : to wait before the stream is asked for again
+    last : id of the last event; None before the first
+    pause_s : seconds to wait before the stream is opened again
     """
 
     last: str | None
@@ -632,7 +632,7 @@ class StreamPosition:
 
 
 def read_events(lines: Iterable[str], place: StreamPosition) -> Iterator[Event]:
-    """Events of a stream; the place is moved on before each is given out."""
+    """Yield the events of a stream; each updates the position before it is yielded."""
     data: list[str] = []
     last = place.last
     for line in lines:
@@ -654,12 +654,12 @@ def read_events(lines: Iterable[str], place: StreamPosition) -> Iterator[Event]:
 def follow_stream(
     opened: Callable[[str | None], httpx.Response], after: str | None
 ) -> Iterator[Event]:
-    """Events of one stream after the other, as if it were one.
+    """Yield events without end; a stream that ends or breaks is opened again.
 
     Parameters
     ----------
-    opened : asks for a stream, from an `id` on; raises where there will be none
-    after : id of the event to begin behind; None: from now on
+    opened : function that opens a stream after an event id; raises if no stream is available
+    after : id of the event before the first one; None yields only new events
     """
     place = StreamPosition(after)
     met = False
@@ -669,19 +669,19 @@ def follow_stream(
                 met = True
                 yield from read_events(response.iter_lines(), place)
         except httpx.TransportError:
-            pass  # it broke, or was silent for too long
+            pass  # the stream broke or timed out
         except errors.Unreachable:
             if not met:
                 raise
         time.sleep(place.pause_s)
 
 
-#: Pauses between two looks at a job, seconds: the first, and the longest.
+#: First and longest pause between two checks of a job, seconds.
 _PAUSES_S = (0.02, 0.5)
 
 
 def growing_pauses(until: float) -> Iterator[float]:
-    """Growing pauses that end at a time of `time.monotonic`; none if it has come."""
+    """Yield growing pauses until a time of `time.monotonic`; none if it has passed."""
     pause, longest = _PAUSES_S
     while (left := until - time.monotonic()) > 0:
         yield min(pause, left)

@@ -1,6 +1,4 @@
-"""What a job does: jobs themselves, imports, associations, coverage, differences of sessions,
-reconstructions.
-"""
+"""Client methods for jobs: imports, associations, coverage, differences and reconstructions."""
 
 from __future__ import annotations
 
@@ -37,13 +35,13 @@ from sceneprint_client.errors import InvalidRequest, UnreadableArchive, Unreadab
 from sceneprint_client.http import (
     ServiceConnection,
     error_of,
-    given,
     growing_pauses,
     job_path,
     map_path,
     product_path,
     query_path,
     read_record,
+    without_none,
 )
 
 if TYPE_CHECKING:
@@ -51,21 +49,21 @@ if TYPE_CHECKING:
 
 
 _Product = TypeVar("_Product", bound=Product)
-#: Jobs that are looked at in one round; workers take them in about this order.
+#: Number of jobs that one round of `wait` checks; workers process jobs roughly in this order.
 _WINDOW = 8
-#: Bytes of an archive that are sent at once.
+#: Number of bytes of an archive in one piece of the request.
 _CHUNK = 1 << 20
 
 
 class JobMethods(ServiceConnection):
-    """Jobs, and what is begun as one."""
+    """Client methods for jobs and their results."""
 
     def job(self, job_id: str) -> Job:
-        """Return a job; UnknownJob if it does not exist."""
+        """Return a job; raise UnknownJob if it does not exist."""
         return self._ask(Job, "GET", job_path(job_id))
 
     def jobs(self, state: JobState | None = None) -> Iterator[Job]:
-        """Jobs of all maps, newest first, optionally only those in one state."""
+        """Yield the jobs of all maps, newest first, optionally only those in one state."""
         return self._items(Page[Job], "/v1/jobs", state=state)
 
     def cancel_job(self, job_id: str) -> Job:
@@ -73,8 +71,8 @@ class JobMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownJob : it does not exist.
-        JobOver : it has ended already.
+        UnknownJob : If the job does not exist.
+        JobOver : If the job has ended.
         """
         return self._ask(Job, "POST", f"{job_path(job_id)}/cancel")
 
@@ -83,17 +81,17 @@ class JobMethods(ServiceConnection):
 
         Returns
         -------
-        job : a new one, or the retry that exists already
+        job : the new job, or the existing retry
 
         Raises
         ------
-        UnknownJob : it does not exist.
-        CannotRetry : it did not fail, or there is nothing to retry.
+        UnknownJob : If the job does not exist.
+        CannotRetry : If the job did not fail, or there is nothing to retry.
         """
         return self._ask(Job, "POST", f"{job_path(job_id)}/retry")
 
     def retry_dead_jobs(self, map_name: str | None = None) -> Iterator[RetriedJobs]:
-        """Retry all dead jobs, or those of a map, except those already retried.
+        """Retry all dead jobs, or those of a map, except jobs with an earlier retry.
 
         Yields
         ------
@@ -101,12 +99,12 @@ class JobMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownMap : no such map.
+        UnknownMap : If the map does not exist.
         """
         cursor: str | None = None
         while True:
-            asked = given(map=map_name, cursor=cursor)
-            done = self._ask(RetriedJobs, "POST", "/v1/jobs/retry", params=asked)
+            parameters = without_none(map=map_name, cursor=cursor)
+            done = self._ask(RetriedJobs, "POST", "/v1/jobs/retry", params=parameters)
             yield done
             cursor = done.next_cursor
             if cursor is None:
@@ -120,23 +118,23 @@ class JobMethods(ServiceConnection):
 
         Parameters
         ----------
-        job_ids : of uploads
-        timeout_s : seconds after which they are returned as they are
-        progress : called with the number of ended jobs and the total
+        job_ids : ids of jobs, such as `job_id` of uploads
+        timeout_s : longest wait, seconds
+        progress : function that is called with the number of ended jobs and the total
 
         Returns
         -------
-        jobs : in the order given; `job.state.over` is False if the time ran out
+        jobs : the jobs in the order of `job_ids`; `job.state.over` is False after a timeout
 
         Raises
         ------
-        UnknownJob : one of them does not exist.
+        UnknownJob : If one of the jobs does not exist.
         """
         order, known = list(job_ids), dict[str, Job]()
         waiting = list(dict.fromkeys(order))
         total, until = len(waiting), time.monotonic() + timeout_s
         for pause in growing_pauses(until):
-            while waiting:  # without a pause, as long as some of the window are over
+            while waiting:  # repeats without a pause while jobs of the window have ended
                 window = waiting[:_WINDOW]
                 known |= {job_id: self.job(job_id) for job_id in window}
                 left = [job_id for job_id in window if not known[job_id].state.over]
@@ -150,8 +148,6 @@ class JobMethods(ServiceConnection):
             self._let_work(pause)
         return [known[job_id] if job_id in known else self.job(job_id) for job_id in order]
 
-    # archives and whole maps: imports are jobs
-
     def import_archive(
         self, map_name: str, archive: Path | BinaryIO, options: ImportOptions | None = None
     ) -> Job:
@@ -159,19 +155,18 @@ class JobMethods(ServiceConnection):
 
         Parameters
         ----------
-        map_name : of the map
-        archive : a zip, or a tar (plain, .gz, .bz2 or .xz), of a 7-Scenes scene or sequence, a TUM
-            RGB-D folder, or depth images with their intrinsics.json
-        options : metadata of all its frames; default: a name from the file's
+        archive : zip or tar (plain, .gz, .bz2 or .xz) of a 7-Scenes scene or sequence, a TUM RGB-D
+            folder, or depth images with their intrinsics.json
+        options : metadata of all frames; default: a name from that of the file
 
         Returns
         -------
-        job : wait for it with `wait`; `import_items` lists the results
+        job : the import; `wait` waits for it, and `import_items` lists its results
 
         Raises
         ------
-        UnknownMap : no such map.
-        UnreadableArchive : not an archive, or the file cannot be read.
+        UnknownMap : If the map does not exist.
+        UnreadableArchive : If the file cannot be read or is not an archive.
         """
         if not isinstance(archive, Path):
             return self._send_archive(map_name, archive, options or ImportOptions())
@@ -182,31 +177,31 @@ class JobMethods(ServiceConnection):
                 return self._send_archive(map_name, file, own)
         except OSError as error:
             raise UnreadableArchive(
-                f"{archive}: The file cannot be read ({error.strerror}). Check its name."
+                f"{archive}: The file cannot be read ({error.strerror}). Check its path."
             ) from error
 
     def import_map(
         self, map_name: str, file: Path | BinaryIO, options: ImportOptions | None = None
     ) -> Job:
-        """Import a map that comes as one file, a cloud or a mesh: a worker renders views of it.
+        """Import a map from a single file, a cloud or a mesh: a worker renders views of it.
 
         Parameters
         ----------
-        map_name : of the map that they become frames of
+        map_name : name of the map that receives the views as frames
         file : PCD, PLY (points or mesh), LAS, LAZ, OBJ, STL, glTF or E57
-        options : with `as` = `map`; default: that, and the name of the file. Of a file without a
-            path, `name` says its format by its ending
+        options : options with `as` = `map`; default: these and the file's name. For a file object,
+            the suffix of `name` determines the format
 
         Returns
         -------
-        job : wait for it with `wait`; its `result` is a MapImportResult, and `import_items` lists
-            the views
+        job : the import; its `result` is a MapImportResult, `wait` waits for it, and `import_items`
+            lists the views
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : options of an archive.
-        UnreadableCloud : no file of a map, or it cannot be read.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the options are those of an archive.
+        UnreadableCloud : If the file cannot be read or its format cannot hold a map.
         """
         if not isinstance(file, Path):
             return self._send_archive(map_name, file, _of_map(options, None))
@@ -215,16 +210,16 @@ class JobMethods(ServiceConnection):
                 return self._send_archive(map_name, opened, _of_map(options, file.name))
         except OSError as error:
             raise UnreadableCloud(
-                f"{file}: The file cannot be read ({error.strerror}). Check its name."
+                f"{file}: The file cannot be read ({error.strerror}). Check its path."
             ) from error
 
     def import_items(self, map_name: str, job_id: str) -> Iterator[ImportItem]:
-        """Results for the members of an archive so far, in their order."""
+        """Yield the results for the members of an archive so far, in the order of the archive."""
         job = job_path(job_id).rpartition("/")[2]
         return self._items(Page[ImportItem], f"{map_path(map_name)}/imports/{job}/items")
 
     def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
-        """Send an archive, from its start at each try."""
+        """Send an archive; each attempt starts at its beginning."""
         path = f"{map_path(map_name)}/imports"
         parameters = {"options": options.model_dump_json(exclude_defaults=True, by_alias=True)}
 
@@ -240,48 +235,46 @@ class JobMethods(ServiceConnection):
             raise error_of(response)
         return read_record(Job, response)
 
-    # products of maps: coverage, associations and differences of sessions
-
     def compute(
         self, kind: type[_Product], map_name: str, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None, **request: Any,
     ) -> _Product:  # fmt: skip
-        """Compute a product of a map: measure its coverage, find where two of its sessions see the
-        same places or one returns to a place, or compare two sessions.
+        """Compute a product of a map: coverage, an association, or a difference of sessions.
+
+        An association finds where two sessions see the same places, or one returns to a place.
 
         Parameters
         ----------
         kind : MapCoverage, Association or Difference
-        map_name : of the map
-        timeout_s : seconds to wait; 0 returns at once. The job continues in any case
-        progress : called with the number of finished steps and the total
+        timeout_s : longest wait, seconds; the job continues after it. 0 returns immediately
+        progress : function that is called with the number of finished steps and the total
         request : fields of NewMapCoverage, NewAssociation or NewDifference
 
         Returns
         -------
-        product : `product.state.over` is False if the time ran out
+        product : the product; `product.state.over` is False after a timeout
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : the map has no such frames, or a field is out of range.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the map lacks the requested frames, or a field is out of range.
         """
-        wanted = checked(kind.request_type, f"The {kind.noun}", **request)
-        begun = self._begin(kind, f"{map_path(map_name)}/{kind.collection}", wanted)
-        return self.wait_for_product(begun, timeout_s=timeout_s, progress=progress)
+        options = checked(kind.request_type, f"The {kind.noun}", **request)
+        product = self._begin(kind, f"{map_path(map_name)}/{kind.collection}", options)
+        return self.wait_for_product(product, timeout_s=timeout_s, progress=progress)
 
     def product(self, kind: type[_Product], map_name: str | None, job_id: str) -> _Product:
-        """Return a product as it is now; UnknownMap or UnknownJob if it does not exist.
+        """Return a product; raise UnknownMap or UnknownJob if it does not exist.
 
         Parameters
         ----------
         kind : MapCoverage, Association, Difference or Reconstruction
-        map_name, job_id : of the product; a Reconstruction has no map
+        map_name, job_id : ids of the product; `map_name` is None for a Reconstruction
         """
         return self._ask(kind, "GET", product_path(kind, map_name, job_id))
 
     def products(self, kind: type[_Product], map_name: str) -> Iterator[_Product]:
-        """Products of a map, newest first, coverage without plans; UnknownMap if it does not exist.
+        """Yield the products of a map, newest first; coverage results omit their plans.
 
         Parameters
         ----------
@@ -291,12 +284,12 @@ class JobMethods(ServiceConnection):
         return self._items(page, f"{map_path(map_name)}/{kind.collection}")
 
     def delete_product(self, kind: type[Product], map_name: str | None, job_id: str) -> None:
-        """Delete a product with its results, also while a worker computes it; see `product`.
+        """Delete a product with its results, even while a worker computes it; see `product`.
 
         Raises
         ------
-        UnknownMap, UnknownJob : it does not exist.
-        JoinStands : it is an association, whose join must be undone first.
+        UnknownMap, UnknownJob : If the map or job does not exist.
+        JoinStands : If the product is an association whose join must be undone first.
         """
         self._delete(product_path(kind, map_name, job_id))
 
@@ -304,13 +297,13 @@ class JobMethods(ServiceConnection):
         self, product: _Product, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> _Product:  # fmt: skip
-        """Return a product once it has ended, or when the time ran out.
+        """Wait until a product has ended, and return it.
 
         Parameters
         ----------
-        product : as it is known
-        timeout_s : seconds to wait
-        progress : called with the number of finished steps and the total
+        product : product to wait for
+        timeout_s : longest wait, seconds
+        progress : function that is called with the number of finished steps and the total
         """
         pauses = growing_pauses(time.monotonic() + timeout_s)
         while True:
@@ -323,16 +316,16 @@ class JobMethods(ServiceConnection):
             self._let_work(pause)
             product = self.product(type(product), product.map, product.job_id)
 
-    # associations
-
     def undo_join(self, map_name: str, job_id: str) -> Association:
-        """Undo the join of an association: poses are again as they were sent, or in the parent
-        frame that other joins lead to. The map's sessions are not joined again automatically.
+        """Undo the join of an association, and return its frames to the poses of their uploads.
+
+        Frames that other joins move keep the result of these. The sessions of the map are not
+        joined again automatically.
 
         Raises
         ------
-        UnknownMap, UnknownJob : it does not exist.
-        NotIndexed : it has not succeeded.
+        UnknownMap, UnknownJob : If the map or job does not exist.
+        NotIndexed : If the job has not succeeded.
         """
         path = f"{product_path(Association, map_name, job_id)}/join"
         return self._ask(Association, "DELETE", path)
@@ -341,19 +334,18 @@ class JobMethods(ServiceConnection):
         self, map_name: str, job_id: str, *, min_overlap: float = 0.0,
         consistent: bool | None = None,
     ) -> Iterator[Edge]:  # fmt: skip
-        """Edges of an association in the order they were found.
+        """Yield the edges of an association in the order of their discovery.
 
         Parameters
         ----------
-        map_name, job_id : of the association
-        min_overlap : least overlap
-        consistent : only edges that a second edge or a join supports (True), or that were outvoted
-            (False); default: all
+        min_overlap : smallest overlap, 0 to 1
+        consistent : True selects edges that a second edge or a join supports, False edges that
+            contradict the majority; default: all
 
         Raises
         ------
-        UnknownMap, UnknownJob : it does not exist.
-        InvalidRequest : an overlap out of range.
+        UnknownMap, UnknownJob : If the map or job does not exist.
+        InvalidRequest : If the overlap is out of range.
         """
         _check_overlap(min_overlap)
         return self._items(
@@ -365,80 +357,73 @@ class JobMethods(ServiceConnection):
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", *,
         min_overlap: float = 0.0, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
-        """Return the pose graph of an association that has succeeded, as a file.
+        """Return the pose graph of a successful association as the text of a file.
 
         Parameters
         ----------
-        map_name, job_id : of the association
-        kind : g2o, tum or json
-        min_overlap : least overlap of an edge
-        odometry : add an edge between consecutive frames, from their poses
-        consistent : only edges that a second edge of another viewpoint or a join supports; False
-            adds those that nothing checks, such as all edges of frames without poses
+        kind : file format, g2o, tum or json
+        min_overlap : smallest overlap of an edge, 0 to 1
+        odometry : whether to add an edge between consecutive frames, from their poses
+        consistent : whether to return only edges that a second edge of another viewpoint or a join
+            supports; unsupported edges include all edges of frames without poses
 
         Raises
         ------
-        UnknownMap, UnknownJob : it does not exist.
-        NotIndexed : it has not ended, or did not succeed.
-        InvalidRequest : there is no such file, or an overlap out of range.
+        UnknownMap, UnknownJob : If the map or job does not exist.
+        NotIndexed : If the job has not succeeded.
+        InvalidRequest : If the file format is unknown, or the overlap is out of range.
         """
         known = get_args(GraphFormat)
         if kind not in known:
             raise InvalidRequest(
-                f"A graph does not come as {kind!r:.80}. Give one of {', '.join(known)}.",
-                (("format", f"give one of {', '.join(known)}"),),
+                f"A graph has no format {kind!r:.80}. Pass one of {', '.join(known)}.",
+                (("format", f"pass one of {', '.join(known)}"),),
             )
         _check_overlap(min_overlap)
-        asked = {
+        parameters = {
             "format": kind, "min_overlap": min_overlap, "odometry": odometry,
             "consistent": consistent,
         }  # fmt: skip
         path = f"{product_path(Association, map_name, job_id)}/graph"
-        return self._bytes(path, params=asked).decode()
-
-    # coverage
+        return self._bytes(path, params=parameters).decode()
 
     def coverage_frames(
         self, map_name: str, job_id: str, outcome: CoverageOutcome | None = None
     ) -> Iterator[CoverageFrame]:
-        """Queried frames of a coverage job, optionally only those with one outcome.
+        """Yield the query frames of a coverage job, optionally only those with one outcome.
 
         Raises
         ------
-        UnknownMap, UnknownJob : it does not exist.
+        UnknownMap, UnknownJob : If the map or job does not exist.
         """
         path = f"{product_path(MapCoverage, map_name, job_id)}/frames"
         return self._items(Page[CoverageFrame], path, outcome=outcome)
 
     def coverage_changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
-        """Which cells became better or worse since an earlier result with the same options.
+        """Return the cells that became better or worse since an earlier job with the same options.
 
         Raises
         ------
-        UnknownMap, UnknownJob : one of them does not exist.
-        NotIndexed : one of them has not ended, or did not succeed.
-        InvalidRequest : they cannot be compared.
+        UnknownMap, UnknownJob : If the map or one of the jobs does not exist.
+        NotIndexed : If one of the jobs has not succeeded.
+        InvalidRequest : If the two results cannot be compared.
         """
         path = f"{product_path(MapCoverage, map_name, job_id)}/changes"
         return self._ask(CoverageChanges, "GET", path, params={"since": since})
 
-    # differences of sessions
-
     def difference_points(self, map_name: str, job_id: str) -> SurfacePoints:
-        """Cells of both sessions as points. `patches` gives the kind of each: SAME, GONE, NEW,
-        UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
+        """Return the cells of both sessions as points. `patches` holds the kind of each: SAME,
+        GONE, NEW, UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
 
         Raises
         ------
-        UnknownMap, UnknownJob : it does not exist.
-        NotIndexed : it has not ended, or did not succeed.
-        Refused : the service has another version.
+        UnknownMap, UnknownJob : If the map or job does not exist.
+        NotIndexed : If the job has not succeeded.
+        Refused : If the service sends another version of the format.
         """
         from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
         return decode_points(self._bytes(f"{product_path(Difference, map_name, job_id)}/points"))
-
-    # reconstructions
 
     def reconstruct(
         self, query: str | Answer, *, wait_s: float | None = None, **request: Any
@@ -448,42 +433,42 @@ class JobMethods(ServiceConnection):
         Parameters
         ----------
         query : the answer, or the id of its query
-        wait_s : seconds to wait for it; default: none
+        wait_s : longest wait for the result, seconds; default: no wait
         request : fields of NewReconstruction
 
         Returns
         -------
-        reconstruction : has a `result` when its state is `succeeded`; else `error` says why
+        reconstruction : the job; its `result` is set in the state `succeeded`, else its `error`
 
         Raises
         ------
-        UnknownQuery : the answer is not stored, or no longer.
-        InvalidRequest : it has no accepted match, or lacks a named one.
+        UnknownQuery : If the answer is not stored.
+        InvalidRequest : If the answer has no accepted match, or lacks a requested match.
         """
-        wanted = checked(NewReconstruction, "The reconstruction", **request)
+        options = checked(NewReconstruction, "The reconstruction", **request)
         query_id = query if isinstance(query, str) else query.query_id
-        begun = self._begin(Reconstruction, f"{query_path(query_id)}/reconstruction", wanted)
-        return begun if wait_s is None else self.wait_for_product(begun, timeout_s=wait_s)
+        product = self._begin(Reconstruction, f"{query_path(query_id)}/reconstruction", options)
+        return product if wait_s is None else self.wait_for_product(product, timeout_s=wait_s)
 
     def reconstruction_mesh(self, job_id: str) -> bytes:
         """Return the surface of a reconstruction as a PLY file.
 
         Raises
         ------
-        UnknownJob : it does not exist.
-        NotIndexed : it has not ended, or failed.
+        UnknownJob : If the job does not exist.
+        NotIndexed : If the job has not succeeded.
         """
         return self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
 
 
 def _of_map(options: ImportOptions | None, name: str | None) -> ImportOptions:
-    """Return the options of the import of a map; InvalidRequest where they are of an archive."""
+    """Return the options of a map import; raise InvalidRequest for those of an archive."""
     if options is None:
         own = {"as": "map"} if name is None else {"as": "map", "name": name[-64:].lstrip(".")}
         return checked(ImportOptions, "The map's name", **own)
     if options.as_ != "map":
         raise InvalidRequest(
-            "The options are those of an archive. Make them with `as` = `map`.",
+            "The options are for an archive. Pass options with `as` = `map`.",
             (("as", "not `map`"),),
         )
     return options
@@ -492,6 +477,6 @@ def _of_map(options: ImportOptions | None, name: str | None) -> ImportOptions:
 def _check_overlap(least: float) -> None:
     if not 0.0 <= least <= 1.0:
         raise InvalidRequest(
-            f"The least overlap is {least}. Give one from 0 to 1.",
-            (("min_overlap", "out of its range"),),
+            f"The smallest overlap is {least}. Pass one from 0 to 1.",
+            (("min_overlap", "out of range"),),
         )

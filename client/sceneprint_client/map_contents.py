@@ -1,6 +1,4 @@
-"""Maps and what they hold: frames and what was made of them, sessions, trajectories, and the fused
-surface.
-"""
+"""Client methods for maps and their contents: frames, sessions, trajectories and surfaces."""
 
 from __future__ import annotations
 
@@ -49,10 +47,10 @@ from sceneprint_client.http import (
     ServiceConnection,
     deletion_path,
     frame_path,
-    given,
     map_path,
     surface_path,
     surface_tile_path,
+    without_none,
 )
 
 if TYPE_CHECKING:
@@ -60,26 +58,26 @@ if TYPE_CHECKING:
 
 
 class MapMethods(ServiceConnection):
-    """Maps, their frames, and what is made of these."""
+    """Client methods for maps, their frames and the results of these."""
 
     def create_map(
         self, name: str, title: str | None = None, model: str = "depth",
         up: Sequence[float] | None = None, **limits: float | None,
     ) -> Map:  # fmt: skip
-        """Create a map, or confirm that it exists as requested.
+        """Create a map, or confirm that it exists with the same properties.
 
         Parameters
         ----------
-        name, title, model : of the map
-        up : unit vector in the parent frames of its poses; default: learnt from its frames
-        limits : `quota_frames` and `quota_bytes`, which only an operator may set, and
+        name, title, model : properties of the map
+        up : unit vector in the parent frames of its poses; default: estimated from its frames
+        limits : `quota_frames` and `quota_bytes`, which require an operator's key, and
             `retention_days`; see NewMap
 
         Raises
         ------
-        InvalidRequest : the name is not a slug, or there is no such model or limit.
-        MapExists : a map of that name has another title, model or limits.
-        Forbidden : a quota is given, and the key does not have `admin` for `*`.
+        InvalidRequest : If the name is not a slug, or the model or a limit does not exist.
+        MapExists : If a map of that name has another title, model or limits.
+        Forbidden : If a quota is set and the key does not have `admin` for `*`.
         """
         known: dict[str, Any] = limits if up is None else {**limits, "up": list(up)}
         new = checked(NewMap, "The map", name=name, title=title, model=model, **known)
@@ -90,7 +88,7 @@ class MapMethods(ServiceConnection):
         return self._ask(Page[Map], "GET", "/v1/maps").items
 
     def map(self, name: str) -> Map:
-        """Return a map; UnknownMap if it does not exist."""
+        """Return a map; raise UnknownMap if it does not exist."""
         return self._ask(Map, "GET", map_path(name))
 
     def edit_map(
@@ -99,9 +97,9 @@ class MapMethods(ServiceConnection):
     ) -> Map:  # fmt: skip
         """Edit title, limits and up of a map; parameters and errors as for `edit_frame`.
 
-        Quotas require a key with `admin` for `*`, else Forbidden. With
-        `dry_run` nothing changes, and the map is returned as it would be: `overdue` is how many
-        frames its retention would delete at once.
+        Changes of quotas raise Forbidden unless the key has `admin` for `*`. `dry_run` returns
+        the edited map without storing it; its `overdue` is the number of frames that the new
+        retention would delete immediately.
         """
         parameters = {"dry_run": "true"} if dry_run else {}
         return self._ask(
@@ -109,7 +107,7 @@ class MapMethods(ServiceConnection):
         )
 
     def delete_map(self, name: str) -> None:
-        """Delete a map with everything in it, permanently; UnknownMap if it does not exist."""
+        """Delete a map and its contents permanently; raise UnknownMap if it does not exist."""
         self._delete(map_path(name))
 
     def reencode(self, map_name: str, model: str) -> Map:
@@ -117,14 +115,13 @@ class MapMethods(ServiceConnection):
 
         Parameters
         ----------
-        map_name : of the map
         model : `depth`, `lidar`, `paper`, or the id or label of one of `models`
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : no such model.
-        Conflict : the map has this model, or is being signed with a third one.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the model does not exist.
+        Conflict : If the map has this model, or is being signed with a third model.
         """
         return self._ask(Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model})
 
@@ -133,13 +130,13 @@ class MapMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownMap : no such map.
-        Conflict : the map is not being re-encoded.
+        UnknownMap : If the map does not exist.
+        Conflict : If the map is not being re-encoded.
         """
         return self._ask(Map, "DELETE", f"{map_path(map_name)}/reencoding")
 
     def frame(self, map_name: str, frame_id: str) -> Frame:
-        """Return a frame; UnknownMap or UnknownFrame if it does not exist."""
+        """Return a frame; raise UnknownMap or UnknownFrame if it does not exist."""
         return self._ask(Frame, "GET", frame_path(map_name, frame_id))
 
     def frames(
@@ -151,65 +148,64 @@ class MapMethods(ServiceConnection):
         has_pose: bool | None = None, content_id: str | None = None, name: str | None = None,
         find: str | None = None, order: Literal["asc", "desc", "taken"] = "asc",
     ) -> Iterator[Frame]:  # fmt: skip
-        """Frames of a map in order of arrival; deleted ones only on request.
+        """Yield the frames of a map in order of arrival; deleted frames only with `state`.
 
-        A frame must meet all conditions. Frames without the field are left out.
+        A frame must meet all conditions; a frame without the field does not meet its condition.
 
         Parameters
         ----------
-        map_name : of the map
-        state : in this state
-        robot, session : this one, or one of these
-        tags : the frame has all of them
-        captured_after, captured_before : taken at that time or later, or earlier; with a zone
-        received_after, received_before : uploaded at that time or later, or earlier
-        parent_frame : of its pose
-        has_pose : whether it has one
-        content_id : hash of its samples and camera, or points and viewpoint
-        name : prefix of its name, such as "frame-000123"
-        find : prefix of its id, name or session
-        order : "desc": newest first; "taken", with one session: in the order in which its
-            frames were taken
+        state : state of the frames
+        robot, session : one or several names
+        tags : tags that a frame must all have
+        captured_after, captured_before : start (inclusive) and end of the capture time, with a
+            time zone
+        received_after, received_before : start (inclusive) and end of the upload time
+        parent_frame : parent frame of the pose
+        has_pose : whether the frames have a pose
+        content_id : hash of samples and camera, or of points and viewpoint
+        name : prefix of the name, such as "frame-000123"
+        find : prefix of the id, name or session
+        order : "asc": oldest first; "desc": newest first; "taken", with one session: order of
+            capture
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : an invalid name, or a time without a zone.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If a name is invalid, or a time has no time zone.
         """
-        wanted = checked(
+        listing = checked(
             FrameListing, "The list", state=state, robot=_names(robot), session=_names(session),
             tag=_names(tags), captured_after=captured_after, captured_before=captured_before,
             received_after=received_after, received_before=received_before,
             parent_frame=parent_frame, has_pose=has_pose, content_id=content_id, name=name,
             find=find, order=order,
         )  # fmt: skip
-        parameters = wanted.model_dump(mode="json", exclude_defaults=True)
+        parameters = listing.model_dump(mode="json", exclude_defaults=True)
         return self._items(Page[Frame], f"{map_path(map_name)}/frames", **parameters)
 
     def edit_frame(
         self, map_name: str, frame_id: str, changes: Mapping[str, Any],
         if_match: str | None = None,
     ) -> Frame:  # fmt: skip
-        """Edit the metadata of a frame; filters see the change at once.
+        """Edit the metadata of a frame; filters use the new values immediately.
 
         Parameters
         ----------
-        map_name, frame_id : of the frame
-        changes : fields of FrameEdit: omitted ones stay, None removes
+        changes : fields of FrameEdit; omitted fields are unchanged, None removes a value
         if_match : `etag` of the frame when you read it; None overwrites later edits
 
         Raises
         ------
-        UnknownMap, UnknownFrame : it does not exist, or was deleted.
-        InvalidRequest, InvalidPose : a field is unknown, cannot be edited, or is invalid.
-        PreconditionFailed : it was edited since.
+        UnknownMap, UnknownFrame : If the map or frame does not exist or was deleted.
+        InvalidRequest, InvalidPose : If a field is unknown, cannot be edited, or is invalid.
+        PreconditionFailed : If the frame was edited after you read it.
         """
         return self._ask(
             Frame, "PATCH", frame_path(map_name, frame_id), **_edit_request(changes, if_match)
         )
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
-        """Delete a frame from its map; UnknownMap or UnknownFrame if it does not exist."""
+        """Delete a frame; raise UnknownMap or UnknownFrame if it does not exist."""
         self._delete(frame_path(map_name, frame_id))
 
     def restore_frame(self, map_name: str, frame_id: str) -> Frame:
@@ -217,37 +213,34 @@ class MapMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownMap, UnknownFrame : it does not exist, or can no longer be restored.
-        Conflict : its content was uploaded again.
-        QuotaExceeded : the map has no room for it.
+        UnknownMap, UnknownFrame : If the frame does not exist or can no longer be restored.
+        Conflict : If the same content was uploaded again.
+        QuotaExceeded : If the quota of the map has no room for the frame.
         """
         return self._ask(Frame, "POST", f"{frame_path(map_name, frame_id)}/restore")
-
-    # selected frames
 
     def delete_frames(
         self, map_name: str, frame_ids: Sequence[str] | None = None,
         filter: Mapping[str, Any] | None = None,  # noqa: A002  (as in JSON)
     ) -> tuple[int, list[FrameDeletion]]:  # fmt: skip
-        """Delete frames by their ids, or all that pass a filter.
+        """Delete frames by their ids, or all frames that pass a filter.
 
         Parameters
         ----------
-        map_name : of the map
-        frame_ids : at most 1000; unknown ones are skipped
+        frame_ids : at most 1000 ids; unknown ids are skipped
         filter : conditions as for `frames`, at least one
 
         Returns
         -------
         count : number of deleted frames
-        deletions : for `restore_deletion`
+        deletions : arguments for `restore_deletion`
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : neither ids nor a filter, or both.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If you pass neither ids nor a filter, or both.
         """
-        body = given(frame_ids=_listed(frame_ids), filter=filter)
+        body = without_none(frame_ids=_listed(frame_ids), filter=filter)
         count, deletions = 0, list[FrameDeletion]()
         while True:
             done = self._ask(
@@ -263,7 +256,7 @@ class MapMethods(ServiceConnection):
         filter: Mapping[str, Any] | None = None,  # noqa: A002  (as in JSON)
         **changes: Any,
     ) -> tuple[int, list[dict[str, Any]]]:  # fmt: skip
-        """Edit frames by their ids, or all that pass a filter.
+        """Edit frames by their ids, or all frames that pass a filter.
 
         Parameters
         ----------
@@ -273,14 +266,14 @@ class MapMethods(ServiceConnection):
         Returns
         -------
         count : number of edited frames
-        inverse : arguments for the calls that undo it
+        inverse : arguments of the calls that undo the edit
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : there is nothing to change, or a frame would have too many tags.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If there is nothing to change, or a frame would have too many tags.
         """
-        body = given(frame_ids=_listed(frame_ids), filter=filter) | changes
+        body = without_none(frame_ids=_listed(frame_ids), filter=filter) | changes
         count, inverse = 0, list[dict[str, Any]]()
         while True:
             done = self._ask(FramesEdited, "POST", f"{map_path(map_name)}/frames/edit", json=body)
@@ -295,13 +288,12 @@ class MapMethods(ServiceConnection):
 
         Parameters
         ----------
-        map_name : of the map
-        deletion_id : from `deletions` or `delete_frames`
+        deletion_id : id from `deletions` or `delete_frames`
 
         Raises
         ------
-        UnknownMap, UnknownDeletion : it does not exist, or can no longer be undone.
-        QuotaExceeded : the map has no room for the frames.
+        UnknownMap, UnknownDeletion : If the deletion does not exist or can no longer be undone.
+        QuotaExceeded : If the quota of the map has no room for the frames.
         """
         path = f"{deletion_path(map_name, deletion_id)}/restore"
         count, refused = 0, dict[str, RefusedFrame]()
@@ -310,21 +302,19 @@ class MapMethods(ServiceConnection):
             count += done.frames
             refused |= {one.frame_id: one for one in done.refused}
             if not done.remaining or not done.frames:
-                told = {"frames": count, "refused": list(refused.values())}
-                return done.model_copy(update=told)
+                update = {"frames": count, "refused": list(refused.values())}
+                return done.model_copy(update=update)
 
     def deletions(self, map_name: str) -> Iterator[FrameDeletion]:
-        """Deletions that can still be undone, newest first; UnknownMap if there is no map."""
+        """Yield the deletions that can still be undone, newest first."""
         return self._items(Page[FrameDeletion], f"{map_path(map_name)}/deletions")
 
-    # sessions
-
     def sessions(self, map_name: str) -> Iterator[Session]:
-        """Sessions of a map by robot: number of frames, times, parent frames of poses.
+        """Yield the sessions of a map by robot, with frame counts, times and parent frames.
 
         Raises
         ------
-        UnknownMap : no such map.
+        UnknownMap : If the map does not exist.
         """
         return self._items(Page[Session], f"{map_path(map_name)}/sessions")
 
@@ -333,16 +323,16 @@ class MapMethods(ServiceConnection):
 
         Parameters
         ----------
-        map_name, session : of the frames
-        robot : only frames of this robot; default: of all
+        map_name, session : names of the map and the session
+        robot : robot whose frames to delete; default: all robots
 
         Raises
         ------
-        UnknownMap, UnknownSession : it does not exist.
+        UnknownMap, UnknownSession : If the map or session does not exist.
         """
         path, deleted = f"{map_path(map_name)}/sessions", 0
         while True:
-            parameters = given(session=session, robot=robot)
+            parameters = without_none(session=session, robot=robot)
             change = self._ask(SessionChange, "DELETE", path, params=parameters)
             deleted += change.frames
             if not change.remaining:
@@ -357,16 +347,16 @@ class MapMethods(ServiceConnection):
 
         Parameters
         ----------
-        map_name, session : of the frames
-        rename : new name; the name of another session joins the two
+        map_name, session : names of the map and the session
+        rename : new name; the name of another session merges the two
         rename_robot : new robot of the frames
-        add_tags, remove_tags : for all frames
-        robot : only frames of this robot; default: of all
+        add_tags, remove_tags : tags to add to and remove from all frames
+        robot : robot whose frames to edit; default: all robots
 
         Raises
         ------
-        UnknownMap, UnknownSession : it does not exist.
-        InvalidRequest : there is nothing to change, or a frame would have too many tags.
+        UnknownMap, UnknownSession : If the map or session does not exist.
+        InvalidRequest : If there is nothing to change, or a frame would have too many tags.
         """
         path, edited, after = f"{map_path(map_name)}/sessions", 0, None
         changes = {
@@ -375,7 +365,7 @@ class MapMethods(ServiceConnection):
         }  # fmt: skip
         body = {name: value for name, value in changes.items() if value}
         while True:
-            parameters = given(session=session, robot=robot, after=after)
+            parameters = without_none(session=session, robot=robot, after=after)
             change = self._ask(SessionChange, "PATCH", path, json=body, params=parameters)
             edited, after = edited + change.frames, change.last_frame_id
             if not change.remaining:
@@ -387,23 +377,22 @@ class MapMethods(ServiceConnection):
         captured_before: datetime | None = None, most: int | None = None,
         clock: Clock = "taken",
     ) -> Trajectory:  # fmt: skip
-        """Return the poses of a session in the order they were taken.
+        """Return the poses of a session in order of capture.
 
         Parameters
         ----------
-        map_name : of the map
-        session : of the run
-        robot : required if several robots have a session of that name
-        parent_frame : required if its poses have several
-        captured_after, captured_before : only this part; with a time zone
-        clock : time stamps: "captured" (`captured_at`), "sequence", or "received",
-            which every frame has; "taken": `captured_at`, or `sequence` if none has one
-        most : at most this many poses, evenly spaced; `posed` is the number of all
+        map_name, session : names of the map and the session
+        robot : name of the robot; required if several robots have a session of that name
+        parent_frame : parent frame; required if the poses have several
+        captured_after, captured_before : start and end of the capture time, with a time zone
+        clock : time stamps: "captured" (`captured_at`), "sequence", or "received" (every frame has
+            it); "taken": `captured_at`, or `sequence` if no frame has one
+        most : greatest number of poses, evenly spaced; `posed` is the number of all poses
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : the session is not unique, or too long for one answer.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the session is ambiguous, or too long for one answer.
         """
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
         return self._ask(Trajectory, "GET", **_run_request(map_name, run, "application/json"))
@@ -414,26 +403,23 @@ class MapMethods(ServiceConnection):
         captured_before: datetime | None = None, most: int | None = None,
         clock: Clock = "taken",
     ) -> str:  # fmt: skip
-        """Like `trajectory`, as the text of a TUM file."""
+        """Return the text of a TUM file; parameters and errors as for `trajectory`."""
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
         return self._bytes(**_run_request(map_name, run, "text/plain")).decode()
 
-    # what is made of a frame
-
     def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> bytes:
-        """Return the surface that a frame saw: points and normals as PLY.
+        """Return points and normals of a frame's surface as PLY.
 
         Parameters
         ----------
-        map_name, frame_id : of an indexed frame
-        within : coordinates: "optical" of the sensor, "parent" of its pose, "base" of the
-            robot
+        map_name, frame_id : names of the map and of an indexed frame
+        within : coordinate frame: "optical" (sensor), "parent" (of the pose) or "base" (robot)
 
         Raises
         ------
-        UnknownMap, UnknownFrame : it does not exist, or was deleted.
-        NotIndexed : it is not indexed, or not yet.
-        InvalidRequest : it has no pose, or no base.
+        UnknownMap, UnknownFrame : If the map or frame does not exist or was deleted.
+        NotIndexed : If the frame is not indexed.
+        InvalidRequest : If the frame lacks the pose or the base that `within` requires.
         """
         if within not in CLOUD_FRAMES:
             raise _unknown("frame", within, CLOUD_FRAMES)
@@ -443,14 +429,14 @@ class MapMethods(ServiceConnection):
         self, map_name: str, frame_id: str, within: CloudFrame = "optical",
         limit: int = MOST_DRAWN,
     ) -> SurfacePoints:  # fmt: skip
-        """Return the points of `cloud` as arrays, in a third of the bytes. Errors as for `cloud`.
+        """Return the points of `cloud` as arrays, which takes a third of the bytes.
 
         Parameters
         ----------
         map_name, frame_id, within : see `cloud`
-        limit : most points; if there are more, always the same subset
+        limit : greatest number of points; a larger cloud always yields the same subset
         """
-        from sceneprint_client.surface_encoding import decode_points  # it takes numpy
+        from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
         if within not in CLOUD_FRAMES:
             raise _unknown("frame", within, CLOUD_FRAMES)
@@ -460,47 +446,45 @@ class MapMethods(ServiceConnection):
     def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = WIDTH
     ) -> bytes:
-        """A picture of an indexed frame as PNG: "depth", "normals" or "patches". Errors as for
-        `cloud`.
+        """Return a PNG picture of an indexed frame: "depth", "normals" or "patches". Errors are
+        those of `cloud`.
         """
         if view not in VIEWS:
             raise _unknown("view", view, VIEWS)
         if not WIDTHS[0] <= width <= WIDTHS[1]:
             raise InvalidRequest(
-                f"The width is {width}. Give one from {WIDTHS[0]} to {WIDTHS[1]}.",
-                (("width", "out of its range"),),
+                f"The width is {width}. Pass a width from {WIDTHS[0]} to {WIDTHS[1]}.",
+                (("width", "out of range"),),
             )
         return self._bytes(
             f"{frame_path(map_name, frame_id)}/preview.png", params={"view": view, "width": width}
         )
 
     def patches(self, map_name: str, frame_id: str) -> FramePatches:
-        """Return the surface patches of an indexed frame. Errors as for `cloud`."""
+        """Return the surface patches of an indexed frame. Errors are those of `cloud`."""
         return self._ask(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
 
     def signature(self, map_name: str, frame_id: str) -> FrameSignature:
-        """Return the signature of an indexed frame. Errors as for `cloud`."""
+        """Return the signature of an indexed frame. Errors are those of `cloud`."""
         return self._ask(FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature")
 
     def upload_of(self, map_name: str, frame_id: str) -> bytes:
-        """Return a frame's upload, byte for byte.
+        """Return the original bytes of a frame's upload.
 
         Raises
         ------
-        UnknownMap, UnknownFrame : it does not exist, or was deleted.
-        NotIndexed : it was not kept.
+        UnknownMap, UnknownFrame : If the map or frame does not exist or was deleted.
+        NotIndexed : If the service did not store the upload.
         """
         return self._bytes(f"{frame_path(map_name, frame_id)}/upload")
 
-    # a copy of a map, part by part
-
     def map_copy(self, map_name: str, have: Sequence[str] = ()) -> tuple[MapCopy, dict[str, bytes]]:
-        """Return a map at one moment, and those parts of its rows that you lack, as many as fit.
+        """Return a map at one moment, with those missing parts of its rows that fit one answer.
 
         Raises
         ------
-        UnknownMap : there is no such map.
-        ValueError : the service sent something else.
+        UnknownMap : If the map does not exist.
+        ValueError : If the answer is not a copy of a map.
         """
         body = CopyRequest(have=list(have)).model_dump()
         data = self._send("POST", f"{map_path(map_name)}/copy", json=body).content
@@ -513,11 +497,11 @@ class MapMethods(ServiceConnection):
         return head, parts
 
     def copied_artifact(self, map_name: str, digest: str) -> bytes:
-        """What validation compares of a frame; NotFound if no indexed frame has it."""
+        """Return the validation geometry of a frame; raise NotFound for an unknown digest."""
         return self._bytes(f"{map_path(map_name)}/copy/artifacts/{digest}")
 
     def copied_model(self, map_name: str) -> bytes:
-        """Return the file of a map's model; UnknownMap if there is no such map."""
+        """Return the file of a map's model; raise UnknownMap if the map does not exist."""
         return self._bytes(f"{map_path(map_name)}/copy/model")
 
 
@@ -525,8 +509,8 @@ def _listed(names: Sequence[str] | None) -> list[str] | None:
     return None if names is None else list(names)
 
 
-def _names(given: str | Iterable[str]) -> list[str]:
-    return [given] if isinstance(given, str) else list(given)
+def _names(names: str | Iterable[str]) -> list[str]:
+    return [names] if isinstance(names, str) else list(names)
 
 
 def _run(
@@ -541,14 +525,14 @@ def _run(
 
 
 def _run_request(map_name: str, run: Run, accept: str) -> dict[str, Any]:
-    """Arguments of a request for a trajectory."""
+    """Return the arguments of a request for a trajectory."""
     parameters = run.model_dump(mode="json", exclude_none=True)
     path = f"{map_path(map_name)}/trajectory"
     return {"path": path, "params": parameters, "headers": {"Accept": accept}}
 
 
 def _edit_request(changes: Mapping[str, Any], if_match: str | None) -> dict[str, Any]:
-    """Arguments of a request that edits."""
+    """Return the arguments of a request for an edit."""
     headers = {"Content-Type": "application/merge-patch+json"}
     if if_match is not None:
         headers["If-Match"] = f'"{if_match}"'
@@ -557,47 +541,46 @@ def _edit_request(changes: Mapping[str, Any], if_match: str | None) -> dict[str,
 
 def _unknown(what: str, name: str, known: Iterable[str]) -> InvalidRequest:
     return InvalidRequest(
-        f"There is no {what} {name!r:.40}. Give one of {', '.join(known)}.", ((what, "unknown"),)
+        f"There is no {what} {name!r:.40}. Pass one of {', '.join(known)}.", ((what, "unknown"),)
     )
 
 
 class SurfaceMethods(ServiceConnection):
-    """Surfaces of maps."""
+    """Client methods for the fused surfaces of maps."""
 
     def surface(self, map_name: str) -> MapSurface:
-        """Return the fused surface of a map's posed frames; UnknownMap if it does not exist."""
+        """Return the fused surface of a map's posed frames."""
         return self._ask(MapSurface, "GET", surface_path(map_name))
 
     def begin_surface(self, map_name: str) -> MapSurface:
-        """Build the surface of a map now, or add new frames to it.
+        """Build the surface of a map immediately, or add new frames to it.
 
         Workers do this by themselves, unless `SCENEPRINT_BUILD_SURFACES` is `on_request`.
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : it has no indexed frame with a pose.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the map has no indexed frame with a pose.
         """
         return self._ask(MapSurface, "POST", surface_path(map_name))
 
     def delete_surface(self, map_name: str) -> None:
-        """Delete the surface of a map until it is requested again; UnknownMap if it is missing."""
+        """Delete the surface of a map; the service does not rebuild it until `begin_surface`."""
         self._delete(surface_path(map_name))
 
     def surface_tiles(
         self, map_name: str, parent: str | None = None, level: int = 0
     ) -> Iterator[SurfaceTile]:
-        """Tiles of a level by column, row and floor; `surface` lists the levels.
+        """Yield the tiles of a level by column, row and floor; `surface` lists the levels.
 
         Parameters
         ----------
-        map_name : of the map
-        parent : parent frame; default: the most common one
-        level : 0 for the finest
+        parent : parent frame; default: the most common parent frame
+        level : level; 0 is the finest
 
         Raises
         ------
-        UnknownMap : no such map.
+        UnknownMap : If the map does not exist.
         """
         path = f"{surface_path(map_name)}/tiles"
         return self._items(Page[SurfaceTile], path, parent=parent, level=level)
@@ -607,8 +590,8 @@ class SurfaceMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownMap : no such map.
-        NotFound : it changed or was removed: list the tiles again.
+        UnknownMap : If the map does not exist.
+        NotFound : If the tile was changed or removed; list the tiles again.
         """
         return self._bytes(surface_tile_path(map_name, digest))
 
@@ -616,50 +599,48 @@ class SurfaceMethods(ServiceConnection):
         self, map_name: str, at: Sequence[float] | None = None, *, radius: float | None = None,
         box: Sequence[float] | None = None, parent: str | None = None,
     ) -> Iterator[SurfaceSighting]:  # fmt: skip
-        """Frames that saw a spot, nearest viewpoint first; or those taken in a box.
+        """Yield frames that saw a spot, nearest viewpoint first, or frames taken within a box.
 
         Parameters
         ----------
-        map_name : of the map
         at : x, y, z of the spot, metres
-        radius : they saw something within this distance of it, metres; default: two cells
-        box : x, y, z of two corners, metres; instead of `at`
-        parent : parent frame; default: the most common one
+        radius : radius around the spot, metres; default: two cells
+        box : x, y, z of two opposite corners, metres; instead of `at`
+        parent : parent frame; default: the most common parent frame
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : neither or both of `at` and `box`, or numbers out of range.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If you pass neither `at` nor `box`, or both, or a number is out of range.
         """
-        asked: dict[str, Any] = given(
+        parameters: dict[str, Any] = without_none(
             at=None if at is None else ",".join(map(repr, map(float, at))),
             box=None if box is None else ",".join(map(repr, map(float, box))),
             radius=radius, parent=parent,
         )  # fmt: skip
-        return self._items(Page[SurfaceSighting], f"{surface_path(map_name)}/frames", **asked)
+        return self._items(Page[SurfaceSighting], f"{surface_path(map_name)}/frames", **parameters)
 
     def surface_plan(
         self, map_name: str, parent: str | None = None, *, width: int = PLAN_WIDTH,
         low: float | None = None, high: float | None = None,
     ) -> bytes:  # fmt: skip
-        """Return a surface seen from above as a PNG file, transparent where it is empty.
+        """Return a top view of a surface as a PNG file, transparent where it is empty.
 
         Parameters
         ----------
-        map_name : of the map
-        parent : parent frame; default: the most common one
-        width : of the longer side, pixels
-        low, high : only what lies between these heights, metres along up
+        parent : parent frame; default: the most common parent frame
+        width : length of the longer side, pixels
+        low, high : lowest and highest surface to draw, metres along up
 
         Raises
         ------
-        UnknownMap : no such map.
-        NotFound : no surface has that parent frame.
+        UnknownMap : If the map does not exist.
+        NotFound : If no surface has this parent frame.
         """
         if not PLAN_WIDTHS[0] <= width <= PLAN_WIDTHS[1]:
             raise InvalidRequest(
-                f"The width is {width}. Give one from {PLAN_WIDTHS[0]} to {PLAN_WIDTHS[1]}.",
-                (("width", "out of its range"),),
+                f"The width is {width}. Pass a width from {PLAN_WIDTHS[0]} to {PLAN_WIDTHS[1]}.",
+                (("width", "out of range"),),
             )
-        asked = given(parent=parent, width=width, low=low, high=high)
-        return self._bytes(f"{surface_path(map_name)}/plan.png", params=asked)
+        parameters = without_none(parent=parent, width=width, low=low, high=high)
+        return self._bytes(f"{surface_path(map_name)}/plan.png", params=parameters)

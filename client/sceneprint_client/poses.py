@@ -1,5 +1,4 @@
-"""Poses, and poses over time: rigid transforms, rotations as quaternions, trajectories, and which
-way is up.
+"""Rigid transforms, quaternions, trajectories, and the up direction from an IMU.
 
 q (4,)  --rotation_of-->  R (3, 3)  --quaternion_of-->  q with w >= 0
 q, q' (M, 4), shares (M,)  --slerp-->  (M, 4)
@@ -33,11 +32,11 @@ def rotation_of(quaternion: Floats) -> Floats:
 
 
 def quaternion_of(R: Floats) -> Floats:
-    """The unit quaternion (4,) of a rotation (3, 3): x, y, z, w, the one of both with w >= 0.
+    """Return the unit quaternion (4,), x, y, z, w with w >= 0, of a rotation (3, 3).
 
     Notes
     -----
-    4 q q^T is linear in R; its column with the largest diagonal entry is q, scaled well.
+    4 q q^T is linear in R; its column with the largest diagonal entry is a well-scaled q.
     """
     xx, yy, zz = R[0, 0], R[1, 1], R[2, 2]
     outer = np.array(
@@ -54,12 +53,12 @@ def quaternion_of(R: Floats) -> Floats:
 
 
 def slerp(q: Floats, other: Floats, w: Floats) -> Floats:
-    """Quaternions (M, 4) at the share w of the shorter arc from q to the other."""
+    """Return quaternions (M, 4) at the fraction `w` of the shorter arc from `q` to `other`."""
     cosine = np.sum(q * other, axis=1)
-    other = np.where(cosine[:, None] < 0.0, -other, other)  # q and -q are one rotation
+    other = np.where(cosine[:, None] < 0.0, -other, other)  # q and -q are the same rotation
     angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
     sine = np.sin(angle)
-    small = sine < 1e-6  # the arc is its chord there, and 0/0 is not
+    small = sine < 1e-6  # linear interpolation avoids 0/0 on a short arc
     safe = np.where(small, 1.0, sine)
     a = np.where(small, 1.0 - w, np.sin((1.0 - w) * angle) / safe)
     b = np.where(small, w, np.sin(w * angle) / safe)
@@ -68,7 +67,7 @@ def slerp(q: Floats, other: Floats, w: Floats) -> Floats:
     return mixed
 
 
-# Poses over time, and between their stamps.
+# Trajectories and interpolation.
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +77,8 @@ class SensorTrajectory:
     Parameters
     ----------
     stamps : (N,) seconds, strictly increasing
-    positions : (N, 3) metres, of the sensor in the parent frame
-    quaternions : (N, 4) x, y, z, w of unit length, sensor to parent
+    positions : (N, 3) of the sensor in the parent frame, metres
+    quaternions : (N, 4) unit quaternions x, y, z, w of T_parent_sensor
     """
 
     stamps: Floats
@@ -91,19 +90,19 @@ def interpolate(
     trajectory: SensorTrajectory, stamps: Sequence[float], *, longest_gap: float = 0.1,
     tolerance: float = 0.0,
 ) -> list[Floats | None]:  # fmt: skip
-    """Return the poses at the stamps: positions linear, rotations by slerp.
+    """Return the poses at the stamps: linear positions, and rotations by slerp.
 
     Parameters
     ----------
-    trajectory : N poses
-    stamps : M seconds, in any order
-    longest_gap : seconds between two poses beyond which nothing between them is known
-    tolerance : seconds from a pose within which it stands where nothing is interpolated
+    trajectory : trajectory of N poses
+    stamps : M stamps in any order, seconds
+    longest_gap : longest interval between two poses in which to interpolate, seconds
+    tolerance : greatest distance to a pose, seconds, that replaces a missing interpolation
 
     Returns
     -------
-    poses : M times T_parent_sensor (4, 4), or None before the first pose, after the last,
-        and within a longer gap, unless a pose is as near as the tolerance
+    poses : M times T_parent_sensor (4, 4); None before the first pose, after the last, and within a
+        longer gap, unless a pose lies within the tolerance
     """
     times = np.asarray(stamps, dtype=np.float64)
     t, last = trajectory.stamps, len(trajectory.stamps) - 1
@@ -134,22 +133,22 @@ def _transform(position: Floats, quaternion: Floats) -> Floats:
 
 
 def first_since(stamps_ns: array[int], span_ns: int) -> int:
-    """Place of the first stamp, in the order in which they came, within a span until the last."""
+    """Return the index of the first stamp within a span before the last, in order of arrival."""
     times = np.frombuffer(stamps_ns, np.int64)
     return int(np.argmax(times >= times[-1] - span_ns)) if len(times) else 0
 
 
-# Which way is up, of an accelerometer at rest.
+# The up direction from an accelerometer at rest.
 
-#: Seconds before and after a stamp over which accelerations are averaged.
+#: Half width of the window in which accelerations are averaged, seconds.
 WINDOW_S = 0.5
-#: Fewest samples of such a window.
+#: Smallest number of samples in the window.
 _FEWEST = 10
-#: At rest are mean accelerations of this length within this, m/s^2, ...
+#: The robot is at rest if the length of the mean acceleration is within this of gravity, m/s^2, ...
 _GRAVITY, _OFF = 9.81, 0.3
-#: ... that vary by less than this (standard deviation of all axes), m/s^2, ...
+#: ... the standard deviation of all axes is below this, m/s^2, ...
 _SPREAD = 0.25
-#: ... while the robot turns by less than this on average, radians per second.
+#: ... and the mean angular velocity is below this, rad/s.
 _TURN = 0.05
 _MOST_SAMPLES = 10_000_000
 
@@ -159,17 +158,17 @@ class Accelerations:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._rows = array("d")  # 6 each: acceleration, angular velocity
+        self._rows = array("d")  # rows of 6: acceleration, angular velocity
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
 
     def add(self, stamp_ns: int, acceleration: Sequence[float], turn: Sequence[float]) -> None:
-        """Take a measurement: m/s^2 and radians per second, along the IMU's axes.
+        """Add a measurement, m/s^2 and rad/s in the IMU's axes.
 
         Raises
         ------
-        DatasetError : there are more than 10 million.
+        DatasetError : If there are more than 10 million measurements.
         """
         row = [*acceleration, *turn]
         if not np.isfinite(row).all():
@@ -183,14 +182,14 @@ class Accelerations:
         self._rows.extend(row)
 
     def forget(self, span_ns: int) -> None:
-        """Drop measurements that came before those of so long until the latest."""
+        """Drop measurements that arrived more than `span_ns` before the latest."""
         old = first_since(self._stamps_ns, span_ns)
         del self._stamps_ns[:old], self._rows[: 6 * old]
 
     def up_at(self, stamps_ns: Sequence[int]) -> list[Floats | None]:
-        """Up (3,) in the IMU's axes at each stamp; None where the robot was not at rest.
+        """Return up (3,) in the IMU's axes at each stamp; None while the robot was not at rest.
 
-        At rest an accelerometer measures 9.81 m/s^2 upwards. The mean is taken over a second.
+        At rest an accelerometer measures 9.81 m/s^2 upwards. Up is the mean over one second.
         """
         recorded = np.frombuffer(self._stamps_ns, np.int64)
         order = np.argsort(recorded, kind="stable")
@@ -205,7 +204,7 @@ class Accelerations:
 
 
 def _up(rows: Floats) -> Floats | None:
-    """Up of measurements (N, 6) in a row, or None where they are not of rest."""
+    """Return up for consecutive measurements (N, 6); None if the robot was not at rest."""
     acceleration, turn = rows[:, :3], rows[:, 3:]
     mean = acceleration.mean(axis=0)
     length = float(np.linalg.norm(mean))
@@ -217,48 +216,48 @@ def _up(rows: Floats) -> Floats | None:
     return up
 
 
-TOLERANCE = 1e-2  #: how far a written rotation may be from a true one, or a length from 1
+TOLERANCE = 1e-2  #: greatest error of a rotation matrix, and of the length of a unit vector
 
 
 def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pose with its rotation made orthonormal to machine precision.
+    """Return a pose whose rotation is orthonormal to machine precision.
 
     Parameters
     ----------
-    matrix : (4, 4) T_parent_sensor, its rotation good to 1e-2
+    matrix : (4, 4) T_parent_sensor, with a rotation that is orthonormal to 1e-2
 
     Returns
     -------
-    T_parent_sensor : (4, 4) float64, the rotation nearest to the one given
+    T_parent_sensor : (4, 4) float64, with the nearest rotation
 
     Raises
     ------
-    InvalidPose : the matrix is not 4 x 4 numbers, not finite, or not rigid.
+    InvalidPose : If the matrix is not 4 x 4, not finite, or not rigid.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError) as cause:
-        raise InvalidPose("The pose is not made of numbers. Give 4 x 4 of them.") from cause
+        raise InvalidPose("The pose does not consist of numbers. Pass 4 x 4 numbers.") from cause
     if pose.shape != (4, 4):
-        raise InvalidPose(f"The pose has shape {pose.shape}. Give 4 x 4 numbers.")
+        raise InvalidPose(f"The pose has shape {pose.shape}. Pass 4 x 4 numbers.")
     if not np.isfinite(pose).all():
         raise InvalidPose(
-            "The pose is not finite, as where tracking was lost. Leave the frame or its pose out."
+            "The pose is not finite, as after a loss of tracking. Omit the frame or its pose."
         )
     if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
         raise InvalidPose(
-            "The last row of the pose is not 0 0 0 1. Give sensor-to-parent, row by row."
+            "The last row of the pose is not 0 0 0 1. Pass sensor to parent, row by row."
         )
     rotation = pose[:3, :3]
-    # entries first: the product of large ones overflows
+    # Large entries are excluded first, since their product would overflow.
     rigid = np.abs(rotation).max() < 2.0
     if not rigid or np.abs(rotation.T @ rotation - np.eye(3)).max() > TOLERANCE:
         raise InvalidPose(
             f"The rotation of the pose is not orthonormal to {TOLERANCE}. "
-            "Give a rigid transform without scale."
+            "Pass a rigid transform without scale."
         )
     if np.linalg.det(rotation) < 0.0:
-        raise InvalidPose("The rotation of the pose mirrors. Give right-handed axes.")
+        raise InvalidPose("The rotation of the pose is a reflection. Use right-handed axes.")
     left, _, right = np.linalg.svd(rotation)
     pose[:3, :3] = left @ right
     pose[3] = (0.0, 0.0, 0.0, 1.0)

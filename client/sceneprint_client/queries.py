@@ -1,6 +1,4 @@
-"""Queries: where was this frame taken, where am I, are these two frames of one place; and what
-their answers rest on.
-"""
+"""Client methods for queries: localization, similarity of two frames, and details of answers."""
 
 from __future__ import annotations
 
@@ -42,7 +40,6 @@ from sceneprint_client.http import (
     compared_frame,
     form_text,
     frames_form,
-    given,
     map_path,
     match_path,
     meta_json,
@@ -51,6 +48,7 @@ from sceneprint_client.http import (
     query_json,
     query_of,
     query_path,
+    without_none,
 )
 
 if TYPE_CHECKING:
@@ -59,12 +57,12 @@ if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput, MetaInput
     from sceneprint_client.surface_encoding import SurfacePoints
 
-#: Most frames of a ranking that are compared with each other.
+#: Greatest number of frames with pairwise similarities.
 _MOST_ALIKE = 200
 
 
 class QueryMethods(ServiceConnection):
-    """Queries, and what can be looked at after one."""
+    """Client methods for queries and their answers."""
 
     def query(
         self, map_name: str | None = None, frame: FrameInput | None = None,
@@ -72,43 +70,43 @@ class QueryMethods(ServiceConnection):
         maps: str | Iterable[str] | None = None, up: Sequence[float] | None = None,
         robot: str | None = None, **how: Unpack[QueryOptions],
     ) -> Answer:  # fmt: skip
-        """Where was this frame taken? The frame is not added to the map.
+        """Return the frames of a map that show the place of a frame, without storing the frame.
 
         Parameters
         ----------
-        map_name : of the map
-        frame, meta : as for `upload`
-        frame_id : a frame of the map, instead of `frame`; it does not find itself
-        maps : names of maps of one model to search together, or `*` for all, instead of
+        frame, meta : the frame to search for, as for `upload`
+        frame_id : id of a frame of the map, instead of `frame`; the frame itself is excluded
+        maps : names of maps with the same model to search together, or `*` for all, instead of
             `map_name`; with `frame_id`, `map_name` is the map of that frame
-        up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar
-        robot : who asks, for the record of the query; default: from `meta`
-        how : k, stages, exact, filter, seed and the other fields of Query; a filter, and
-            other options with fields, as a dictionary or a record
+        up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar file
+        robot : name of the robot for the query log; default: from `meta`
+        how : fields of Query, such as k, stages, exact, filter and seed; nested options are
+            dictionaries or records
 
         Raises
         ------
-        UnknownMap, UnknownFrame : it does not exist.
-        FrameError, DatasetError : the frame cannot be read, or nothing in it can be signed.
-        InvalidRequest : an option is out of range, the frame of the map is not indexed, or
+        UnknownMap, UnknownFrame : If the map or frame does not exist.
+        FrameError, DatasetError : If the frame cannot be read or has no surface to sign.
+        InvalidRequest : If an option is out of range, the frame of the map is not indexed, or
             the maps have different models.
-        TypeError : not exactly one of `frame` and `frame_id`, no map, or an unknown option.
+        TypeError : If not exactly one of `frame` and `frame_id` is passed, no map is passed, or
+            an option is unknown.
         """
         check_options(how)
         if maps is None:
-            name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
-            request = _query_request(wanted, query_of(Query, how), robot)
+            name, query_frame = named_or_sent(map_name, frame, meta, frame_id, up)
+            request = _query_request(query_frame, query_of(Query, how), robot)
             return self._ask(Answer, "POST", f"{map_path(name)}/queries", **request)
         if (frame_id is None) != (map_name is None):
-            raise TypeError("with `maps`, give `map_name` where `frame_id` names a frame of it")
-        _, wanted = named_or_sent(map_name or "", frame, meta, frame_id, up)
-        named = wanted if isinstance(wanted, NamedFrame) else None
-        asked = maps if isinstance(maps, str) else list(maps)
-        several = query_of(SeveralQuery, how, maps=asked, frame=named)
-        if isinstance(wanted, NamedFrame):
-            request = {"json": {**query_json(several), **given(robot=robot)}}
+            raise TypeError("with `maps`, pass `map_name` only with `frame_id`")
+        _, query_frame = named_or_sent(map_name or "", frame, meta, frame_id, up)
+        named = query_frame if isinstance(query_frame, NamedFrame) else None
+        names = maps if isinstance(maps, str) else list(maps)
+        several = query_of(SeveralQuery, how, maps=names, frame=named)
+        if isinstance(query_frame, NamedFrame):
+            request = {"json": {**query_json(several), **without_none(robot=robot)}}
         else:
-            request = query_form(*_with_robot(robot, *wanted), several)
+            request = query_form(*_with_robot(robot, *query_frame), several)
         return self._ask(Answer, "POST", "/v1/queries", **request)
 
     def localize(
@@ -117,35 +115,35 @@ class QueryMethods(ServiceConnection):
         up: Sequence[float] | None = None, robot: str | None = None,
         **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
-        """Where in a map was this frame taken? One status and one pose; see `query`."""
+        """Return the status and pose of a frame in a map; see `query` for the parameters."""
         check_options(how)
-        name, wanted = named_or_sent(map_name, frame, meta, frame_id, up)
-        request = _query_request(wanted, query_of(Query, how), robot)
+        name, query_frame = named_or_sent(map_name, frame, meta, frame_id, up)
+        request = _query_request(query_frame, query_of(Query, how), robot)
         return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
 
     def localize_sequence(
         self, map_name: str, frames: Sequence[FrameInput],
         metas: Sequence[MetaInput] | None = None, **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
-        """Where in a map was the last of these frames taken? The earlier ones vote for it too.
+        """Return the pose of the last of several frames; the earlier ones contribute evidence.
 
         Parameters
         ----------
-        map_name : of the map
-        frames : 2 to 10 in the order they were taken, as for `upload`
-        metas : of each; their poses, in one parent frame of any name, are the odometry. Default:
-            what lies beside the files
+        frames : 2 to 10 frames in the order of capture, as for `upload`
+        metas : metadata of each frame; their poses, in any common parent frame, are the odometry.
+            Default: metadata from sidecar files
         how : see `query`
 
         Raises
         ------
-        InvalidRequest : too few or too many frames, another number of metadata, or no odometry.
+        InvalidRequest : If there are too few or too many frames, or metadata or odometry is
+            missing.
         """
         check_options(how)
         if metas is not None and len(metas) != len(frames):
             raise InvalidRequest(
-                f"There are {len(frames)} frames and {len(metas)} `metas`. Give one for each.",
-                (("metas", "not one for each"),),
+                f"There are {len(frames)} frames and {len(metas)} `metas`. Pass one for each.",
+                (("metas", "pass one for each frame"),),
             )
         request = frames_form(frames, [None] * len(frames) if metas is None else metas)
         query = query_json(query_of(Query, how))
@@ -159,19 +157,19 @@ class QueryMethods(ServiceConnection):
         validation: ValidationOptions | dict[str, Any] | None = None, seed: int = 0,
         model: str | None = None,
     ) -> Similarity:  # fmt: skip
-        """How similar are two frames, and do they see the same place?
+        """Return the similarity of two frames, and whether they show the same place.
 
         Parameters
         ----------
-        a, b : each a frame as for `upload`, or a stored one: (map, frame id)
-        meta_a, meta_b : metadata of those that are not stored
+        a, b : a frame as for `upload`, or a stored frame as (map, frame id)
+        meta_a, meta_b : metadata of frames that are not stored
         validate, validation, seed, model : see Comparison
 
         Raises
         ------
-        UnknownMap, UnknownFrame : it does not exist.
-        FrameError, DatasetError : a frame cannot be read, or nothing in it can be signed.
-        InvalidRequest : an option is out of range, or the frames have different models.
+        UnknownMap, UnknownFrame : If the map or frame does not exist.
+        FrameError, DatasetError : If a frame cannot be read or has no surface to sign.
+        InvalidRequest : If an option is out of range, or the frames have different models.
         """
         how = checked(
             Comparison, "The comparison", validate=validate, validation=validation, seed=seed,
@@ -191,28 +189,26 @@ class QueryMethods(ServiceConnection):
         fields = {name: form_text(value) for name, value in body.items()}
         return self._ask(Similarity, "POST", "/v1/similarity", files=files, data=fields)
 
-    # the queries that came
-
     def queries(
         self, map_name: str | None = None, *,
         status: RecordStatus | Iterable[RecordStatus] = (), robot: str | None = None,
         since: datetime | str | None = None, until: datetime | str | None = None,
         kept: bool = False,
     ) -> Iterator[QueryRecord]:  # fmt: skip
-        """Return past queries, newest first; they are stored for 30 days by default.
+        """Yield past queries, newest first; the service stores them for 30 days by default.
 
         Parameters
         ----------
-        map_name : only of this map; default: all that the key may read
-        status : this one, or one of these
-        robot : only of this robot
-        since, until : from that time on, and before that time; with a zone
-        kept : only queries with a kept answer, see `keep_answer`
+        map_name : name of a map; default: all maps that the key may read
+        status : one or several statuses
+        robot : name of a robot; default: all robots
+        since, until : start (inclusive) and end (exclusive) of the period, with a time zone
+        kept : whether to return only queries with a kept answer, see `keep_answer`
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : an invalid status or time.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the status or a time is invalid.
         """
         statuses = [status] if isinstance(status, str) else list(status)
         return self._items(
@@ -225,24 +221,22 @@ class QueryMethods(ServiceConnection):
 
         Raises
         ------
-        UnknownMap : no such map.
-        Forbidden : the key does not have `admin` for it.
+        UnknownMap : If the map does not exist.
+        Forbidden : If the key does not have `admin` for the map.
         """
         self._send("DELETE", "/v1/queries", params={"map": map_name})
-
-    # what can be looked at after a query
 
     def answer(self, query_id: str) -> Answer:
         """Return the answer to an earlier query while it is stored.
 
         Raises
         ------
-        UnknownQuery : it is not stored, or no longer.
+        UnknownQuery : If the query is not stored.
         """
         return self._ask(Answer, "GET", query_path(query_id))
 
     def stored_query(self, query_id: str) -> StoredQuery:
-        """Return how an earlier query was sent, and when its answer expires; UnknownQuery."""
+        """Return the parameters of an earlier query and the expiry of its answer."""
         return self._ask(StoredQuery, "GET", f"{query_path(query_id)}/question")
 
     def keep_answer(self, query_id: str, title: str | None = None) -> QueryRecord:
@@ -250,56 +244,56 @@ class QueryMethods(ServiceConnection):
 
         Parameters
         ----------
-        query_id : of the answer
-        title : a label for people
+        query_id : id of the query
+        title : label for people
 
         Raises
         ------
-        UnknownQuery : it is no longer stored.
-        QuotaExceeded : too many answers are kept.
-        InvalidRequest : the title is too long.
+        UnknownQuery : If the query is no longer stored.
+        QuotaExceeded : If too many answers are kept.
+        InvalidRequest : If the title is too long.
         """
-        body = given(title=title)
+        body = without_none(title=title)
         return self._ask(QueryRecord, "PUT", f"{query_path(query_id)}/keep", json=body)
 
     def release_answer(self, query_id: str) -> None:
-        """Release a kept answer; UnknownQuery if it is not kept."""
+        """Release a kept answer; raise UnknownQuery if it is not kept."""
         self._send("DELETE", f"{query_path(query_id)}/keep")
 
     def query_cloud(self, query_id: str) -> bytes:
-        """Return the surface that a query saw: points and normals as PLY, in its sensor's frame.
+        """Return points and normals of a query's surface as PLY, in the frame of its sensor.
 
         Raises
         ------
-        UnknownQuery : its answer is not stored, or no longer.
-        NotIndexed : it ran without validation.
+        UnknownQuery : If the answer is not stored.
+        NotIndexed : If the query ran without validation.
         """
         return self._bytes(f"{query_path(query_id)}/cloud.ply")
 
     def query_points(self, query_id: str, limit: int = MOST_DRAWN) -> SurfacePoints:
-        """The points of `query_cloud` as arrays, at most `limit`. Errors as for `query_cloud`."""
-        from sceneprint_client.surface_encoding import decode_points  # it takes numpy
+        """Return at most `limit` points of `query_cloud` as arrays."""
+        from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
         path = f"{query_path(query_id)}/points"
         return decode_points(self._bytes(path, params={"limit": limit}))
 
     def similarities(self, query_id: str, limit: int = 50) -> Similarities:
-        """Pairwise similarities of a query and its nearest frames.
+        """Return pairwise similarities of a query and its nearest frames.
 
         Parameters
         ----------
-        query_id : of an answer
-        limit : how many frames of the ranking, 1 to 200
+        query_id : id of the query
+        limit : number of frames of the ranking, 1 to 200
 
         Raises
         ------
-        UnknownQuery : its answer is not stored, or no longer.
-        InvalidRequest : a limit out of range.
+        UnknownQuery : If the answer is not stored.
+        InvalidRequest : If a limit is out of range.
         """
         if not 1 <= limit <= _MOST_ALIKE:
             raise InvalidRequest(
-                f"{limit} frames cannot be compared with each other. Ask for 1 to {_MOST_ALIKE}.",
-                (("limit", f"give 1 to {_MOST_ALIKE}"),),
+                f"{limit} frames cannot be compared with each other. Pass 1 to {_MOST_ALIKE}.",
+                (("limit", f"pass 1 to {_MOST_ALIKE}"),),
             )
         return self._ask(
             Similarities, "GET", f"{query_path(query_id)}/similarities", params={"limit": limit}
@@ -308,49 +302,49 @@ class QueryMethods(ServiceConnection):
     def match_details(
         self, query_id: str, frame_id: str, map_name: str | None = None
     ) -> MatchDetails:
-        """One match of a query, validated again, with the data behind its figures.
+        """Validate one match of a query again, and return its details.
 
         Parameters
         ----------
-        query_id, frame_id : of an answer, and of one of its matches
-        map_name : if matches from several maps have that id; default: the first of them
+        query_id, frame_id : id of the query, and id of one of its matches
+        map_name : map of the match if several maps have this frame id; default: the first
 
         Raises
         ------
-        UnknownQuery : its answer is not stored, or no longer.
-        UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
-        NotIndexed : the query ran without validation, or the map has another model now.
+        UnknownQuery : If the answer is not stored.
+        UnknownMap, UnknownFrame : If no match has this id, or its frame was deleted.
+        NotIndexed : If the query ran without validation, or the map now has another model.
         """
         return self._ask(
-            MatchDetails, "GET", match_path(query_id, frame_id), params=given(map=map_name)
+            MatchDetails, "GET", match_path(query_id, frame_id), params=without_none(map=map_name)
         )
 
     def overlay(
         self, query_id: str, frame_id: str, map_name: str | None = None,
         color: OverlayColour = "source", transform: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
-        """Return points of a query and a match, coloured, as PLY in the match's sensor frame.
+        """Return coloured points of a query and a match as PLY, in the frame of the match's sensor.
 
         Parameters
         ----------
         query_id, frame_id, map_name : see `match_details`
-        color : by "source", "normal" or "residual"
-        transform : "aligned" (the accepted one), "rival" (the next best), or "none"
+        color : source of the colour: "source", "normal" or "residual"
+        transform : "aligned" (the accepted one), "rival" (the second best), or "none"
 
         Raises
         ------
-        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : see `match_details`.
-        InvalidRequest : no such transform or color.
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `match_details`.
+        InvalidRequest : If the transform or color is not supported.
         """
         for name, value, known in (("color", color, COLOURS), ("transform", transform, TRANSFORMS)):
             if value not in known:
                 raise InvalidRequest(
-                    f"{value!r:.80} is no {name} of an overlay. Give one of {', '.join(known)}.",
-                    ((name, f"give one of {', '.join(known)}"),),
+                    f"An overlay has no {name} {value!r:.80}. Pass one of {', '.join(known)}.",
+                    ((name, f"pass one of {', '.join(known)}"),),
                 )
         return self._bytes(
             f"{match_path(query_id, frame_id)}/overlay.ply",
-            params=given(map=map_name, color=color, transform=transform),
+            params=without_none(map=map_name, color=color, transform=transform),
         )
 
 
@@ -359,15 +353,15 @@ def _as_text(at: datetime | str | None) -> str | None:
 
 
 def _query_request(frame: QueryFrame, query: Query, robot: str | None) -> dict[str, Any]:
-    """Arguments of a request that asks for a stored frame of the map, or for one at hand."""
+    """Return the arguments of a request for a query with a stored or a new frame."""
     if isinstance(frame, NamedFrame):
-        named = {"frame_id": frame.frame_id, **given(robot=robot)}
+        named = {"frame_id": frame.frame_id, **without_none(robot=robot)}
         return {"json": {**named, **query_json(query)}}
     return query_form(*_with_robot(robot, *frame), query)
 
 
 def _with_robot(robot: str | None, data: bytes, meta: FrameMeta) -> tuple[bytes, FrameMeta]:
-    """Return a frame with the robot that sends the query, unless its metadata names one."""
+    """Add the name of the querying robot to a frame whose metadata names none."""
     if robot is None or meta.robot is not None:
         return data, meta
     return data, meta.model_copy(update={"robot": robot})

@@ -1,10 +1,10 @@
-"""Where a robot is, of the messages that its topics carry: the node for ROS 2 without ROS.
+"""Localization of a robot from ROS messages: the logic of the ROS 2 node, without ROS.
 
-Image | CompressedImage | PointCloud2  --Relocaliser.take_frame-->  questions to a service
+Image | CompressedImage | PointCloud2  --Relocaliser.take_frame-->  queries to a service
 CameraInfo, TFMessage, Odometry, Imu  --Relocaliser.take_...-->  camera, poses, up
 stamp  --Relocaliser.report-->  Report  --write_pose | write_transform-->  messages
 
-Messages are any objects with the attributes that ROS gives them: see ros_messages.
+A message is any object with the attributes of its ROS type; see ros_messages.
 """
 
 from __future__ import annotations
@@ -43,34 +43,34 @@ from sceneprint_client.transforms import TransformTree, frame_name
 if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput
 
-#: Seconds of transforms and accelerations that are remembered.
+#: Period for which transforms and accelerations are stored, seconds.
 _MEMORY_S = 10.0
-#: Messages after which the rest is forgotten.
+#: Number of messages between two removals of old data.
 _SWEPT_AFTER = 512
-#: A frame so many seconds older than the last one says that the clock jumped.
+#: A frame that is older than the last one by this indicates a jump of the clock, seconds.
 _JUMP_S = 1.0
-#: Frames that may wait for their transforms.
+#: Greatest number of frames that wait for their transforms.
 _MOST_WAITING = 64
-#: What `report` says of a robot that saw nothing yet.
-_NOTHING = "no frame has come"
+#: Message of a report before the first frame.
+_NOTHING = "no frame has arrived"
 
 
 @dataclass(frozen=True)
 class RelocaliserParameters:
-    """What the relocaliser takes for granted.
+    """Parameters of a Relocaliser.
 
     Parameters
     ----------
-    odom_frame : what the robot's odometry leads to
-    base_frame : of the robot
-    parent_frame : what of the service's map is called `map` here; empty: what the first fix leads
-        to. A fix that leads elsewhere is not reported, as nothing joins the two
+    odom_frame : parent frame of the robot's odometry
+    base_frame : frame of the robot's base
+    parent_frame : parent frame of the service's map that is published as `map`; empty: that of the
+        first fix. A fix in another parent frame is not reported, since no transform relates them
     rectified : whether depth images are rectified, so that their camera is P of the camera info
-    interval_s : fewest seconds between two frames that are asked for
-    wait_s : how long a frame waits for its transforms, by the stamps of later frames
-    stale_s : without a frame for so long nothing is reported as known
-    planar : whether the robot drives on the plane z = 0 of the map: `T_map_odom` then keeps x, y
-        and the heading of the base, and the rest is zero
+    interval_s : shortest time between two queried frames, seconds
+    wait_s : longest wait of a frame for its transforms, by the stamps of later frames, seconds
+    stale_s : age of the last frame from which no pose is reported, seconds
+    planar : whether the robot drives on the plane z = 0 of the map; `T_map_odom` then keeps only
+        x, y and the heading of the base
     """
 
     odom_frame: str = "odom"
@@ -94,11 +94,11 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class TrackedPose:
-    """Where a robot is that is tracked.
+    """Pose of a tracked robot.
 
     Parameters
     ----------
-    T_map_odom, T_map_base : (4, 4)
+    T_map_odom, T_map_base : (4, 4) poses of odometry and base in the map
     covariance : (6, 6) of T_map_base, errors (x, y, z, rx, ry, rz) along the axes of the map
     """
 
@@ -109,15 +109,15 @@ class TrackedPose:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What may be told to other nodes.
+    """State for other ROS nodes.
 
     Parameters
     ----------
-    state : of the tracker
-    stamp_ns : of the frame that it is told for, nanoseconds; 0 before the first
-    pose : while tracking, else None
-    is_fix : whether it tracks now, and did not by the last report
-    level, message, values : for diagnostics
+    state : state of the tracker
+    stamp_ns : stamp of the latest frame, nanoseconds; 0 before the first
+    pose : pose while tracking, else None
+    is_fix : whether the robot is tracked and was not at the last report
+    level, message, values : fields of the diagnostics
     """
 
     state: State
@@ -131,7 +131,7 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Where odometry says that the robot was when a frame was taken."""
+    """Pose from odometry at the time of a frame."""
 
     stamp_ns: int
     T_odom_sensor: Floats
@@ -139,14 +139,14 @@ class _Place:
 
 
 class Relocaliser:
-    """Takes messages in the order in which they come, and asks a service in a thread of its own.
+    """Consumer of ROS messages that queries a service in its own thread.
 
-    To be called by one thread; to be closed, or used in `with`.
+    Call it from one thread, and close it or use it in `with`.
 
     Parameters
     ----------
-    tracker : which nobody else updates
-    parameters : default: RelocaliserParameters()
+    tracker : tracker that nothing else updates
+    parameters : parameters; default: RelocaliserParameters()
     """
 
     def __init__(self, tracker: Tracker, parameters: RelocaliserParameters | None = None) -> None:
@@ -160,20 +160,20 @@ class Relocaliser:
         self._waiting: deque[tuple[int, Any]] = deque()
         self._newest_ns = self._unswept = 0
         self._last: _Place | None = None
-        self._asked_ns: int | None = None
+        self._queried_ns: int | None = None
         self._parent = self.parameters.parent_frame
         self._was_tracking = False
         self._error, self._error_at = "", 0
 
-    # What comes in.
+    # Input.
 
     def take_camera_info(self, message: Any) -> None:
-        """Take a sensor_msgs CameraInfo; one of a camera that is not calibrated says nothing."""
+        """Take a sensor_msgs CameraInfo; that of an uncalibrated camera is ignored."""
         if is_calibrated(message):
             self._info = message
 
     def take_transforms(self, message: Any, *, fixed: bool) -> None:
-        """Take a tf2_msgs TFMessage; `fixed` are those of /tf_static."""
+        """Take a tf2_msgs TFMessage; `fixed` marks messages of /tf_static."""
         for one in message.transforms:
             parent, child = str(one.header.frame_id), str(one.child_frame_id)
             self._edges_of_tf.add((frame_name(parent), frame_name(child)))
@@ -182,7 +182,7 @@ class Relocaliser:
         self._sweep()
 
     def take_odometry(self, message: Any) -> None:
-        """Take a nav_msgs Odometry; where tf says the same, it is passed over."""
+        """Take a nav_msgs Odometry; it is ignored if tf has the same transform."""
         parent, child = frame_name(message.header.frame_id), frame_name(message.child_frame_id)
         if parent and child and (parent, child) not in self._edges_of_tf:
             row = pose_row(message.pose.pose)
@@ -190,7 +190,7 @@ class Relocaliser:
             self._sweep()
 
     def take_imu(self, message: Any) -> None:
-        """Take a sensor_msgs Imu; one without an accelerometer says nothing."""
+        """Take a sensor_msgs Imu; it is ignored if it has no accelerometer."""
         if float(message.linear_acceleration_covariance[0]) < 0:
             return
         frame = frame_name(message.header.frame_id)
@@ -203,14 +203,15 @@ class Relocaliser:
         self._sweep()
 
     def take_frame(self, message: Any) -> None:
-        """Take a sensor_msgs Image or CompressedImage of depth, or PointCloud2; it waits until
-        its transforms are there, and `step` looks.
+        """Take a sensor_msgs depth Image, CompressedImage or PointCloud2.
+
+        The frame waits for its transforms until a call of `step` finds them.
         """
         stamp = stamp_of(message.header)
         self.counts["frames"] += 1
         if stamp <= 0:
             self.counts["unreadable"] += 1
-            self._note(SceneprintError("A frame has no stamp. Set the clock of its driver."))
+            self._note(SceneprintError("A frame has no stamp. Check the clock of its driver."))
             return
         if self._newest_ns - stamp > _JUMP_S * 1e9:
             self._restart("the clock jumped back")
@@ -220,13 +221,13 @@ class Relocaliser:
             self._waiting.popleft()
             self.counts["without_transform"] += 1
 
-    def relocalise(self, reason: str = "it was asked to relocalise") -> None:
-        """Forget the place; the next frame is asked for at once, without a prior."""
+    def relocalise(self, reason: str = "relocalisation was requested") -> None:
+        """Forget the pose; the next frame is queried immediately, without a prior."""
         self._tracker.reset(reason)
-        self._asked_ns, self._was_tracking = None, False
+        self._queried_ns, self._was_tracking = None, False
 
     def step(self) -> int:
-        """Go on with frames whose transforms are there now; how many they were."""
+        """Process frames whose transforms have arrived, and return their number."""
         done = 0
         while self._waiting:
             stamp, message = self._waiting[0]
@@ -242,11 +243,11 @@ class Relocaliser:
         return done
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Until all that was asked is answered; False where that takes longer."""
+        """Wait until all queries are answered; return False after a timeout."""
         return self._questions.wait(timeout_s)
 
     def close(self) -> None:
-        """Ask no more; a question that is under way is waited for."""
+        """Stop querying; wait for a query in progress."""
         self._questions.close()
 
     def __enter__(self) -> Relocaliser:
@@ -260,7 +261,7 @@ class Relocaliser:
         return 0 if self._last is None else self._last.stamp_ns
 
     def _sweep(self) -> None:
-        """Forget what is too old for any frame, now and then."""
+        """Remove old data at intervals."""
         self._unswept += 1
         if self._unswept >= _SWEPT_AFTER:
             self._unswept = 0
@@ -269,7 +270,7 @@ class Relocaliser:
                 self._imu[1].forget(round(_MEMORY_S * 1e9))
 
     def _restart(self, reason: str) -> None:
-        """Begin anew with another clock; what is fixed stays."""
+        """Start again with another clock; fixed transforms remain."""
         self._tree.forget_moving()
         self._imu, self._last = None, None
         self._waiting.clear()
@@ -287,11 +288,11 @@ class Relocaliser:
         return _Place(stamp_ns, T_odom_sensor, T_odom_base)
 
     def _go_on(self, place: _Place, message: Any) -> None:
-        """Move the tracker to a frame, and ask for the frame where it is time to."""
+        """Move the tracker to a frame, and query the frame if the interval has passed."""
         self._last = place
         stamp = place.stamp_ns * 1e-9
-        asked = self._asked_ns
-        if asked is not None and place.stamp_ns - asked < self.parameters.interval_s * 1e9:
+        previous = self._queried_ns
+        if previous is not None and place.stamp_ns - previous < self.parameters.interval_s * 1e9:
             self._tracker.move(place.T_odom_sensor, stamp)
             return
         try:
@@ -304,19 +305,19 @@ class Relocaliser:
         try:
             up = self._up(message, place.stamp_ns)
             self._questions.submit(frame, place.T_odom_sensor, up, stamp, meta=camera)
-        except SceneprintError as error:  # of the question before
+        except SceneprintError as error:  # raised by the previous query
             self._note(error)
         else:
-            self._asked_ns = place.stamp_ns
+            self._queried_ns = place.stamp_ns
             self.counts["asked"] += 1
 
     def _frame(self, message: Any) -> tuple[FrameInput, CameraIntrinsics | None]:
-        """What is sent of a message; raises as the functions of ros_messages."""
+        """Return frame and camera of a message for the query."""
         if hasattr(message, "point_step"):
             return cloud_points(message), None
         if self._info is None:
             raise SceneprintError(
-                "No calibrated camera info has come. Check the topic of the camera info."
+                "No calibrated camera info has arrived. Check the topic of the camera info."
             )
         k = camera_intrinsics(self._info, rectified=self.parameters.rectified)
         camera = CameraIntrinsics(
@@ -328,12 +329,12 @@ class Relocaliser:
         return compressed_depth(message).body(), camera
 
     def _up(self, message: Any, stamp_ns: int) -> tuple[float, float, float] | None:
-        """Up in the sensor's axes, while the robot is at rest."""
+        """Return up in the sensor's axes while the robot is at rest, else None."""
         if self._imu is None:
             return None
         frame, accelerations = self._imu
         T_sensor_imu = self._tree.fixed_transform(frame_name(message.header.frame_id), frame)
-        # what comes after the frame is not there yet: the window ends with it
+        # Later measurements have not arrived yet, so the window ends at the frame.
         (up,) = accelerations.up_at([stamp_ns - round(WINDOW_S * 1e9)])
         if T_sensor_imu is None or up is None:
             return None
@@ -343,14 +344,14 @@ class Relocaliser:
     def _note(self, error: SceneprintError) -> None:
         self._error, self._error_at = str(error), self._questions.answered
 
-    # What goes out.
+    # Output.
 
     def report(self, now_ns: int) -> Report:
-        """What may be told by what has come so far.
+        """Return the state for other nodes.
 
         Parameters
         ----------
-        now_ns : by the clock of the stamps
+        now_ns : current time on the clock of the stamps, nanoseconds
         """
         state, last = self._tracker.state(), self._last
         silent_s = (now_ns - self._last_ns) * 1e-9
@@ -368,7 +369,7 @@ class Relocaliser:
         level = Level.OK if pose is not None else Level.WARN
         message = f"{state.status}: {state.reason}"
         if is_elsewhere:
-            message = f"tracked in {state.parent_frame}, and the map here is {self._parent}"
+            message = f"tracked in {state.parent_frame}, but this map is {self._parent}"
         if is_stale:
             level = Level.STALE
             message = self._silence(silent_s)
@@ -381,9 +382,9 @@ class Relocaliser:
         )  # fmt: skip
 
     def _pose(self, state: State, last: _Place) -> TrackedPose:
-        """Of a state that is tracked."""
+        """Return the pose of a tracked state."""
         if state.T_map_odom is None or state.T_map_sensor is None or state.covariance is None:
-            raise AssertionError("what is tracked has a pose")
+            raise AssertionError("a tracked state has a pose")
         T_map_odom, T_map_base = state.T_map_odom, state.T_map_odom @ last.T_odom_base
         covariance = shifted_covariance(
             state.covariance, T_map_base[:3, 3] - state.T_map_sensor[:3, 3]
@@ -394,17 +395,17 @@ class Relocaliser:
         return TrackedPose(T_map_odom, T_map_base, covariance)
 
     def _silence(self, silent_s: float) -> str:
-        """Why there is no frame that could be told of."""
+        """Return the reason for the lack of a recent frame."""
         p = self.parameters
         if not self.counts["frames"]:
             return _NOTHING
         if self._last is not None and not self._waiting:
-            return f"no frame has come for {silent_s:.1f} s"
+            return f"no frame has arrived for {silent_s:.1f} s"
         sensor = frame_name(self._waiting[-1][1].header.frame_id) if self._waiting else "the sensor"
         return f"no transforms from {p.odom_frame} to {sensor} and {p.base_frame} at its stamps"
 
     def _values(self, state: State) -> dict[str, str]:
-        """Values for diagnostics."""
+        """Return the values of the diagnostics."""
         values = {
             "status": state.status, "reason": state.reason,
             "parent_frame": state.parent_frame or "", "map_is": self._parent,
@@ -420,7 +421,7 @@ class Relocaliser:
 
 
 def planar(T: Floats) -> Floats:
-    """Return the pose (4, 4) on the plane z = 0 with the same x, y and heading of its x axis."""
+    """Return a pose (4, 4) on the plane z = 0 with the same x, y and heading of the x axis."""
     cosine, sine = T[0, 0], T[1, 0]
     length = math.hypot(cosine, sine) or 1.0
     flat = np.eye(4)

@@ -1,11 +1,11 @@
-"""What messages of ROS say, whoever decoded them: depth, points, cameras, poses.
+"""Contents of decoded ROS messages: depth, points, cameras and poses.
 
 Image  --depth_samples-->  (H, W);  CompressedImage  --compressed_depth-->  CompressedDepth
 PointCloud2  --cloud_points-->  (N, 3)
 CameraInfo  --camera_intrinsics-->  Intrinsics
 Transform | Pose  --transform_row | pose_row-->  x y z, quaternion
 
-A message is any object with the attributes that ROS gives it: of rclpy, of rosbags, of ROS 1.
+A message is any object with the attributes of its ROS type, from rclpy, rosbags or ROS 1.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from sceneprint_client.poses import Floats
 
 # Depth images.
 
-#: Encodings of images that are depth: 16-bit millimetres, or metres (REP 118).
+#: Encodings of depth images: 16-bit millimetres, or metres (REP 118).
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-#: Stored units per metre of the 16-bit ones.
+#: Stored units per metre of 16-bit images.
 DEPTH_SCALE = 1000.0
-#: Bytes before the PNG of a compressedDepth message: a format, and two floats a and b.
+#: Length of the header of a compressedDepth message, bytes: a format, and two floats a and b.
 TRANSPORT_BYTES = 12
-#: Bytes within which the PNG begins.
+#: Greatest offset of the PNG, bytes.
 _MOST_BEFORE_PNG = 64
-#: Bytes of a PNG up to its depth and colours.
+#: Length of the head of a PNG up to bit depth and colour type, bytes.
 _PNG_HEAD = 26
 
 
 def image_encoding(message: Any, *, compressed: bool) -> str | None:
-    """Encoding of an image's depth; None where it is of colour, or compressed otherwise.
+    """Return the encoding of a depth image; None for colour or another compression.
 
     Parameters
     ----------
-    message : sensor_msgs Image, or CompressedImage
-    compressed : which of them
+    message : sensor_msgs Image or CompressedImage
+    compressed : whether it is a CompressedImage
     """
     if not compressed:
         return str(message.encoding) if message.encoding in ENCODINGS else None
     encoding = str(message.format).partition(";")[0].strip()
     if "compressedDepth" in str(message.format):
         return encoding if encoding in ENCODINGS else None
-    # a PNG of 16 bits and one channel is depth
+    # A PNG of 16 bits and one channel holds depth.
     head = bytes(memoryview(message.data)[:_PNG_HEAD])
     is_deep = head.startswith(PNG_SIGNATURE) and head[24:26] == b"\x10\x00"
     encoding = encoding if encoding in ENCODINGS else "16UC1"
@@ -72,31 +72,31 @@ def depth_samples(message: Any) -> NDArray[Any]:
 
     Raises
     ------
-    UnreadableFrame : it is of another encoding, or its sizes contradict each other.
+    UnreadableFrame : If the encoding is not supported, or the sizes contradict each other.
     """
     kind = ENCODINGS.get(message.encoding)
     if kind is None:
         raise UnreadableFrame(
             f"The image has the encoding {message.encoding!r:.40}, and depth is 16UC1, mono16 or "
-            "32FC1. Name the topic of the depth images."
+            "32FC1. Specify the topic of the depth images."
         )
     samples = _samples(message, np.dtype((">" if message.is_bigendian else "<") + kind))
     return samples.astype("<" + kind)
 
 
 def _samples(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
-    """Samples (H, W) of an image whose rows may be longer than they need to be."""
+    """Return the samples (H, W) of an image whose rows may have padding."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     row = width * kind.itemsize
     if not 0 < width * height <= MAXIMUM_SAMPLES or step < row:
         raise UnreadableFrame(
-            f"The image announces {width} x {height} samples in rows of {step} bytes; 1 to "
-            f"{MAXIMUM_SAMPLES} samples are read. Record it again."
+            f"The image announces {width} x {height} samples in rows of {step} bytes; the limit is "
+            f"{MAXIMUM_SAMPLES} samples. Record it again."
         )
     data = np.frombuffer(memoryview(message.data), np.uint8)
     if len(data) < step * height:
         raise UnreadableFrame(
-            f"The image has {len(data)} bytes, and {height} rows of {step} bytes are announced. "
+            f"The image has {len(data)} bytes, but announces {height} rows of {step} bytes. "
             "Record it again."
         )
     rows = data[: step * height].reshape(height, step)[:, :row]
@@ -109,9 +109,9 @@ class CompressedDepth:
 
     Parameters
     ----------
-    png : its samples, 16 bits each; empty where they are not compressed as PNG
-    samples : (H, W) of another compression; None of a PNG
-    inverse : a and b of a 32FC1 image, where z = a / (v - b) metres; None of 16UC1 millimetres
+    png : PNG of 16-bit samples; empty for another compression
+    samples : (H, W) samples of another compression; None for PNG
+    inverse : a and b of a 32FC1 image with z = a / (v - b) metres; None for 16UC1 millimetres
     """
 
     png: bytes
@@ -119,7 +119,7 @@ class CompressedDepth:
     inverse: tuple[float, float] | None
 
     def body(self) -> bytes | NDArray[Any]:
-        """Return what a service takes as a frame: a PNG, after its header where that matters, or an
+        """Return the frame for a service: a PNG, with its header if the depth is inverse, or an
         array of millimetres or metres.
         """
         if self.samples is not None:
@@ -132,16 +132,16 @@ class CompressedDepth:
 
 
 def compressed_depth(message: Any) -> CompressedDepth:
-    """Return the samples of a compressed depth image, and how they stand for metres.
+    """Return the samples of a compressed depth image and their relation to metres.
 
     Parameters
     ----------
     message : sensor_msgs CompressedImage of compressed_depth_image_transport (PNG or RVL), or of a
-        PNG of 16 bits
+        16-bit PNG
 
     Raises
     ------
-    UnreadableFrame : it is compressed otherwise, or lacks the header that says how.
+    UnreadableFrame : If the compression is not supported, or its header is missing.
     """
     encoding = image_encoding(message, compressed=True)
     data = bytes(memoryview(message.data))
@@ -149,9 +149,9 @@ def compressed_depth(message: Any) -> CompressedDepth:
     is_rvl = "rvl" in str(message.format).partition("compressedDepth")[2].lower()
     if encoding is None or (at < 0 and not is_rvl):
         raise UnreadableFrame(
-            f"The image has the format {message.format!r:.60}, and of compressed depth only PNG "
-            "and RVL of 16UC1 and 32FC1 are read. Record the raw topic, or set the transport's "
-            "format to png."
+            f"The image has the format {message.format!r:.60}; the supported compressed depth is "
+            "PNG and RVL of 16UC1 and 32FC1. Record the raw topic, or set the transport's format "
+            "to png."
         )
     samples = rvl_samples(data[TRANSPORT_BYTES:]) if is_rvl else None
     png = b"" if is_rvl else data[at:]
@@ -159,14 +159,13 @@ def compressed_depth(message: Any) -> CompressedDepth:
         return CompressedDepth(png, samples, None)
     if not is_rvl and at < TRANSPORT_BYTES:
         raise UnreadableFrame(
-            "The image of 32FC1 lacks the 12 bytes that say how its depth is stored. Record it "
-            "again."
+            "The 32FC1 image lacks the 12-byte header with its quantisation. Record it again."
         )
     a, b = struct.unpack_from("<ff", data, 4)
     if not (math.isfinite(a) and math.isfinite(b) and a > 0):
         raise UnreadableFrame(
-            f"The image stores inverse depth by a = {a:g} and b = {b:g}, and these are no such "
-            "numbers. Record it again."
+            f"The image stores inverse depth with a = {a:g} and b = {b:g}, which are out of range. "
+            "Record it again."
         )
     return CompressedDepth(png, samples, (a, b))
 
@@ -182,17 +181,17 @@ def inverse_depth(samples: NDArray[np.uint16], a: float, b: float) -> NDArray[np
 
 
 def rvl_samples(data: bytes) -> NDArray[np.uint16]:
-    """Return the samples (H, W) of an image compressed by RVL, after its width and height.
+    """Return the samples (H, W) of an image compressed by RVL, which follows width and height.
 
-    Runs of zeros and of values alternate. A value is the difference to the one before, zigzag
-    coded; all numbers are of groups of three bits, the lowest first, with a bit for "more follow",
-    in words of 32 bits from the top (Wilson, Fast Lossless Depth Image Compression, 2017).
+    Runs of zeros alternate with runs of values. A value is the zigzag-coded difference to its
+    predecessor. Numbers are groups of three bits, lowest first, each with a continuation bit, in
+    big-endian words of 32 bits (Wilson, Fast Lossless Depth Image Compression, 2017).
 
     Raises
     ------
-    UnreadableFrame : the data ends early, the sizes are none, or a sample has more than 16 bits.
+    UnreadableFrame : If the data is truncated, the size is invalid, or a sample exceeds 16 bits.
     """
-    broken = UnreadableFrame("The image compressed by RVL is damaged. Record it again.")
+    broken = UnreadableFrame("The RVL-compressed image is damaged. Record it again.")
     width, height = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
     if not 0 < width * height <= MAXIMUM_SAMPLES:
         raise broken
@@ -231,22 +230,22 @@ def rvl_samples(data: bytes) -> NDArray[np.uint16]:
 
 
 def is_calibrated(info: Any) -> bool:
-    """Return whether a CameraInfo says anything: drivers without a calibration send zeros."""
+    """Return whether a CameraInfo is calibrated; drivers without a calibration send zeros."""
     k = _numbers(info, "k", 9)
     return k is not None and k[0] > 0 and k[4] > 0
 
 
 def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
-    """Return the camera that a CameraInfo describes.
+    """Return the intrinsics of a CameraInfo.
 
     Parameters
     ----------
     info : sensor_msgs CameraInfo
-    rectified : whether the images have been rectified: their camera is P, without distortion
+    rectified : whether the images are rectified, so that their camera is P without distortion
 
     Raises
     ------
-    InvalidIntrinsics : it describes no camera, or a lens that is not supported.
+    InvalidIntrinsics : If it does not describe a camera, or the lens model is not supported.
     """
     k, p = _numbers(info, "k", 9), _numbers(info, "p", 12)
     if k is None:
@@ -260,7 +259,7 @@ def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
     if int(info.binning_x) > 1 or int(info.binning_y) > 1:
         raise InvalidIntrinsics(
             f"The camera info has a binning of {info.binning_x} x {info.binning_y}, which is not "
-            "supported. Write the camera of the binned images into an intrinsics.json."
+            "supported. Write the intrinsics of the binned images to an intrinsics.json."
         )
     width, height, roi = int(info.width), int(info.height), info.roi
     if int(roi.width) and int(roi.height):
@@ -270,20 +269,20 @@ def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
 
 
 def is_rectified(topic: str) -> bool:
-    """Return whether a topic's images have been rectified, by the name that ROS gives them."""
+    """Return whether the name of a topic indicates rectified images."""
     return "rect" in topic_without_transport(topic).rpartition("/")[2]
 
 
 def topic_without_transport(topic: str) -> str:
-    """Return the name of an image's topic without that of how it is compressed."""
+    """Return the name of an image topic without the suffix of its compression."""
     base, _, last = topic.rpartition("/")
     return base if last in ("compressedDepth", "compressed") else topic
 
 
 def _distortion(info: Any) -> tuple[float, ...]:
-    """Coefficients k1, k2, p1, p2[, k3] of a lens, none where it does not distort."""
-    told = getattr(info, "d", None)
-    d = [float(value) for value in (info.D if told is None else told)]
+    """Return the coefficients k1, k2, p1, p2[, k3] of a lens; none without distortion."""
+    distortion = getattr(info, "d", None)
+    d = [float(value) for value in (info.D if distortion is None else distortion)]
     if not any(d):
         return ()
     model = str(info.distortion_model)
@@ -291,8 +290,8 @@ def _distortion(info: Any) -> tuple[float, ...]:
         if not any(d[5:]):
             return tuple(d[:5])
         raise InvalidIntrinsics(
-            "The camera info has the lens model rational_polynomial with k4, k5 or k6, of which "
-            "only k1, k2, p1, p2 and k3 are supported. Record the rectified images."
+            "The camera info has the lens model rational_polynomial with k4, k5 or k6; supported "
+            "are only k1, k2, p1, p2 and k3. Record the rectified images."
         )
     raise InvalidIntrinsics(
         f"The camera info has the lens model {model!r:.40} with {len(d)} coefficients; supported "
@@ -301,7 +300,7 @@ def _distortion(info: Any) -> tuple[float, ...]:
 
 
 def _numbers(info: Any, name: str, count: int) -> list[float] | None:
-    """Return a matrix of a CameraInfo: ROS 1 has capital names, ROS 2 small ones."""
+    """Return a matrix of a CameraInfo; its name is upper case in ROS 1, lower case in ROS 2."""
     found = getattr(info, name, None)
     numbers = [float(value) for value in (getattr(info, name.upper()) if found is None else found)]
     return numbers if len(numbers) == count else None
@@ -309,30 +308,30 @@ def _numbers(info: Any, name: str, count: int) -> list[float] | None:
 
 # Points.
 
-#: Types of fields, by the number that sensor_msgs/PointField has for them.
+#: NumPy types by the type number of sensor_msgs/PointField.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-#: Most points of a message.
+#: Greatest number of points of a message.
 MOST_POINTS = 20_000_000
-#: Points that are converted at a time.
+#: Number of points in one block of a conversion.
 _BLOCK = 1 << 16
 
 
 def cloud_points(message: Any) -> NDArray[np.float32]:
-    """Return the points (N, 3) of a message that are there, metres.
+    """Return the valid points (N, 3) of a message, metres.
 
-    Points that are not finite, or exactly at the sensor as some drivers write what they missed, are
-    left out.
+    Points that are not finite are dropped, and points at the sensor's origin, which some drivers
+    write for missing returns.
 
     Parameters
     ----------
-    message : sensor_msgs PointCloud2, of any fields with x, y and z, organised or not
+    message : sensor_msgs PointCloud2 with fields x, y and z, organised or not
 
     Raises
     ------
-    UnreadableCloud : it has no x, y and z, or its sizes contradict each other.
+    UnreadableCloud : If x, y or z is missing, or the sizes contradict each other.
     """
     table, found = cloud_table(message), []
-    with np.errstate(all="ignore"):  # what overflows is no number, and so missing
+    with np.errstate(all="ignore"):  # coordinates that overflow count as missing
         for block in cloud_blocks(table):
             points = block.astype(np.float32)
             found.append(points[np.isfinite(points).all(axis=1)])
@@ -340,21 +339,21 @@ def cloud_points(message: Any) -> NDArray[np.float32]:
 
 
 def cloud_table(message: Any) -> NDArray[np.void]:
-    """Return the x, y and z of a PointCloud2 in place (rows, columns); raises as `cloud_points`."""
+    """Return x, y and z of a PointCloud2 (rows, columns) as a view; see `cloud_points`."""
     width, height = int(message.width), int(message.height)
     step, row = int(message.point_step), int(message.row_step)
     data = memoryview(message.data).cast("B")
     if width * height > MOST_POINTS:
         raise UnreadableCloud(
-            f"The cloud announces {width} x {height} points; at most {MOST_POINTS} are read. "
-            "Thin it out."
+            f"The cloud announces {width} x {height} points; the limit is {MOST_POINTS}. "
+            "Downsample it."
         )
-    if height == 1 or row == 0:  # some drivers leave it out
+    if height == 1 or row == 0:  # some drivers do not set row_step
         row = width * step
     if step < 1 or row < width * step or len(data) < row * height:
         raise UnreadableCloud(
-            f"The cloud has {len(data)} bytes, and {height} rows of {width} points of {step} bytes "
-            "are announced. Record it again."
+            f"The cloud has {len(data)} bytes, but announces {height} rows of {width} points of "
+            f"{step} bytes. Record it again."
         )
     if not width * height:
         return np.empty((0, 0), [(name, "f4") for name in "xyz"])
@@ -364,9 +363,7 @@ def cloud_table(message: Any) -> NDArray[np.void]:
 
 
 def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:
-    """Points (n, 3) of records with x, y and z in their order, many at a time; NaN where one lies
-    exactly at the sensor.
-    """
+    """Yield blocks of points (n, 3) in order, with NaN for points at the sensor's origin."""
     height, width = table.shape
     rows = max(1, _BLOCK // max(width, 1))
     for first in range(0, height, rows):
@@ -380,7 +377,7 @@ def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:
 
 
 def _point_type(message: Any, step: int) -> np.dtype[Any]:
-    """x, y and z of a point of so many bytes."""
+    """Return the type of x, y and z in a point of `step` bytes."""
     order = ">" if message.is_bigendian else "<"
     found = {}
     for field in message.fields:
@@ -390,8 +387,8 @@ def _point_type(message: Any, step: int) -> np.dtype[Any]:
     if len(found) != 3:
         names = ", ".join(str(field.name) for field in message.fields[:20])
         raise UnreadableCloud(
-            f"The cloud has the fields {printable(names[:120]) or 'none'}, and x, y and z are "
-            "needed. Name the topic of the points."
+            f"The cloud has the fields {printable(names[:120]) or 'none'}, but x, y and z are "
+            "required. Specify the topic of the points."
         )
     if any(offset + np.dtype(kind).itemsize > step for kind, offset in found.values()):
         raise UnreadableCloud(
@@ -407,26 +404,26 @@ def _point_type(message: Any, step: int) -> np.dtype[Any]:
     return points
 
 
-# Poses and what moves.
+# Stamps and poses.
 
 
 def stamp_of(header: Any) -> int:
-    """When a message with a header was measured, nanoseconds."""
+    """Return the stamp of a message's header, nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def transform_row(transform: Any) -> list[float]:
-    """x y z, and the quaternion x y z w, of a geometry_msgs Transform."""
+    """Return x y z and the quaternion x y z w of a geometry_msgs Transform."""
     turn = transform.rotation
     return [*vector_row(transform.translation), *vector_row(turn), float(turn.w)]
 
 
 def pose_row(pose: Any) -> list[float]:
-    """x y z, and the quaternion x y z w, of a geometry_msgs Pose."""
+    """Return x y z and the quaternion x y z w of a geometry_msgs Pose."""
     turn = pose.orientation
     return [*vector_row(pose.position), *vector_row(turn), float(turn.w)]
 
 
 def vector_row(vector: Any) -> list[float]:
-    """x y z of a geometry_msgs Vector3, Point or Quaternion."""
+    """Return x y z of a geometry_msgs Vector3, Point or Quaternion."""
     return [float(vector.x), float(vector.y), float(vector.z)]

@@ -1,7 +1,7 @@
-"""What lies beside a frame's file: its camera, how its points are read, its pose.
+"""Sidecar files of a frame: its camera, the layout of its points, and its pose.
 
-folder  --find_camera-->  Camera          `intrinsics.json` beside the frames or above them
-folder  --find_cloud_source-->  CloudSource          `clouds.json` likewise, or nothing
+folder  --find_camera-->  Camera            `intrinsics.json` beside the frames or above them
+folder  --find_cloud_source-->  CloudSource `clouds.json` beside the frames or above, optional
 text  --read_pose-->  T_parent_sensor (4, 4)
 """
 
@@ -22,13 +22,13 @@ from sceneprint_client.files import naming, read_object, read_text
 from sceneprint_client.formats import CloudFormat
 from sceneprint_client.poses import TOLERANCE, rigid_transform
 
-#: A place, metres, or a direction.
+#: A position in metres, or a direction.
 Position = tuple[float, float, float]
 _NO_UP = (
-    "up is {}, no direction. Write a list of three numbers of length 1 in the sensor's axes, such "
-    "as [0, -1, 0] of a camera that is held level."
+    "up is {}, not a direction. Write a list of three numbers of length 1 in the sensor's axes, "
+    "such as [0, -1, 0] for a camera that is held level."
 )
-_PARENTS = 4  #: folders above the frames that are looked into
+_PARENTS = 4  #: number of searched folders above that of the frames
 _MAXIMUM_BYTES = 65_536
 
 
@@ -43,18 +43,18 @@ _OPTIONAL = ("depth_scale", "distortion", "depth_along_ray", "up")
 
 @dataclass(frozen=True)
 class Camera:
-    """A sensor: its lens, and how it stores depth.
+    """Intrinsics of a depth camera, and its encoding of depth.
 
     Parameters
     ----------
-    intrinsics : of the depth images, with their distortion
+    intrinsics : intrinsics of the depth images, with distortion
     depth_scale : stored units per metre
-    along_ray : depth is the range along the pixel's ray and not z
-    up : unit vector in the camera's axes, of one that is carried level; None where not known
+    along_ray : whether depth is the range along the pixel's ray instead of z
+    up : unit vector in the camera's axes if the camera is carried level; None if unknown
 
     Raises
     ------
-    InvalidIntrinsics : the depth scale is no positive number, or `up` not of length 1.
+    InvalidIntrinsics : If the depth scale is not positive, or `up` is not a unit vector.
     """
 
     intrinsics: Intrinsics
@@ -66,24 +66,24 @@ class Camera:
         if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
             raise InvalidIntrinsics(
                 f"The depth scale {self.depth_scale} is not a positive number. "
-                "Give the stored units per metre, 1000 for millimetres."
+                "Specify the stored units per metre, 1000 for millimetres."
             )
         if self.up is not None and not is_unit(self.up):
             raise InvalidIntrinsics(_NO_UP.format(self.up))
 
 
 def is_unit(vector: Position) -> bool:
-    """Return whether three numbers are of length 1, to a hundredth."""
+    """Return whether a vector has length 1, within 0.01."""
     return abs(math.hypot(*vector) - 1.0) <= TOLERANCE
 
 
 def find_camera(folder: Path) -> Camera:
-    """Return the camera of the nearest `intrinsics.json`, here or up to 4 folders above.
+    """Return the camera of the nearest `intrinsics.json`, in this folder or up to 4 above.
 
     Raises
     ------
-    DatasetError : there is none; the message shows one to write.
-    InvalidIntrinsics : as `read_camera`.
+    DatasetError : If there is no such file; the message shows an example.
+    InvalidIntrinsics : If the file is invalid; see `read_camera`.
     """
     absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
     for place in (absolute, *absolute.parents[:_PARENTS]):
@@ -92,21 +92,21 @@ def find_camera(folder: Path) -> Camera:
             return read_camera(candidate)
     raise DatasetError(
         f"{folder}: There is no {INTRINSICS_FILE} here or in the {_PARENTS} folders above, so the "
-        f"camera is unknown. Write one such as {_INTRINSICS_EXAMPLE} (pixels; depth_scale is "
+        f"camera is unknown. Write a file such as {_INTRINSICS_EXAMPLE} (pixels; depth_scale is "
         "stored units per metre)."
     )
 
 
 def read_camera(path: Path) -> Camera:
-    """Return the camera that a JSON file describes.
+    """Return the camera of a JSON file.
 
-    Fields: width, height, fx, fy, cx, cy in pixels; and, if they differ from what is said
-    here, depth_scale (1000), distortion (none), depth_along_ray (false), up (not known).
+    Fields: width, height, fx, fy, cx, cy in pixels. Optional fields and their defaults:
+    depth_scale (1000), distortion (none), depth_along_ray (false), up (unknown).
 
     Raises
     ------
-    InvalidIntrinsics : the file cannot be read, is no JSON object, lacks a field, has one
-        too many, or a value that no camera has; names the file.
+    InvalidIntrinsics : If the file cannot be read, is not a JSON object, lacks a field, has an
+        unknown field, or has an invalid value; names the file.
     """
     fields = read_object(path, _MAXIMUM_BYTES, InvalidIntrinsics, _INTRINSICS_EXAMPLE)
     with naming(str(path)):
@@ -117,21 +117,23 @@ def _camera(fields: dict[str, object]) -> Camera:
     missing = [name for name in _REQUIRED if name not in fields]
     if missing:
         raise InvalidIntrinsics(
-            f"{', '.join(missing)} is missing. Write it such as {_INTRINSICS_EXAMPLE}."
+            f"{', '.join(missing)} is missing. Write an object such as {_INTRINSICS_EXAMPLE}."
         )
     unknown = sorted(set(fields) - {*_REQUIRED, *_OPTIONAL})
     if unknown:
-        # a misspelt optional field would otherwise be silently without effect
+        # Without this check, a misspelt optional field would have no effect.
         raise InvalidIntrinsics(
-            f"{', '.join(unknown)!r:.80} is no field of it. "
+            f"{', '.join(unknown)!r:.80} is not a field of intrinsics.json. "
             f"The fields are {', '.join((*_REQUIRED, *_OPTIONAL))}."
         )
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
-        raise InvalidIntrinsics("distortion is no list. Write k1, k2, p1, p2 and optionally k3.")
+        raise InvalidIntrinsics(
+            "distortion is not a list. Write [k1, k2, p1, p2] or [k1, k2, p1, p2, k3]."
+        )
     along_ray = fields.get("depth_along_ray", False)
     if not isinstance(along_ray, bool):
-        raise InvalidIntrinsics("depth_along_ray is neither true nor false. Write one of them.")
+        raise InvalidIntrinsics("depth_along_ray is not a boolean. Write true or false.")
     return Camera(
         Intrinsics(
             width=_whole(fields, "width"),
@@ -148,12 +150,12 @@ def _camera(fields: dict[str, object]) -> Camera:
     )
 
 
-def _camera_up(told: object) -> Position | None:
-    if told is None:
+def _camera_up(value: object) -> Position | None:
+    if value is None:
         return None
-    if not isinstance(told, list) or len(told) != len("xyz"):
-        raise InvalidIntrinsics(_NO_UP.format(f"{told!r:.60}"))
-    x, y, z = (_intrinsics_number("up", value) for value in told)
+    if not isinstance(value, list) or len(value) != len("xyz"):
+        raise InvalidIntrinsics(_NO_UP.format(f"{value!r:.60}"))
+    x, y, z = (_intrinsics_number("up", number) for number in value)
     return x, y, z
 
 
@@ -167,16 +169,16 @@ def _whole(fields: dict[str, object], name: str) -> int:
 
 
 def _intrinsics_number(name: str, value: object) -> float:
-    # bool is a kind of int in Python; "true" is no length in pixels
+    # bool is a subclass of int, but true is not a length in pixels.
     if not isinstance(value, bool) and isinstance(value, int | float):
         try:
             return float(value)
         except OverflowError:
             pass
-    raise InvalidIntrinsics(f"{name} is {value!r:.40}, not a number. Write it as one.")
+    raise InvalidIntrinsics(f"{name} is {value!r:.40}, not a number. Write a number.")
 
 
-# How points are read.
+# Layout of points.
 
 
 CLOUDS_FILE = "clouds.json"
@@ -189,7 +191,7 @@ _FORMATS: tuple[CloudFormat, ...] = get_args(CloudFormat)
 
 
 class Unsaid(Enum):
-    """What is given for a viewpoint of which nothing is said: the file says it, or the origin."""
+    """Marker for a viewpoint that is not specified: that of the file, or else the origin."""
 
     UNSAID = "unsaid"
 
@@ -199,17 +201,17 @@ UNSAID = Unsaid.UNSAID
 
 @dataclass(frozen=True)
 class CloudSource:
-    """How a file of points is to be read.
+    """Layout of a file of points.
 
     Parameters
     ----------
-    file_format : of it, or None: its first bytes tell
-    viewpoint : where the sensor was, metres in the file's axes; None for points of many views;
-        UNSAID: as the file says, else the origin
-    units_per_metre : of its coordinates
-    up : unit vector in the file's axes, of a sensor that is carried level; None where not known
-    row : names of the float32 in each row of a .bin file, such as x, y, z, i, ring; None: x, y, z
-        and intensity
+    file_format : format; None if the first bytes determine it
+    viewpoint : position of the sensor in the file's axes, metres; None for points from many
+        viewpoints; UNSAID: that of the file, or else the origin
+    units_per_metre : units of the coordinates per metre
+    up : unit vector in the file's axes if the sensor is carried level; None if unknown
+    row : names of the float32 values in each row of a .bin file, such as x, y, z, i, ring; None:
+        x, y, z and intensity
     """
 
     file_format: CloudFormat | None = None
@@ -220,28 +222,29 @@ class CloudSource:
 
 
 def row_of(text: str) -> tuple[str, ...]:
-    """Return the names of the values of a row, of text such as x,y,z,i,ring.
+    """Return the names of the values in a row, from a text such as x,y,z,i,ring.
 
     Raises
     ------
-    DatasetError : x, y or z is not among them once, or they are more than 32.
+    DatasetError : If x, y or z is missing or repeated, or there are more than 32 names.
     """
     names = tuple(name.strip().lower() for name in text.split(","))
     if any(names.count(axis) != 1 for axis in "xyz") or len(names) > _LONGEST_ROW:
         raise DatasetError(
-            f"The row {text!r:.80} does not name x, y and z once each, or more than "
-            f"{_LONGEST_ROW} values. Write it such as x,y,z,i,ring."
+            f"The row {text!r:.80} must name x, y and z once each, and at most {_LONGEST_ROW} "
+            "values. Write it such as x,y,z,i,ring."
         )
     return names
 
 
 def find_cloud_source(folder: Path) -> CloudSource:
-    """Return what the nearest `clouds.json` says, here or up to 4 folders above; without one,
-    nothing is said.
+    """Return the layout in the nearest `clouds.json`, in this folder or up to 4 above.
+
+    Without such a file, all fields have their defaults.
 
     Raises
     ------
-    DatasetError : it cannot be read, is no JSON object, or has a field or value that is none.
+    DatasetError : If the file cannot be read, is not a JSON object, or has an invalid field.
     """
     absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
     for place in (absolute, *absolute.parents[:_PARENTS]):
@@ -257,49 +260,53 @@ def _read_source(path: Path) -> CloudSource:
         unknown = sorted(set(fields) - {*_FIELDS})
         if unknown:
             raise DatasetError(
-                f"{', '.join(unknown)!r:.80} is no field of it. "
+                f"{', '.join(unknown)!r:.80} is not a field of clouds.json. "
                 f"The fields are {', '.join(_FIELDS)}."
             )
         file_format = fields.get("format")
         if file_format is not None and file_format not in _FORMATS:
-            raise DatasetError(f"format is {file_format!r:.40}. Known are {', '.join(_FORMATS)}.")
+            raise DatasetError(
+                f"format is {file_format!r:.40}. Supported formats are {', '.join(_FORMATS)}."
+            )
         units = _cloud_number("units_per_metre", fields.get("units_per_metre", 1.0))
         if not units > 0.0:
             raise DatasetError(f"units_per_metre is {units}. Write 1000 for millimetres.")
         row = fields.get("row")
         if row is not None and file_format not in (None, "kitti"):
-            raise DatasetError(f"row is of .bin files, and format is {file_format}. Leave one out.")
+            raise DatasetError(
+                f"row is valid only for .bin files, but format is {file_format}. Remove either."
+            )
         return CloudSource(
             file_format, _viewpoint(fields), units, _cloud_up(fields.get("up")),
             None if row is None else row_of(str(row)),
         )  # fmt: skip
 
 
-def _cloud_up(told: object) -> Position | None:
-    if told is None:
+def _cloud_up(value: object) -> Position | None:
+    if value is None:
         return None
-    if isinstance(told, list) and len(told) == len("xyz"):
-        x, y, z = (_cloud_number("up", value) for value in told)
+    if isinstance(value, list) and len(value) == len("xyz"):
+        x, y, z = (_cloud_number("up", number) for number in value)
         if is_unit((x, y, z)):
             return x, y, z
-    raise DatasetError(_NO_UP.format(f"{told!r:.60}"))
+    raise DatasetError(_NO_UP.format(f"{value!r:.60}"))
 
 
 def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
     if "viewpoint" not in fields:
         return UNSAID
-    told = fields["viewpoint"]
-    if told is None:
+    value = fields["viewpoint"]
+    if value is None:
         return None
-    if not isinstance(told, dict) or set(told) != {"x", "y", "z"}:
+    if not isinstance(value, dict) or set(value) != {"x", "y", "z"}:
         raise DatasetError(
-            f"viewpoint is {told!r:.60}. Write it such as {_CLOUDS_EXAMPLE}, or null for points "
-            "that were not seen from one place."
+            f"viewpoint is {value!r:.60}. Write it such as {_CLOUDS_EXAMPLE}, or null for points "
+            "without a common viewpoint."
         )
     return (
-        _cloud_number("x", told["x"]),
-        _cloud_number("y", told["y"]),
-        _cloud_number("z", told["z"]),
+        _cloud_number("x", value["x"]),
+        _cloud_number("y", value["y"]),
+        _cloud_number("z", value["z"]),
     )
 
 
@@ -307,11 +314,11 @@ def _cloud_number(name: str, value: object) -> float:
     if not isinstance(value, bool) and isinstance(value, int | float):
         try:
             number = float(value)
-        except OverflowError:  # JSON has whole numbers of any length
+        except OverflowError:  # integers in JSON have no upper limit
             number = math.inf
         if math.isfinite(number):
             return number
-    raise DatasetError(f"{name} is {value!r:.40}, no finite number. Write it as one.")
+    raise DatasetError(f"{name} is {value!r:.40}, not a finite number. Write a finite number.")
 
 
 # Poses.
@@ -324,14 +331,14 @@ def read_pose(path: Path) -> NDArray[np.float64]:
 
     Raises
     ------
-    InvalidPose : the file cannot be read, or as `rigid_transform`; names the file.
+    InvalidPose : If the file cannot be read or its matrix is not rigid; names the file.
     """
     words = read_text(path, _MAXIMUM_POSE_BYTES, InvalidPose).split()
     with naming(str(path)):
         if len(words) != 16:
             raise InvalidPose(
-                f"The file holds {len(words)} words and a pose is 16 numbers. "
-                "Write 4 rows of 4, sensor to parent."
+                f"The file holds {len(words)} words, but a pose has 16 numbers. "
+                "Write 4 rows of 4 numbers, sensor to parent."
             )
         return rigid_transform(np.array(_numbers(words)).reshape(4, 4))
 
@@ -340,4 +347,4 @@ def _numbers(words: list[str]) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as cause:
-        raise InvalidPose(f"A word is no number ({cause}). Write numbers only.") from cause
+        raise InvalidPose(f"A word is not a number ({cause}). Write only numbers.") from cause

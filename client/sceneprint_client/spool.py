@@ -1,8 +1,8 @@
-"""A spool: frames that a robot keeps on its disk while it is offline, and uploads later.
+"""A spool: frames that a robot stores on its disk while it is offline, and uploads later.
 
 frame, meta  --Spool.add-->  a durable row of one SQLite file
-rows, oldest first  --Spool.sync, Client.upload_batch-->  frames of a map, each once
-two places  --separation-->  how far apart they are, which decides what a full spool gives up
+rows, oldest first  --Spool.sync, Client.upload_batch-->  frames of a map, without duplicates
+two places  --separation-->  their distance, which determines the frames that a full spool drops
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-#: Bytes of a new spool, unless said otherwise.
+#: Default capacity of a new spool, bytes.
 MOST_BYTES = 1 << 30
-#: What one unit of separation is: so many metres, or degrees, or seconds.
+#: Metres, degrees and seconds that count as one unit of separation.
 METRES, DEGREES, SECONDS = 1.0, 30.0, 60.0
-#: Bytes of frames sent in one request; a larger frame is sent alone.
+#: Greatest size of the frames in one request, bytes; a larger frame is sent alone.
 BATCH_BYTES = 4 << 20
-#: Seconds before a busy service is asked again, if it does not say when.
+#: Delay before the next request to a busy service that does not specify one, seconds.
 _PAUSE_S = 1.0
-#: Seconds that another process may keep the file locked.
+#: Longest wait for another process's lock on the file, seconds.
 _LOCKED_S = 30.0
-#: Bytes of a page of the file. A frame is charged whole pages, and one for its rows of the indexes.
+#: Size of a page of the file, bytes. A frame counts as whole pages, plus one for its index rows.
 _PAGE = 4096
-#: Pages that the journal keeps on disk, so that frames can be removed or set aside when the disk is
-#: full: one request's frames change fewer, as their own pages are not written for that.
+#: Number of pages that the journal reserves on disk. Removing or rejecting the frames of one
+#: request changes fewer pages, so it works on a full disk.
 _RESERVE = 512
-#: Marks the file as a spool, and its schema.
+#: Application id that marks the file as a spool, and version of its schema.
 _APPLICATION, _SCHEMA = 0x53705370, 1
 
-# `frames.reason` is null while a frame waits, and '' once it is refused: as long as null, so that a
-# frame is set aside without being written again, for which a full disk has no room. `data` is last,
-# so that other columns are read without it.
+# `frames.reason` is null for a waiting frame and '' for a rejected one. Both take the same space,
+# so a change does not rewrite the frame, for which a full disk has no room. `data` is last, so
+# reading the other columns does not load it.
 _TABLES = """
 CREATE TABLE frames (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -116,23 +116,24 @@ CREATE TRIGGER reason_retried AFTER UPDATE OF reason ON frames WHEN NEW.reason I
     DELETE FROM reasons WHERE frame = NEW.id;
 END;
 """
-#: What is told of a frame whose reason was not kept.
+#: Reason of a rejected frame whose reason could not be stored.
 _NO_REASON = "The service refused it; the disk had no room for its reason"
 
 
 @dataclass(frozen=True)
 class SpoolStatus:
-    """What a spool holds, and what has become of all frames that were added.
+    """Counts and sizes of a spool.
 
     Parameters
     ----------
-    waiting : frames to upload
-    refused : frames that the service refused; `Spool.refusals` has their reasons
-    bytes, most_bytes : that waiting and refused frames take on disk, and may take
-    uploaded : frames that a map has, since the spool was created
-    thinned : waiting frames that a full spool gave up
-    discarded : refused frames that a full spool gave up
-    oldest : when the first waiting frame was taken, else added; None if none waits
+    waiting : number of frames to upload
+    refused : number of frames that the service rejected; `Spool.refusals` returns the reasons
+    bytes, most_bytes : disk space of waiting and rejected frames, and its limit
+    uploaded : number of uploaded frames since the creation of the spool
+    thinned : number of waiting frames that a full spool dropped
+    discarded : number of rejected frames that a full spool dropped
+    oldest : capture time of the first waiting frame, or the time of its addition; None without
+        waiting frames
     """
 
     waiting: int
@@ -147,7 +148,7 @@ class SpoolStatus:
 
 @dataclass(frozen=True)
 class SpoolRefusal:
-    """A frame that the service refused, and why."""
+    """A frame that the service rejected, and the reason."""
 
     name: str | None
     session: str | None
@@ -157,15 +158,15 @@ class SpoolRefusal:
 
 @dataclass
 class SyncReport:
-    """What one `Spool.sync` did.
+    """Result of one `Spool.sync`.
 
     Parameters
     ----------
-    received : frames that are new to the map
-    there : frames that the map had already
-    refused : frames that were set aside
-    poses : frames that the map has with their poses
-    ranges : of the frames that the map has
+    received : number of frames that are new to the map
+    there : number of frames that the map already had
+    refused : number of frames that the service rejected
+    poses : number of uploaded frames with a pose
+    ranges : ranges of the uploaded frames
     """
 
     received: int = 0
@@ -176,23 +177,23 @@ class SyncReport:
 
     @property
     def summary(self) -> UploadSummary:
-        """Return what the map has of these frames."""
+        """Return the summary of the uploaded frames."""
         return upload_summary(self.done, {"": self.done - self.poses}, self.ranges)
 
     @property
     def done(self) -> int:
-        """Frames that do not wait any more."""
+        """Number of frames that no longer wait."""
         return self.received + self.there + self.refused
 
 
 @dataclass(frozen=True, eq=False)
 class SpoolPlace:
-    """When a frame was taken, and from where.
+    """Time and pose of a frame.
 
     Parameters
     ----------
     stamp : seconds
-    T : (4, 4) T_parent_sensor, or None where unknown
+    T : (4, 4) T_parent_sensor; None if unknown
     """
 
     stamp: float
@@ -208,7 +209,7 @@ class _Waiting:
 
 @dataclass(frozen=True)
 class _Target:
-    """Where frames go: arguments of `Client.upload_batch`, and how long to wait for a service."""
+    """Arguments of `Client.upload_batch`, and the time to wait for a busy service."""
 
     client: Client
     map_name: str
@@ -217,34 +218,35 @@ class _Target:
 
 
 class Spool:
-    """Frames on disk until they are uploaded; safe to share between threads and processes.
+    """Frames on disk until their upload; safe to share between threads and processes.
 
-    `add` returns when the frame is durable. A full spool gives up the waiting frame that is
-    nearest, in pose and time, to the frames before and after it in its run (one session of one
-    robot): a metre, 30 degrees and a minute weigh the same; without poses the time alone counts,
-    and of equals the oldest goes. The first and the last frame of a run stay while others can go.
-    Refused frames go before any waiting one.
+    A full spool first drops rejected frames. Then it drops the waiting frame with the smallest
+    separation, in pose and time, from the frames before and after it in its run (one session of
+    one robot). A metre, 30 degrees and a minute have the same weight; without poses only time
+    counts, and the oldest of equal frames is dropped. First and last frames of runs are dropped
+    last.
 
     Parameters
     ----------
-    path : of the SQLite file, created if missing
-    most_bytes : that its frames may take; default: as before, 1 GiB for a new spool
+    path : path of the SQLite file, created if missing
+    most_bytes : limit of the disk space of frames; default: the existing limit, or 1 GiB for a new
+        spool
 
     Raises
     ------
-    UnusableStore : the file is not a spool, is damaged, or cannot be opened or written.
-    InvalidRequest : `most_bytes` is not positive.
+    UnusableStore : If the file is not a spool, is damaged, or cannot be opened or written.
+    InvalidRequest : If `most_bytes` is not positive.
     """
 
     def __init__(self, path: str | os.PathLike[str], most_bytes: int | None = None) -> None:
         if most_bytes is not None and most_bytes <= 0:
             raise errors.InvalidRequest(
-                f"The spool may hold {most_bytes} bytes. Give `most_bytes` above 0.",
+                f"The limit of the spool is {most_bytes} bytes. Pass `most_bytes` above 0.",
                 (("most_bytes", "not above 0"),),
             )
         self._path, self._lock = Path(path), RLock()
-        with self._told():
-            with suppress(OSError):  # private: frames are pictures; SQLite gives its log the same
+        with self._translated_errors():
+            with suppress(OSError):  # frames are private; SQLite gives its journal the same mode
                 self._path.touch(0o600)
             self._database = sqlite3.connect(
                 self._path, timeout=_LOCKED_S, isolation_level=None, check_same_thread=False
@@ -270,25 +272,25 @@ class Spool:
         self, frame: FrameInput, meta: MetaInput | None = None,
         *, up: Sequence[float] | None = None,
     ) -> bool:  # fmt: skip
-        """Keep a frame until it is uploaded. It is durable when this returns.
+        """Store a frame until its upload. It is durable when this returns.
 
-        Give `captured_at` in `meta`: the service knows only when the frame arrives.
+        Set `captured_at` in `meta`, since the service knows only the time of the upload.
 
         Parameters
         ----------
-        frame, meta, up : as for `Client.upload`
+        frame, meta, up : see `Client.upload`
 
         Returns
         -------
-        new : False if the same content with the same metadata is in the spool
+        new : False if the spool already has the same content with the same metadata
 
         Raises
         ------
-        StoreFull : the disk has no room, and the spool is as it was.
-        InvalidRequest : the frame is larger than `most_bytes`.
-        FrameError, DatasetError : as for `Client.upload`, if that can be seen without decoding; the
-            frame is empty, or a PNG without intrinsics. What lies beside a file is read only where
-            `meta` is left out.
+        StoreFull : If the disk is full; the spool is unchanged.
+        InvalidRequest : If the frame is larger than `most_bytes`.
+        FrameError, DatasetError : If the frame is empty, is a PNG without intrinsics, or is
+            invalid in another way that `Client.upload` detects without decoding. Sidecar files
+            are read only if `meta` is omitted.
         """
         data, known = frame_bytes(frame, meta, with_pose=True, up=up)
         _require_sendable(data, known)
@@ -299,8 +301,8 @@ class Spool:
             most = database.execute("SELECT most_bytes FROM counters").fetchone()[0]
             if size > most:
                 raise errors.InvalidRequest(
-                    f"The frame takes {size} bytes, and the spool {self._path} holds at most "
-                    f"{most}. Give it more `most_bytes`, or make frames smaller.",
+                    f"The frame takes {size} bytes, which exceeds the limit of {most} bytes of the "
+                    f"spool {self._path}. Increase `most_bytes`, or make frames smaller.",
                     (("frame", "larger than the spool"),),
                 )
             if database.execute("SELECT 1 FROM frames WHERE digest = ?", (digest,)).fetchone():
@@ -322,7 +324,7 @@ class Spool:
         return True
 
     def status(self) -> SpoolStatus:
-        """What the spool holds, and what has become of all frames that were added."""
+        """Return counts and sizes of the spool."""
         names = (
             "waiting", "refused", "bytes", "most_bytes", "uploaded", "thinned", "discarded",
         )  # fmt: skip
@@ -335,7 +337,7 @@ class Spool:
         return SpoolStatus(**dict(zip(names, row, strict=True)), oldest=oldest)
 
     def refusals(self) -> list[SpoolRefusal]:
-        """Frames that the service refused, oldest first."""
+        """Return the frames that the service rejected, oldest first."""
         with self._transaction(write=False) as database:
             rows = database.execute(
                 "SELECT meta, coalesce(reasons.reason, ?) FROM frames "
@@ -349,7 +351,7 @@ class Spool:
         ]
 
     def retry_refused(self) -> int:
-        """Let what was refused wait again, as after an upgrade of the service; how many."""
+        """Queue the rejected frames again and return their number."""
         with self._transaction() as database:
             query = "UPDATE frames SET reason = NULL WHERE reason IS NOT NULL"
             return database.execute(query).rowcount
@@ -359,33 +361,34 @@ class Spool:
         if_novel: float | bool | None = None, patience_s: float = 120.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> SyncReport:  # fmt: skip
-        """Upload the frames that wait now, oldest first; each leaves the spool once a map has it.
+        """Upload the waiting frames, oldest first; a frame leaves the spool once it is uploaded.
 
-        Call it again after any error or kill: the service recognises content and metadata that a
-        map has, so that no frame is lost and none is there twice. A frame that it refuses (409,
-        413, 415, 422) is set aside with its reason, and the next one follows.
+        After an error or a crash call it again: the service recognises frames that the map already
+        has, so no frame is lost or duplicated. A frame that the service rejects (409, 413, 415,
+        422) is stored with the reason, and the upload continues with the next one.
 
         Parameters
         ----------
-        client : of the service
-        map_name : of the map that frames go to
-        priority, if_novel : as for `Client.upload`
-        patience_s : seconds in all to wait where the service asks to come back later
-        progress : called after each request with (done, total) frames
+        client : client of the service
+        map_name : map that receives the frames
+        priority, if_novel : see `Client.upload`
+        patience_s : total time to wait while the service is busy, seconds
+        progress : function that is called after each request with (done, total) frames
 
         Raises
         ------
-        Unreachable : still offline; what was not uploaded stays in the spool, here and below.
+        Unreachable : If the service does not answer. After every error the remaining frames stay
+            in the spool.
         Busy, RateLimited, QuotaExceeded, StoreAway, StoreLocked, StoreFull, NewerSchema, Refused :
-            the service takes no more now.
-        UnknownMap, KeyRequired, Forbidden : map or key are wrong.
-        UnusableStore : the spool cannot be written.
+            If the service accepts no more frames now.
+        UnknownMap, KeyRequired, Forbidden : If the map or the key is wrong.
+        UnusableStore : If the spool cannot be written.
         """
         how = {"priority": priority, "if_novel": if_novel}
-        upload_fields(priority, if_novel)  # what is wrong with these is no fault of a frame
+        upload_fields(priority, if_novel)  # an invalid argument must not reject any frame
         target = _Target(client, map_name, how, time.monotonic() + patience_s)
         with self._transaction() as database:
-            # written whatever it was: else what is sent would be found out to be so once it is sent
+            # This write detects a read-only file before any frame is sent.
             database.execute(f"PRAGMA user_version = {_SCHEMA}")
             query = "SELECT count(*), max(id) FROM frames WHERE reason IS NULL"
             total, last = database.execute(query).fetchone()
@@ -396,10 +399,10 @@ class Spool:
                 progress(report.done, max(total, report.done))
         return report
 
-    # uploads
+    # Uploads.
 
     def _oldest(self, last: int) -> list[_Waiting]:
-        """Return the first frames that wait, up to an id: as many as fit one request."""
+        """Return the first waiting frames up to an id, as many as fit one request."""
         with self._transaction(write=False) as database:
             rows = database.execute(
                 "SELECT id, length(data) FROM frames WHERE reason IS NULL AND id <= ? "
@@ -420,7 +423,7 @@ class Spool:
         ]
 
     def _send(self, target: _Target, batch: list[_Waiting], report: SyncReport) -> None:
-        """Upload frames, and record what came of each; a batch refused as a whole is halved."""
+        """Upload frames and record the results; a batch that is rejected as a whole is halved."""
         try:
             items = _persist(
                 target,
@@ -442,28 +445,28 @@ class Spool:
             self._send(target, batch[:half], report)
             self._send(target, batch[half:], report)
             return
-        taken, refused, beyond = [], {}, None
+        uploaded, refused, beyond = [], {}, None
         for one, item in zip(batch, items, strict=True):
             if item.frame is not None:
-                taken.append(one.id)
+                uploaded.append(one.id)
                 report.received += item.status != 200
                 report.there += item.status == 200
                 report.poses += item.frame.has_pose
                 if item.frame.samples is not None:
                     report.ranges.append(item.frame.samples)
             elif item.status in _OF_A_FRAME:
-                refused[one.id] = item.problem.detail if item.problem else "no reason was given"
+                refused[one.id] = item.problem.detail if item.problem else "no reason was stated"
             else:
                 beyond = item
-        self._settle(taken, refused)
+        self._settle(uploaded, refused)
         report.refused += len(refused)
         if beyond is not None:
             raise _error_of(beyond)
 
-    def _settle(self, taken: list[int], refused: dict[int, str]) -> None:
-        """Remove frames that a map has, and set others aside."""
+    def _settle(self, uploaded: list[int], refused: dict[int, str]) -> None:
+        """Remove uploaded frames, and mark others as rejected."""
         with self._transaction() as database:
-            for number in taken:
+            for number in uploaded:
                 removed = database.execute("DELETE FROM frames WHERE id = ?", (number,)).rowcount
                 database.execute("UPDATE counters SET uploaded = uploaded + ?", (removed,))
             database.executemany(
@@ -471,7 +474,7 @@ class Spool:
             )
         if not refused:
             return
-        # a full disk may have no room for these: whoever reads them is told so
+        # A full disk may have no room for the reasons; `refusals` then returns a placeholder.
         with suppress(errors.StoreFull), self._transaction() as database:
             database.executemany(
                 "INSERT OR REPLACE INTO reasons SELECT id, ? FROM frames "
@@ -479,15 +482,15 @@ class Spool:
                 [(reason, number) for number, reason in refused.items()],
             )
 
-    # the file
+    # The file.
 
     def _open(self, most_bytes: int | None) -> None:
         """Create or check the tables."""
-        with self._told():
+        with self._translated_errors():
             self._database.execute("PRAGMA journal_mode = PERSIST")
             self._database.execute("PRAGMA synchronous = FULL")
-            # where it is on, as Debian compiles SQLite, all of a frame that is removed would go
-            # through the journal
+            # With secure_delete, which Debian's SQLite enables, removing a frame would write all
+            # of its pages to the journal.
             self._database.execute("PRAGMA secure_delete = OFF")
         with self._transaction() as database:
             mark = database.execute("PRAGMA application_id").fetchone()[0]
@@ -495,8 +498,8 @@ class Spool:
             tables = database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
             if tables and (mark, schema) != (_APPLICATION, _SCHEMA):
                 raise errors.UnusableStore(
-                    f"{self._path}: This is not a spool, or one of another version of "
-                    "sceneprint-client. Name another file, or use that version."
+                    f"{self._path}: This is not a spool, or another version of sceneprint-client "
+                    "wrote it. Specify another file, or use that version."
                 )
             if not tables:
                 for statement in _statements(_TABLES):
@@ -511,26 +514,26 @@ class Spool:
         self._reserve()
 
     def _reserve(self) -> None:
-        """Let the journal have room on disk for removing frames; it stays when transactions end.
+        """Reserve disk space for the journal, which keeps it after each transaction.
 
-        Without that room a full disk could not be emptied: to remove is to write.
+        Without it a full disk could not be emptied, since removing frames writes to the journal.
         """
         journal = self._path.with_name(self._path.name + "-journal")
         if journal.is_file() and journal.stat().st_size >= _RESERVE * _PAGE:
             return
-        with suppress(errors.StoreFull):  # the next time, then
+        with suppress(errors.StoreFull):  # the next call tries again
             with self._transaction() as database:
                 database.execute("CREATE TABLE IF NOT EXISTS reserve (data BLOB)")
-                page = [(bytes(_PAGE // 2 + 1024),)]  # two do not fit into one
+                page = [(bytes(_PAGE // 2 + 1024),)]  # a page holds only one of these rows
                 database.executemany("INSERT INTO reserve VALUES (?)", page * _RESERVE)
-            with self._transaction() as database:  # only pages of before go into the journal
+            with self._transaction() as database:  # only existing pages are written to the journal
                 database.execute("UPDATE reserve SET data = CAST(x'01' || data AS BLOB)")
                 database.execute("DROP TABLE reserve")
 
     @contextmanager
     def _transaction(self, *, write: bool = True) -> Iterator[sqlite3.Connection]:
-        """A transaction that is committed when the block ends well, and else leaves nothing."""
-        with self._lock, self._told():
+        """Run a transaction: commit it at the end of the block, or roll it back after an error."""
+        with self._lock, self._translated_errors():
             self._database.execute("BEGIN IMMEDIATE" if write else "BEGIN")
             try:
                 yield self._database
@@ -542,43 +545,45 @@ class Spool:
                 raise
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Errors of SQLite in our words; Python 3.10 has no codes of them."""
+    def _translated_errors(self) -> Iterator[None]:
+        """Convert errors of SQLite, by their messages: Python 3.10 does not expose error codes."""
         try:
             yield
         except sqlite3.Error as error:
             if "full" in str(error):
                 raise errors.StoreFull(
-                    f"{self._path}: The disk has no room for the spool ({error}), and nothing was "
-                    "changed. Free some, or upload the frames: `sceneprint spool FILE --to MAP`."
+                    f"{self._path}: The disk has no room for the spool ({error}); nothing was "
+                    "changed. Free some space, or upload frames: `sceneprint spool FILE --to MAP`."
                 ) from error
             if "locked" in str(error):
                 raise errors.StoreLocked(
-                    f"{self._path}: Another process has kept the spool locked for "
+                    f"{self._path}: Another process has locked the spool for more than "
                     f"{_LOCKED_S:.0f} s. Stop it, or try again."
                 ) from error
             raise errors.UnusableStore(
-                f"{self._path}: The spool cannot be used ({error}), and nothing was changed. Check "
-                "the path, its permissions and the disk."
+                f"{self._path}: The spool cannot be used ({error}); nothing was changed. Check the "
+                "path, its permissions and the disk."
             ) from error
 
 
 def _require_sendable(data: bytes, meta: FrameMeta) -> None:
-    """See that no service would refuse a frame for what its robot can still mend; FrameError."""
+    """Raise FrameError for errors that the service would report and the robot can still fix."""
     if not data:
         raise errors.UnreadableFrame("The frame is empty. Write it again.")
     if data.startswith(b"\x89PNG") and meta.intrinsics is None:
         raise errors.InvalidIntrinsics(
-            "The frame is a depth image, but its intrinsics are missing. Give `intrinsics` in "
-            "`meta`; intrinsics.json beside the file is read only where `meta` is left out."
+            "The frame is a depth image, but its intrinsics are missing. Pass `intrinsics` in "
+            "`meta`; intrinsics.json beside the file is read only if `meta` is omitted."
         )
 
 
-# What a full spool gives up.
+# Thinning of a full spool.
 
 
 def separation(a: SpoolPlace, b: SpoolPlace) -> float:
-    """Metres / 1 + degrees / 30 + seconds / 60 between two frames; without poses, seconds alone."""
+    """Return metres / 1 + degrees / 30 + seconds / 60 between two frames; time alone if a pose is
+    unknown.
+    """
     apart = abs(a.stamp - b.stamp) / SECONDS
     if a.T is None or b.T is None:
         return apart
@@ -587,7 +592,7 @@ def separation(a: SpoolPlace, b: SpoolPlace) -> float:
 
 
 def pose_matrix(pose: GivenPose | None) -> NDArray[np.float64] | None:
-    """Return a pose as (4, 4); None where there is none, or its numbers are none of a pose."""
+    """Return a pose as (4, 4); None if it is missing or invalid."""
     if pose is None:
         return None
     T = np.eye(4)
@@ -604,7 +609,7 @@ def pose_matrix(pose: GivenPose | None) -> NDArray[np.float64] | None:
 
 
 def _give_up_one(database: sqlite3.Connection) -> None:
-    """Remove the frame that is missed least; see Spool."""
+    """Drop the least valuable frame; see Spool."""
     row = database.execute("SELECT id FROM frames WHERE reason IS NOT NULL ORDER BY id").fetchone()
     if row is not None:
         database.execute("DELETE FROM frames WHERE id = ?", row)
@@ -627,7 +632,7 @@ def _give_up_one(database: sqlite3.Connection) -> None:
 
 
 def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side: int) -> int | None:
-    """Return the waiting frame of a run before (-1) or after (1) one; of None the last."""
+    """Return the waiting frame before (-1) or after (1) a frame of a run; the last for None."""
     order, compared = ("DESC", "<") if side < 0 else ("ASC", ">")
     row = database.execute(
         f"SELECT id FROM frames WHERE reason IS NULL AND run = ? AND id {compared} ? "
@@ -638,7 +643,7 @@ def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side:
 
 
 def _renew_novelty(database: sqlite3.Connection, number: int | None) -> None:
-    """Set the separation of a frame from its two neighbours; null at the ends of a run."""
+    """Store the separation of a frame from its two neighbours; null at the ends of a run."""
     if number is None:
         return
     query = "SELECT run, stamp, pose FROM frames WHERE id = ?"
@@ -659,7 +664,7 @@ def _place(stamp: float, pose: str | None) -> SpoolPlace:
 
 
 def _statements(script: str) -> Iterator[str]:
-    """Statements of a script, one by one: `executescript` would end the transaction."""
+    """Yield the statements of a script, since `executescript` would commit the transaction."""
     statement = ""
     for line in script.splitlines(keepends=True):
         statement += line
@@ -668,21 +673,21 @@ def _statements(script: str) -> Iterator[str]:
             statement = ""
 
 
-# What a service answers.
+# Answers of the service.
 
-#: Statuses that say something about the frame, and nothing of the next one.
+#: Statuses that concern one frame and not the next one.
 _OF_A_FRAME = (400, 409, 413, 415, 422)
 
 
 def _is_about_content(error: errors.SceneprintError) -> bool:
     """Return whether the service refused the content of a request."""
-    if isinstance(error, errors.Refused):  # a proxy before the service, or a problem we do not know
+    if isinstance(error, errors.Refused):  # an answer of a proxy, or an unknown problem
         return error.status in (409, 413, 415, 422)
     return isinstance(error, (errors.FrameError, errors.Conflict, errors.InvalidRequest))
 
 
 def _persist(target: _Target, send: Callable[[], T]) -> T:
-    """Send a request; waits as long as the service asks to, while there is patience."""
+    """Send a request, and repeat it while the service is busy and time is left."""
     while True:
         try:
             return send()
@@ -694,8 +699,8 @@ def _persist(target: _Target, send: Callable[[], T]) -> T:
 
 
 def _error_of(item: BatchItem) -> errors.SceneprintError:
-    """Why the service takes no more frames."""
-    detail = "A frame was not taken." if item.problem is None else item.problem.detail
+    """Return the reason why the service accepts no more frames."""
+    detail = "The service rejected a frame." if item.problem is None else item.problem.detail
     if item.status == 403:
         return errors.QuotaExceeded(detail)
     return errors.Refused(detail, item.status, item.problem.model_dump() if item.problem else {})

@@ -1,4 +1,4 @@
-"""Surfaces as the service packs them: points of frames, and tiles of a map.
+"""Decoders of surfaces that the service sends: points of frames, and tiles of a map.
 
 bytes  --decode_points-->  SurfacePoints: docs/reference.md, Points
 bytes  --decode_tile-->  SurfaceCells: docs/surface.md
@@ -21,26 +21,26 @@ HEADER = struct.Struct("<4sHHII3f3fIf")
 POINT = np.dtype(
     [("position", "<u2", 3), ("patch", "<u2"), ("normal", "i1", 3), ("residual", "u1")]
 )
-#: Flags of the header: what is told of each point.
+#: Flags of the header: attributes of each point.
 NORMALS, PATCHES, RESIDUALS = 1, 2, 4
-#: Index of the validation patch of a point that lies on none.
+#: Index of points that lie on no validation patch.
 NO_PATCH = 65535
-#: Largest coordinate of a point; the shares of the box that they lie in.
+#: Greatest coordinate of a point within its bounding box.
 _STEPS = 65535.0
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """The surface that a frame saw.
+    """Sampled surface of a frame.
 
     Parameters
     ----------
-    points : (N, 3) metres, in the coordinates that were asked for
-    normals : (N, 3) to 1/127; None where not told
-    patches : (N,) index of the validation patch, -1 for none; None where not told
-    residuals : (N,) bytes, see docs/reference.md; None where not told
-    tolerance_m : metres that a residual of 250 stands for; 0 where none is told
-    total : points that there are, of which these were chosen
+    points : (N, 3) metres, in the requested coordinate frame
+    normals : (N, 3) unit normals, rounded to 1/127; None if not requested
+    patches : (N,) index of the validation patch, -1 for none; None if not requested
+    residuals : (N,) bytes, see docs/reference.md; None if not requested
+    tolerance_m : distance that a residual of 250 represents, metres; 0 without residuals
+    total : number of points before subsampling
     """
 
     points: NDArray[np.float64]
@@ -56,15 +56,15 @@ def decode_points(data: bytes) -> SurfacePoints:
 
     Raises
     ------
-    Refused : the bytes are not of this version, or their number is not what they say.
+    Refused : If the format version differs, or the length does not match the header.
     """
     if len(data) < HEADER.size or data[:4] != MAGIC:
-        raise _refusal("they do not begin as points do")
+        raise _refusal("the header is wrong")
     _, version, flags, count, stride, *box, total, tolerance = HEADER.unpack_from(data)
     if (version, stride) != (VERSION, POINT.itemsize):
-        raise _refusal(f"they are of version {version} with {stride} bytes a point")
+        raise _refusal(f"the version is {version}, with {stride} bytes per point")
     if len(data) != HEADER.size + count * POINT.itemsize:
-        raise _refusal(f"{len(data)} bytes are not those of {count} points")
+        raise _refusal(f"{len(data)} bytes do not hold {count} points")
     rows = np.frombuffer(data, POINT, count, HEADER.size)
     origin, extent = np.array(box[:3]), np.array(box[3:])
     patches = rows["patch"].astype(np.int32)
@@ -80,8 +80,8 @@ def decode_points(data: bytes) -> SurfacePoints:
 
 def _refusal(why: str) -> Refused:
     return Refused(
-        f"The service sent bytes that are not points: {why}. Install a client of the service's "
-        "version: `sceneprint doctor` tells it.",
+        f"The service sent invalid points: {why}. Install a client of the service's version, which "
+        "`sceneprint doctor` shows.",
         200,
         {},
     )
@@ -89,26 +89,26 @@ def _refusal(why: str) -> Refused:
 
 # Tiles of a map's surface: docs/surface.md.
 
-#: A cell: place in its tile, how often and when it was seen, and by which session.
+#: A cell: position in its tile, number of sightings, and session and time of the last one.
 CELL = np.dtype([("at", "u1", 3), ("seen", "u1"), ("session", "<u2"), ("taken", "<u2")])
-#: Cells along each side of a tile; shares of a side that a place is told in.
+#: Number of cells along each side of a tile, and number of steps of a position along it.
 SIDE, STEPS = 64, 256
-#: Number of frames that saw a cell, as a byte: so many steps for each doubling.
+#: Steps per doubling of the number of frames that saw a cell, which is stored in one byte.
 SEEN_STEPS = 16.0
-#: Of a cell that no frame with a session saw, and of one that no frame with a time did.
+#: Values of cells that no frame with a session saw, and that no frame with a time saw.
 NO_SESSION, NO_TIME = 65535, 65535
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceCells:
-    """Cells of a tile.
+    """Decoded cells of a tile.
 
     Parameters
     ----------
-    points : (N, 3) mean of what was seen in each cell, metres, in the parent frame
-    seen : (N,) frames that saw it, within 3 percent
-    sessions : (N,) int32 index of the last session that saw it; -1 where that is not known
-    taken : (N,) int32 when it was last seen, in steps of the surface; -1 where that is not known
+    points : (N, 3) mean position of the points in each cell, metres, in the parent frame
+    seen : (N,) number of frames that saw the cell, within 3 percent
+    sessions : (N,) int32 index of the last session that saw the cell; -1 if unknown
+    taken : (N,) int32 time of the last sighting, in steps of the surface; -1 if unknown
     """
 
     points: NDArray[np.float64]
@@ -120,13 +120,13 @@ class SurfaceCells:
 def cell_points(
     rows: NDArray[Any], place: tuple[int, int, int], tile_m: float
 ) -> NDArray[np.float64]:
-    """(N, 3) where cells lie, metres in the parent frame.
+    """Return the positions (N, 3) of cells, metres, in the parent frame.
 
     Parameters
     ----------
-    rows : of CELL
-    place : column, row and floor of their tile
-    tile_m : width of the tile
+    rows : (N,) CELL
+    place : column, row and floor of the tile
+    tile_m : width of the tile, metres
     """
     points: NDArray[np.float64] = (np.array(place) + (rows["at"] + 0.5) / STEPS) * tile_m
     return points
@@ -137,18 +137,18 @@ def decode_tile(data: bytes, tile: SurfaceTile, tile_m: float) -> SurfaceCells:
 
     Parameters
     ----------
-    data : of `surface_tile`
-    tile : which one it is
-    tile_m : of its level
+    data : bytes from `surface_tile`
+    tile : the tile
+    tile_m : width of tiles of its level, metres
 
     Raises
     ------
-    Refused : the bytes are not so many as the tile has.
+    Refused : If the length does not match the number of cells of the tile.
     """
     if len(data) != tile.cells * CELL.itemsize:
         raise Refused(
-            f"The service sent {len(data)} bytes, which are not {tile.cells} cells. Install a "
-            "client of the service's version: `sceneprint doctor` tells it.",
+            f"The service sent {len(data)} bytes, which do not hold {tile.cells} cells. Install a "
+            "client of the service's version, which `sceneprint doctor` shows.",
             200,
             {},
         )

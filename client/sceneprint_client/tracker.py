@@ -1,4 +1,4 @@
-"""Continuous localisation of a robot: answers of a service over time, joined with odometry.
+"""Continuous localization of a robot: answers of a service over time, combined with odometry.
 
     tracker = Tracker(client, "warehouse", camera=(525, 525, 319.5, 239.5))
     state = tracker.update(depth, T_odom_sensor, stamp=stamp)
@@ -6,7 +6,7 @@
         drive(state.T_map_odom)
 
 frame, odometry  --Tracker.update-->  State
-frame, odometry  --AsyncTracker.submit-->  State, at once
+frame, odometry  --AsyncTracker.submit-->  State, without waiting
 log  --replay-->  the same states
 """
 
@@ -48,17 +48,17 @@ if TYPE_CHECKING:
 
 __all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters", "replay"]
 
-#: Why no answer came, and may come the next time.
+#: Errors after which a later query may succeed.
 _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited, errors.StoreAway, errors.StoreLocked)
-#: Age of a frame from which on later questions are not asked with it, seconds.
+#: Greatest age of earlier frames in a query, seconds.
 _OLDEST_S = 30.0
-#: Statuses of HTTP from here on are faults of the service, or of what stands before it.
+#: Lowest HTTP status that is a fault of the service or of a proxy.
 _FIRST_FAULT = 500
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A frame as it is sent: alone, or again with later ones."""
+    """A frame as it is sent, alone or with later frames."""
 
     stamp: float
     T_odom_sensor: NDArray[np.float64]
@@ -67,22 +67,22 @@ class _View:
 
 
 class Tracker:
-    """Where a robot is in a map: `lost`, `ambiguous` or `tracking`, with T_map_odom.
+    """Pose of a robot in a map over time: `lost`, `ambiguous` or `tracking`, with T_map_odom.
 
-    Each update asks the service once, and waits for the answer: see AsyncTracker. Unless it is
-    tracking, the service gets the latest frames together (`TrackerParameters.frames`).
+    Each update sends one query and waits for the answer; AsyncTracker does not wait. While the
+    robot is not tracked, a query contains the latest frames together (`TrackerParameters.frames`).
 
     Parameters
     ----------
-    client : of the service, or `Client.embedded`
-    map_name : of the map, whose frames have poses
-    camera : of frames that are arrays or bytes: as `meta` of `Client.localize`
-    parameters : default: TrackerParameters()
-    log : a text file that is written, a line a call; `replay` reads it
+    client : client of the service, or `Client.embedded`
+    map_name : name of a map whose frames have poses
+    camera : camera of frames that are arrays or bytes, as `meta` of `Client.localize`
+    parameters : parameters; default: TrackerParameters()
+    log : text file that receives one line per call for `replay`
 
     Raises
     ------
-    UnknownMap, FrameError and the like come from `update`, where asking again would not help.
+    SceneprintError : In `update`, if a retry cannot help, such as UnknownMap or a FrameError.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Tracker:
         self._core = TrackerCore(parameters)
         self._views: deque[_View] = deque(maxlen=self._core.parameters.frames)
         self._lock = RLock()
-        self.epoch = 0  #: how often it was reset
+        self.epoch = 0  #: number of resets
         self._log = log
         self._write({"parameters": asdict(self._core.parameters)})
 
@@ -101,27 +101,27 @@ class Tracker:
         self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None = None,
         stamp: float | None = None, *, meta: MetaInput | None = None,
     ) -> State:  # fmt: skip
-        """Ask where a frame was taken; the state after the answer.
+        """Query the pose of a frame, and return the state after the answer.
 
         Parameters
         ----------
-        frame : as for `Client.localize`
-        odom_pose : (4, 4) T_odom_sensor when the frame was taken; of a robot that knows the pose
-            of its base, T_odom_base @ T_base_sensor
-        up : unit vector in the sensor's axes, of an IMU
-        stamp : when the frame was taken, seconds; default: now
-        meta : default: `camera`
+        frame : frame as for `Client.localize`
+        odom_pose : (4, 4) T_odom_sensor at the capture of the frame, or
+            T_odom_base @ T_base_sensor for odometry of the base
+        up : unit vector in the sensor's axes, from an IMU
+        stamp : capture time of the frame, seconds; default: now
+        meta : metadata of the frame; default: `camera`
 
         Raises
         ------
-        SceneprintError : the frame or the map cannot be used. A service that does not answer is no
-            error: the state goes on by odometry.
+        SceneprintError : If the frame or the map cannot be used. Without an answer the state
+            follows the odometry instead.
         """
         stamp = time.time() if stamp is None else stamp
         return self.answer(frame, odom_pose, up, stamp, meta, self.epoch)
 
     def move(self, odom_pose: NDArray[Any], stamp: float | None = None) -> State:
-        """Return the state by odometry alone, between frames."""
+        """Update the odometry between frames, and return the state."""
         stamp = time.time() if stamp is None else stamp
         with self._lock:
             state = self._core.move(stamp, np.asarray(odom_pose, np.float64))
@@ -129,13 +129,14 @@ class Tracker:
             return state
 
     def state(self) -> State:
-        """Return the state as it is, by what came so far."""
+        """Return the current state."""
         with self._lock:
             return self._core.state()
 
     def reset(self, reason: str = "it was reset") -> State:
-        """Forget the place: after a lift or a ride, which odometry does not see. Clock and odometry
-        may begin anew; answers to frames from before are not used.
+        """Forget the pose, as after a motion that odometry does not measure, such as a lift.
+
+        Clock and odometry may start again, and answers to earlier frames are ignored.
         """
         with self._lock:
             self.epoch += 1
@@ -147,7 +148,7 @@ class Tracker:
         self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None,
         stamp: float, meta: MetaInput | None, epoch: int,
     ) -> State:  # fmt: skip
-        """As `update`; an answer to a frame of an `epoch` before the last reset is not used."""
+        """Update like `update`, but ignore the answer if the tracker was reset after `epoch`."""
         T_odom_sensor = rigid_transform(np.asarray(odom_pose, np.float64))
         camera = self._camera if meta is None else meta
         view = _View(stamp, T_odom_sensor, *frame_bytes(frame, camera, with_pose=False, up=up))
@@ -168,21 +169,21 @@ class Tracker:
             return state
 
     def _earlier(self, view: _View) -> list[_View]:
-        """Return the earlier frames that a question is asked with; none while tracking."""
+        """Return the earlier frames of the next query; none while tracking."""
         views = [one for one in self._views if 0 <= view.stamp - one.stamp <= _OLDEST_S]
         poses = [one.T_odom_sensor for one in (*views, view)]
         places = spaced_views(poses, self._core.parameters.frames)
         return [views[place] for place in places[:-1]]
 
     def _remember(self, view: _View) -> None:
-        """Keep a frame for later questions; a robot that stands still keeps what it saw before."""
+        """Store a frame for later queries; a robot that stands still keeps its earlier frames."""
         if not self._views or is_new_view(self._views[-1].T_odom_sensor, view.T_odom_sensor):
             self._views.append(view)
 
     def _observe(
         self, view: _View, earlier: list[_View], prior: PoseEvidence | None
     ) -> tuple[Observation, bool]:
-        """Return what the service says of a frame, and whether it answered with the frame."""
+        """Return the answer to a frame, and whether the service accepted the frame."""
         try:
             answer, used = self._localize(view, earlier, prior)
         except errors.UselessFrame as error:
@@ -199,22 +200,22 @@ class Tracker:
     def _localize(
         self, view: _View, earlier: list[_View], prior: PoseEvidence | None
     ) -> tuple[Localization, list[_View]]:
-        """Ask the service; returns its answer, and the earlier frames that it rests on."""
-        given = None if prior is None else _given_prior(prior)
+        """Send a query; return its answer and the earlier frames that support it."""
+        known = None if prior is None else _sent_prior(prior)
         if earlier:
-            back = inverse(view.T_odom_sensor)  # only what lies between the frames counts
+            back = inverse(view.T_odom_sensor)  # the query uses poses relative to this frame
             sent = [*earlier, view]
             metas = [_with_odometry(one.meta, back @ one.T_odom_sensor) for one in sent]
             frames = [one.data for one in sent]
             try:
                 answer = self._client.localize_sequence(
-                    self._map, frames, metas, keep=False, prior=given
+                    self._map, frames, metas, keep=False, prior=known
                 )
             except (errors.FrameError, errors.TooLarge):
-                pass  # asking with the frame alone tells whether the earlier ones are at fault
+                pass  # a query with only this frame shows whether an earlier frame is the cause
             else:
                 return answer, earlier
-        answer = self._client.localize(self._map, view.data, view.meta, keep=False, prior=given)
+        answer = self._client.localize(self._map, view.data, view.meta, keep=False, prior=known)
         if earlier:
             with self._lock:
                 self._views.clear()
@@ -226,19 +227,19 @@ class Tracker:
 
 
 class AsyncTracker:
-    """A tracker whose questions a thread asks: `submit` returns at once.
+    """A tracker that queries in its own thread, so that `submit` does not wait.
 
-    While a question is under way the latest frame alone waits; older ones are dropped, their
-    odometry counts. To be closed, or used in `with`.
+    During a query only the latest frame waits; older ones are dropped, but their odometry counts.
+    Close it, or use it in `with`.
 
     Parameters
     ----------
-    tracker : which nobody else updates
+    tracker : tracker that nothing else updates
     """
 
     def __init__(self, tracker: Tracker) -> None:
-        self.dropped = 0  #: frames that a later one superseded
-        self.answered = 0  #: questions that ended without an error
+        self.dropped = 0  #: number of frames that a later frame replaced
+        self.answered = 0  #: number of queries that ended without an error
         self._tracker = tracker
         self._waiting: dict[str, Any] | None = None
         self._busy = self._closed = False
@@ -251,11 +252,11 @@ class AsyncTracker:
         self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None = None,
         stamp: float | None = None, *, meta: MetaInput | None = None,
     ) -> State:  # fmt: skip
-        """Leave a frame to the thread; the state by what is known so far. See `Tracker.update`.
+        """Pass a frame to the thread, and return the current state. See `Tracker.update`.
 
         Raises
         ------
-        SceneprintError : an earlier frame, or the map, cannot be used.
+        SceneprintError : If an earlier frame or the map cannot be used.
         """
         stamp = time.time() if stamp is None else stamp
         epoch = self._tracker.epoch
@@ -273,14 +274,14 @@ class AsyncTracker:
         return state
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Until no frame waits; False where that takes longer."""
+        """Wait until no frame waits; return False after a timeout."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: self._waiting is None and not self._busy, timeout_s
             )
 
     def close(self) -> None:
-        """Ask no more; a question that is under way is waited for."""
+        """Stop querying; wait for a query in progress."""
         with self._changed:
             self._closed, self._waiting = True, None
             self._changed.notify_all()
@@ -303,9 +304,9 @@ class AsyncTracker:
                 self._changed.wait_for(lambda: self._waiting is not None or self._closed)
                 if self._waiting is None:
                     return
-                asked, self._waiting, self._busy = self._waiting, None, True
+                frame, self._waiting, self._busy = self._waiting, None, True
             try:
-                self._tracker.answer(**asked)
+                self._tracker.answer(**frame)
             except Exception as error:
                 with self._changed:
                     self._error = error
@@ -314,7 +315,7 @@ class AsyncTracker:
                     self.answered += 1
 
 
-# A log of what came in, from which the states can be computed again.
+# A log of all calls, from which the states can be reproduced.
 
 
 def replay(lines: Iterable[str], parameters: TrackerParameters | None = None) -> Iterator[State]:
@@ -322,8 +323,8 @@ def replay(lines: Iterable[str], parameters: TrackerParameters | None = None) ->
 
     Parameters
     ----------
-    lines : of the log
-    parameters : others than those of the log, to see what they would have changed
+    lines : lines of the log
+    parameters : parameters to use instead of those of the log
     """
     core = TrackerCore(parameters)
     for text in lines:
@@ -379,11 +380,11 @@ def _observation_from(line: dict[str, Any]) -> Observation:
     )
 
 
-def _given_prior(pose: PoseEvidence) -> Prior:
+def _sent_prior(pose: PoseEvidence) -> Prior:
     if pose.covariance is None:
-        raise AssertionError("the tracker knows how sure it is")
-    given = GivenPose(parent_frame=pose.parent_frame, matrix=pose.T_map_sensor.tolist())
-    return Prior(pose=given, covariance=_listed(pose.covariance))
+        raise AssertionError("the prior of a tracker has a covariance")
+    sent = GivenPose(parent_frame=pose.parent_frame, matrix=pose.T_map_sensor.tolist())
+    return Prior(pose=sent, covariance=_listed(pose.covariance))
 
 
 def _with_odometry(meta: FrameMeta, T_odom_sensor: NDArray[np.float64]) -> FrameMeta:

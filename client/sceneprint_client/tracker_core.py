@@ -1,10 +1,10 @@
-"""Where a robot is, from answers over time and odometry: arithmetic alone, without a service.
+"""State of a tracked robot from answers and odometry, computed without a service.
 
 answer of the service  --observation_of-->  Observation
 odometry, Observation  --TrackerCore.update-->  State: lost, ambiguous or tracking; T_map_odom
 
-Each answer is a vote for T_map_odom = T_map_sensor @ inv(T_odom_sensor). Equal calls give equal
-states, so a log of them can be replayed.
+Each answer is a vote for T_map_odom = T_map_sensor @ inv(T_odom_sensor). The same calls give the
+same states, so a log of them can be replayed.
 """
 
 from __future__ import annotations
@@ -28,47 +28,48 @@ from sceneprint_client.poses import rigid_transform
 Array = NDArray[np.float64]
 TrackerStatus = Literal["lost", "ambiguous", "tracking"]
 
-#: Deviations that the filter never falls below, and that any answer is off by at least.
+#: Lower limits of the filter's standard deviations, and deviation to add to that of any answer.
 _LEAST_M, _LEAST_RAD = 0.01, math.radians(0.3)
 _ANSWER_M, _ANSWER_RAD = 0.03, math.radians(1.0)
-#: How much of a further answer that came by the prior is believed: its deviation times this.
+#: Factor of the deviation of repeated answers that the prior decided.
 _PRIOR_FACTOR = 2.0
-#: Moves of odometry whose distance is remembered: answers come late by fewer.
+#: Number of stored odometry poses, which limits the delay of answers.
 _MOST_MARKS = 4096
-#: Views of one question differ by at least one of these, so that each shows something new.
+#: Smallest motion between two views of one query, of which either is sufficient.
 _SPACING_M, _SPACING_RAD = 0.1, math.radians(6.0)
-#: Views farther back on the way are not used: by then odometry may be off by centimetres, and what
-#: is farther still is a jump.
+#: Longest path and largest turn back to an earlier view of a query: beyond them odometry may be
+#: off by centimetres, and a larger step is a jump.
 _LONGEST_WAY_M, _LONGEST_TURN_RAD = 3.0, math.radians(120.0)
 
 
 @dataclass(frozen=True)
 class TrackerParameters:
-    """What the tracker takes for granted.
+    """Parameters of a TrackerCore.
 
     Parameters
     ----------
-    drift : of odometry, as a share of the distance travelled
-    turn_drift : of odometry, as a share of the angle turned
-    heading_drift_deg : of odometry, for each metre travelled
-    gate_m, gate_deg : two poses that differ by less are one place, beside what drift explains
-    apart_m, apart_deg : two views that differ by more, in either, are independent
-    strong_weight, weak_weight : of an answer `found`: with strong matches from two viewpoints or
-        more, and any other
-    alternative_weight : of all alternatives of an ambiguous answer together
-    need : weight by which a place must lead for a first fix
-    ratio : of the weight of answers `found` there to those anywhere else, for a first fix
-    most_votes : answers that are remembered
-    half_life_m, half_life_s : way and time after which a vote counts half
-    contradictions : weight of contradictions, from places apart, that makes it lost; an answer
-        `found` elsewhere counts 1, an ambiguous one without the tracked place 0.5
-    patience_s : how long contradictions from one place may last before it is lost
-    most_deviation_m : it is lost beyond that deviation of the position
-    most_undecided_m : distance that answers may stay undecided between places, or rest on the
-        prior, before the state is ambiguous
-    alone_every : every so many questions one is asked without a prior
-    frames : with how many of the latest frames a question is asked while the robot is lost or
-        ambiguous, 1 to 10; 1 asks with each frame alone
+    drift : drift of the odometry, as a fraction of the travelled distance
+    turn_drift : drift of the odometry, as a fraction of the turned angle
+    heading_drift_deg : drift of the heading, degrees per travelled metre
+    gate_m, gate_deg : greatest difference of two poses of one place, in addition to drift
+    apart_m, apart_deg : smallest motion, of which either is sufficient, between two independent
+        views
+    strong_weight, weak_weight : weights of an answer `found` with strong matches from at least two
+        viewpoints, and of any other answer `found`
+    alternative_weight : total weight of the alternatives of an ambiguous answer
+    need : lead in weight that a place requires for a first fix
+    ratio : smallest ratio of the weight of answers `found` at a place to that of all others, for a
+        first fix
+    most_votes : number of stored answers
+    half_life_m, half_life_s : distance and time after which the weight of a vote is halved
+    contradictions : weight of contradictions, from separate places, after which the robot is
+        lost; an answer `found` elsewhere counts 1, an ambiguous one without the tracked place 0.5
+    patience_s : longest period of contradictions from one place before the robot is lost
+    most_deviation_m : deviation of the position above which the robot is lost
+    most_undecided_m : distance after which the state is ambiguous if all answers leave several
+        places possible or depend on the prior
+    alone_every : interval of queries without a prior
+    frames : number of latest frames in a query while the robot is lost or ambiguous, 1 to 10
     """
 
     drift: float = 0.01
@@ -96,7 +97,7 @@ class TrackerParameters:
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= MOST_OF_SEQUENCE:
             raise InvalidRequest(
-                f"A question cannot be asked with {self.frames} frames. Set `frames` to 1 to "
+                f"A query cannot contain {self.frames} frames. Set `frames` to 1 to "
                 f"{MOST_OF_SEQUENCE}.",
                 (("frames", f"not from 1 to {MOST_OF_SEQUENCE}"),),
             )
@@ -104,14 +105,14 @@ class TrackerParameters:
 
 @dataclass(frozen=True, eq=False)
 class PoseEvidence:
-    """A pose that an answer suggests.
+    """A pose that an answer supports.
 
     Parameters
     ----------
-    parent_frame : of the map
+    parent_frame : parent frame of the map
     T_map_sensor : (4, 4)
-    weight : of an alternative, beside the others: its confidence
-    covariance : (6, 6) of errors (x, y, z, rx, ry, rz), metres and radians, or None
+    weight : confidence of an alternative relative to the others
+    covariance : (6, 6) of errors (x, y, z, rx, ry, rz), metres and radians; None if unknown
     """
 
     parent_frame: str
@@ -122,16 +123,16 @@ class PoseEvidence:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What the tracker takes from an answer.
+    """Evidence of an answer.
 
     Parameters
     ----------
-    status : of the answer; `unanswered` where none came
-    poses : the pose that was found, or the alternatives of an ambiguous answer
-    strong : `found` by strong matches from two viewpoints or more
-    by_prior : `found` because the prior decided
-    reason : of the answer
-    earlier : (4, 4) T_odom_sensor of each earlier frame that the question was asked with
+    status : status of the answer; `unanswered` without an answer
+    poses : pose of the answer, or its alternatives if it is ambiguous
+    strong : whether strong matches from at least two viewpoints support the pose
+    by_prior : whether the prior decided between several poses
+    reason : reason of the answer
+    earlier : (4, 4) T_odom_sensor of each earlier frame of the query
     """
 
     status: Literal["found", "ambiguous", "not_found", "unanswered"]
@@ -143,17 +144,18 @@ class Observation:
 
 
 def observation_of(answer: Localization) -> Observation:
-    """What the tracker takes from an answer of `localize`."""
+    """Return the evidence of an answer of `localize`."""
     if answer.status == "found" and answer.pose is not None:
-        told = answer.uncertainty
-        covariance = None if told is None else np.reshape(np.array(told.covariance), (6, 6))
+        covariance = None
+        if answer.uncertainty is not None:
+            covariance = np.reshape(np.array(answer.uncertainty.covariance), (6, 6))
         pose = PoseEvidence(
             answer.pose.parent_frame, rigid_transform(np.array(answer.pose.matrix)), 1.0, covariance
         )
         strong = answer.strength == "strong" and answer.support >= 2
         return Observation("found", (pose,), strong, answer.verified_by == "prior", answer.reason)
     if answer.status == "found":
-        return Observation("not_found", reason="No frame that matched has a pose in the map.")
+        return Observation("not_found", reason="No matching frame has a pose in the map.")
     poses = tuple(
         PoseEvidence(
             one.pose.parent_frame, rigid_transform(np.array(one.pose.matrix)),
@@ -166,19 +168,19 @@ def observation_of(answer: Localization) -> Observation:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the robot is, as far as that is known.
+    """Pose of the robot, as far as it is known.
 
     Parameters
     ----------
-    status : `tracking`: drive on it; `ambiguous`: several places are possible, or the tracked one
-        is in doubt; `lost`: no place is known
-    stamp : of the odometry that it is told for, seconds
-    parent_frame : of the map, which T_map_odom leads to; None unless there is one
-    T_map_odom : (4, 4), or None; moves while tracking only by what answers correct
+    status : `tracking`: the pose is safe to use; `ambiguous`: several places are possible, or the
+        tracked place is in doubt; `lost`: no place is known
+    stamp : stamp of the latest odometry, seconds
+    parent_frame : parent frame of the map, to which T_map_odom leads; None if unknown
+    T_map_odom : (4, 4), or None; while tracking, only corrections by answers change it
     T_map_sensor : (4, 4) T_map_odom @ T_odom_sensor, or None
-    covariance : (6, 6) of T_map_sensor, errors (x, y, z, rx, ry, rz) as ROS orders them, or None
-    age : seconds since an answer confirmed the place without a prior, or None
-    reason : of the status
+    covariance : (6, 6) of T_map_sensor, errors (x, y, z, rx, ry, rz) in the order of ROS, or None
+    age : time since an answer without a prior confirmed the place, seconds, or None
+    reason : reason of the status
     """
 
     status: TrackerStatus
@@ -193,9 +195,9 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """A place of the odometry: pose, and the way until there in metres and radians.
+    """A pose of the odometry, and the path to it in metres and radians.
 
-    `earlier` are the poses of the earlier frames that an answer rests on as well.
+    `earlier` holds the poses of earlier frames that support the same answer.
     """
 
     stamp: float
@@ -207,30 +209,30 @@ class _Mark:
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
-    """A pose that an answer suggested somewhere on the way."""
+    """A pose that an answer supports, at a pose of the odometry."""
 
-    number: int  #: of the answer
+    number: int  #: number of the answer
     mark: _Mark
     evidence: PoseEvidence
     weight: float
     found: bool
-    friends: set[int] = field(default_factory=set)  #: places in the list of votes that agree
+    friends: set[int] = field(default_factory=set)  #: indices of the votes that agree
 
 
 @dataclass(frozen=True, eq=False)
 class _Belief:
-    """The tracked pose, as it was at the last correction."""
+    """The tracked pose after the last correction."""
 
     parent_frame: str
     mark: _Mark
     T_map_sensor: Array
     covariance: Array
     confirmed: float  #: stamp of the last answer that confirmed it without a prior
-    undecided: float | None = None  #: distance at the first answer since that did not
+    undecided: float | None = None  #: distance at the first later answer that did not confirm it
 
 
 class TrackerCore:
-    """Votes over time, and the state that follows from them; not safe between threads."""
+    """Votes over time, and the resulting state; not safe to share between threads."""
 
     def __init__(self, parameters: TrackerParameters | None = None) -> None:
         self.parameters = parameters or TrackerParameters()
@@ -240,32 +242,32 @@ class TrackerCore:
         self._against: list[tuple[int, _Mark, float]] = []
         self._answers = 0
         self._stamp = 0.0
-        self._verdict: tuple[TrackerStatus, str] = ("lost", "nothing was seen yet")
+        self._verdict: tuple[TrackerStatus, str] = ("lost", "no frame has been queried")
 
     def move(self, stamp: float, T_odom_sensor: Array) -> State:
-        """Return the state after a move of the odometry, without an answer."""
+        """Update the odometry without an answer, and return the state."""
         mark = self._mark(stamp, rigid_transform(T_odom_sensor))
         if self._belief is not None:
             self._verdict = self._tracked(mark)
         return self.state()
 
     def update(self, stamp: float, T_odom_sensor: Array, observation: Observation) -> State:
-        """Return the state after an answer.
+        """Add an answer, and return the state.
 
         Parameters
         ----------
-        stamp, T_odom_sensor : of the frame that was asked for, seconds; answers come in the order
-            of their frames, but moves after the frame may have come before
-        observation : what was answered
+        stamp, T_odom_sensor : stamp, seconds, and odometry of the queried frame. Answers arrive in
+            the order of their frames, but later odometry may have arrived before
+        observation : the answer
 
         Returns
         -------
-        state : of the latest odometry
+        state : state at the latest odometry
 
         Raises
         ------
-        InvalidPose : the odometry is no rigid transform.
-        InvalidRequest : stamps do not rise.
+        InvalidPose : If the odometry is not a rigid transform.
+        InvalidRequest : If the stamps are not strictly increasing.
         """
         mark = self._mark(stamp, rigid_transform(T_odom_sensor))
         if observation.status == "unanswered":
@@ -283,8 +285,9 @@ class TrackerCore:
         return self.state()
 
     def reset(self, reason: str = "it was reset") -> State:
-        """Forget the place: after a lift, or when the robot was carried and knows it; clock and
-        odometry may begin anew. An answer to a frame from before is not to be given any more.
+        """Forget the pose, as after a motion that odometry does not measure, such as a lift.
+
+        Clock and odometry may start again. Do not pass answers to earlier frames afterwards.
         """
         self._forget()
         self._votes.clear()
@@ -294,7 +297,7 @@ class TrackerCore:
         return self.state()
 
     def state(self) -> State:
-        """Return the state as it is."""
+        """Return the current state."""
         status, reason = self._verdict
         stamp = self._marks[-1].stamp if self._marks else self._stamp
         belief = self._belief
@@ -306,7 +309,7 @@ class TrackerCore:
         return State(status, stamp, belief.parent_frame, T_map_odom, T, P, age, reason)
 
     def prior(self, T_odom_sensor: Array) -> PoseEvidence | None:
-        """What the next question should say of the pose; None where it is to be asked alone."""
+        """Return the prior for the next query; None for a query without a prior."""
         alone = (self._answers + 1) % self.parameters.alone_every == 0
         if self._belief is None or self._against or alone or self._verdict[0] != "tracking":
             return None
@@ -316,14 +319,14 @@ class TrackerCore:
     # Odometry.
 
     def _mark(self, stamp: float, T: Array) -> _Mark:
-        """Return the place of a frame; the way to it is measured where it is new."""
+        """Return the odometry at a frame; a new pose extends the path."""
         if self._marks and stamp <= self._marks[-1].stamp:
             at = bisect_right([one.stamp for one in self._marks], stamp) - 1
             known = self._marks[max(at, 0)]
             if known.stamp != stamp or not np.allclose(known.T_odom_sensor, T, atol=1e-6):
                 raise InvalidRequest(
                     f"The stamp {stamp} is not after {self._marks[-1].stamp}, that of the last "
-                    "odometry. Give stamps that rise; reset the tracker where the clock jumped.",
+                    "odometry. Pass increasing stamps; after a jump of the clock reset it.",
                     (("stamp", "not after the last"),),
                 )
             return known
@@ -339,16 +342,16 @@ class TrackerCore:
         return _Mark(last.stamp, T, last.distance + step, last.angle + turn)
 
     def _drifts(self, a: _Mark, b: _Mark) -> tuple[float, float]:
-        """Deviations of the odometry between two places, metres and radians."""
+        """Return the deviations of the odometry between two poses, metres and radians."""
         p, way = self.parameters, abs(a.distance - b.distance)
         turned = math.radians(p.heading_drift_deg) * way + p.turn_drift * abs(a.angle - b.angle)
         return p.drift * way, turned
 
     def _apart(self, a: _Mark, b: _Mark) -> bool:
-        """Return whether each view of one answer differs from each view of the other."""
+        """Return whether each view of one answer is independent of each view of the other."""
         A, B = (np.stack([one.T_odom_sensor, *one.earlier]) for one in (a, b))
         steps = np.linalg.norm(A[:, None, :3, 3] - B[None, :, :3, 3], axis=2)
-        # the trace of a rotation is 1 + 2 cos(angle)
+        # The trace of a rotation is 1 + 2 cos(angle).
         cosines = (np.einsum("aij,bij->ab", A[:, :3, :3], B[:, :3, :3]) - 1) / 2
         turned = cosines < math.cos(math.radians(self.parameters.apart_deg))
         return bool(np.all((steps > self.parameters.apart_m) | turned))
@@ -359,7 +362,7 @@ class TrackerCore:
         p, total = self.parameters, sum(one.weight for one in observation.poses)
         found = observation.status == "found"
         if found and observation.by_prior:
-            return  # it says what we told it
+            return  # the prior decided, so the answer is not independent evidence
         for pose in observation.poses:
             weight = p.alternative_weight * pose.weight / total
             if found:
@@ -373,19 +376,19 @@ class TrackerCore:
             self._votes.append(vote)
         self._keep(lambda vote: vote.number > self._answers - p.most_votes)
 
-    def _keep(self, wanted: Callable[[_Vote], bool]) -> None:
-        """Forget the other votes."""
-        if all(map(wanted, self._votes)):
+    def _keep(self, condition: Callable[[_Vote], bool]) -> None:
+        """Remove all votes that do not satisfy a condition."""
+        if all(map(condition, self._votes)):
             return
-        kept = [old for old, vote in enumerate(self._votes) if wanted(vote)]
-        place = {old: new for new, old in enumerate(kept)}
+        remaining = [old for old, vote in enumerate(self._votes) if condition(vote)]
+        place = {old: new for new, old in enumerate(remaining)}
         self._votes = [
             replace(one, friends={place[friend] for friend in one.friends if friend in place})
-            for one in map(self._votes.__getitem__, kept)
+            for one in map(self._votes.__getitem__, remaining)
         ]
 
     def _agree(self, older: _Vote, newer: _Vote) -> bool:
-        """Whether two votes are one place: the older one carried to the newer by odometry."""
+        """Return whether two votes agree, after odometry moves the older to the newer."""
         if older.evidence.parent_frame != newer.evidence.parent_frame:
             return False
         moved = inverse(older.mark.T_odom_sensor) @ newer.mark.T_odom_sensor
@@ -398,7 +401,7 @@ class TrackerCore:
     def _weight(
         self, places: Iterable[int], apart: Callable[[_Mark, _Mark], bool], *, found: bool
     ) -> float:
-        """Of votes that agree: views from one place, that are not `apart`, count once."""
+        """Return the weight of votes that agree; views that are not `apart` count once."""
         votes = [self._votes[place] for place in places]
         weighed = sorted(
             ((self._aged(one), one) for one in votes if one.found or not found),
@@ -413,21 +416,21 @@ class TrackerCore:
         return total
 
     def _aged(self, vote: _Vote) -> float:
-        """Weight of a vote by now."""
+        """Return the current weight of a vote."""
         p, now = self.parameters, self._votes[-1].mark
         halves = abs(now.distance - vote.mark.distance) / p.half_life_m
         halves += abs(now.stamp - vote.mark.stamp) / p.half_life_s
         return float(vote.weight * 0.5**halves)
 
     def _fixed(self, mark: _Mark, observation: Observation) -> tuple[TrackerStatus, str]:
-        """Look for a place that leads, among all votes; it becomes the belief."""
+        """Return the verdict of a first fix; the leading place becomes the belief."""
         p = self.parameters
         own = [i for i, vote in enumerate(self._votes) if vote.number == self._answers]
         if not own:
             disputed = any(len(one.friends) < len(self._votes) for one in self._votes)
             waits = "several places are possible; " if disputed else ""
             return "ambiguous" if waits else "lost", waits + observation.reason
-        apart = cache(self._apart)  # each vote asks it of the same places
+        apart = cache(self._apart)  # each vote compares the same places
         totals = [self._weight(vote.friends, apart, found=False) for vote in self._votes]
         founds = [self._weight(vote.friends, apart, found=True) for vote in self._votes]
         best = max(own, key=lambda place: (founds[place], totals[place], -place))
@@ -440,10 +443,10 @@ class TrackerCore:
             return "tracking", "found: " + observation.reason
         if observation.status == "ambiguous" or rival_found > 0:
             return "ambiguous", "several places are possible; " + observation.reason
-        return "lost", "one view suggests a place; move, and look again"
+        return "lost", "one view suggests a place; move, and query again"
 
     def _believe(self, mark: _Mark, best: int) -> None:
-        """Take the pose of the best place: of its newest vote `found`, carried by odometry."""
+        """Set the belief to the newest vote `found` at the best place, moved by odometry."""
         friends = [self._votes[place] for place in self._votes[best].friends]
         vote = max((one for one in friends if one.found), key=lambda one: one.number)
         pose = vote.evidence
@@ -458,17 +461,17 @@ class TrackerCore:
     # The tracked place.
 
     def _predicted(self, mark: _Mark) -> tuple[Array, Array]:
-        """T_map_sensor and its covariance at a place of the odometry."""
+        """Return T_map_sensor and its covariance at a pose of the odometry."""
         belief = self._belief
         if belief is None:
-            raise AssertionError("nothing is tracked")
+            raise AssertionError("there is no tracked pose")
         T = belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor) @ mark.T_odom_sensor
         drift_m, drift_rad = self._drifts(belief.mark, mark)
         carried = shifted_covariance(belief.covariance, T[:3, 3] - belief.T_map_sensor[:3, 3])
         return T, carried + _diagonal(drift_m, drift_rad)
 
     def _is_tracked(self, pose: PoseEvidence, T: Array, P: Array) -> bool:
-        """Return whether a pose is the tracked one, as far as the gate and its covariance say."""
+        """Return whether a pose agrees with the tracked one, within the gate and its covariance."""
         if self._belief is None or pose.parent_frame != self._belief.parent_frame:
             return False
         step, turn = difference(T, pose.T_map_sensor)
@@ -477,7 +480,7 @@ class TrackerCore:
         return step <= gate and turn <= gate_rad
 
     def _compare(self, mark: _Mark, observation: Observation) -> None:
-        """Correct the belief by an answer that agrees; note one that does not."""
+        """Correct the belief by an answer that agrees, or record a contradiction."""
         belief = self._belief
         if belief is None or not observation.poses:
             return
@@ -503,7 +506,7 @@ class TrackerCore:
             self._belief = replace(self._belief, undecided=mark.distance)
 
     def _correct(self, mark: _Mark, pose: PoseEvidence, factor: float) -> None:
-        """One step of a Kalman filter; a further view from one place says nothing new."""
+        """Apply a step of a Kalman filter; a repeated view from one place adds no information."""
         belief = self._belief
         if belief is None or not self._apart(belief.mark, mark):
             return
@@ -527,7 +530,7 @@ class TrackerCore:
         )
 
     def _tracked(self, mark: _Mark) -> tuple[TrackerStatus, str]:
-        """Return the verdict on the belief; one that cannot be kept is dropped."""
+        """Return the verdict on the belief, and drop a belief that is no longer supported."""
         p, belief = self.parameters, self._belief
         if belief is None:
             return self._verdict
@@ -539,21 +542,21 @@ class TrackerCore:
             if enough or (len(self._against) > 1 and lasted >= p.patience_s - 1e-9):
                 self._keep(lambda vote: vote.number >= first)
                 self._forget()
-                return "lost", "answers contradict the tracked place again and again"
+                return "lost", "answers repeatedly contradict the tracked place"
             if len(self._against) > 1:
-                return "ambiguous", "answers from one place contradict the tracked one"
+                return "ambiguous", "answers from one place contradict the tracked place"
         deviation = _deviation(P[:3, :3])
         if deviation > p.most_deviation_m:
             self._forget()
             return "lost", f"odometry since the last fix may be off by {deviation:.2f} m"
         if belief.undecided is not None and mark.distance - belief.undecided > p.most_undecided_m:
-            return "ambiguous", "no answer has confirmed the place without the prior for long"
+            return "ambiguous", "no answer has recently confirmed the place without the prior"
         if self._against:
-            return "tracking", "one answer contradicts the tracked place; it is not moved"
+            return "tracking", "one answer contradicts the tracked place; the pose is unchanged"
         return "tracking", "tracked by odometry since the last fix"
 
     def _contradiction(self) -> float:
-        """Weight of the answers against the tracked place; views from one place count once."""
+        """Return the weight of contradicting answers; views from one place count once."""
         counted: list[tuple[int, _Mark, float]] = []
         for one in sorted(self._against, key=lambda one: (-one[2], one[0])):
             if all(self._apart(one[1], other[1]) for other in counted):
@@ -569,7 +572,7 @@ class TrackerCore:
 
 
 def inverse(T: Array) -> Array:
-    """Of a rigid transform (4, 4)."""
+    """Return the inverse of a rigid transform (4, 4)."""
     back = np.eye(4)
     back[:3, :3] = T[:3, :3].T
     back[:3, 3] = -T[:3, :3].T @ T[:3, 3]
@@ -577,23 +580,25 @@ def inverse(T: Array) -> Array:
 
 
 def difference(a: Array, b: Array) -> tuple[float, float]:
-    """Metres and radians between two poses (4, 4)."""
+    """Return distance, metres, and angle, radians, between two poses (4, 4)."""
     angle = float(np.linalg.norm(rotation_vector(a[:3, :3].T @ b[:3, :3])))
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), angle
 
 
 def spaced_views(poses: Sequence[Array], most: int) -> list[int]:
-    """Return which of the last views of a way a question is asked with.
+    """Return the indices of the latest views to use in one query.
+
+    Any two differ by 0.1 m or 6 degrees. The path from each to the last view is at most 3 m long
+    and turns by at most 120 degrees.
 
     Parameters
     ----------
-    poses : (4, 4) T_odom_sensor of each view, in the order they were taken
-    most : views, the last one included
+    poses : (4, 4) T_odom_sensor of each view, in order of capture
+    most : greatest number of views, including the last
 
     Returns
     -------
-    places : of the views, in order; the last one is that of `poses`. Any two differ by 0.1 m or 6
-        degrees, and the way from each to the last is at most 3 m long and turns by 120 degrees.
+    places : increasing indices into `poses`, including the last
     """
     last = len(poses) - 1
     chosen, way, turned = [last], 0.0, 0.0
@@ -608,14 +613,14 @@ def spaced_views(poses: Sequence[Array], most: int) -> list[int]:
 
 
 def is_new_view(a: Array, b: Array) -> bool:
-    """Return whether two poses (4, 4) are 0.1 m or 6 degrees apart."""
+    """Return whether two poses (4, 4) differ by at least 0.1 m or 6 degrees."""
     step, turn = difference(a, b)
     return step >= _SPACING_M or turn >= _SPACING_RAD
 
 
 def rotation_vector(R: Array) -> Array:
-    """Axis times angle, radians, of a rotation (3, 3)."""
-    # sine from the skew part, cosine from the trace; near half a turn the symmetric part tells
+    """Return the rotation vector (axis times angle, radians) of a rotation (3, 3)."""
+    # The skew part gives the sine, the trace the cosine; near 180 degrees the symmetric part helps.
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     sine, cosine = float(np.linalg.norm(skew)), (float(np.trace(R)) - 1) / 2
     angle = math.atan2(sine, cosine)
@@ -628,7 +633,7 @@ def rotation_vector(R: Array) -> Array:
 
 
 def rotation_matrix(vector: Array) -> Array:
-    """(3, 3) of axis times angle, radians."""
+    """Return the rotation (3, 3) of a rotation vector (axis times angle, radians)."""
     x, y, z = vector
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = float(np.linalg.norm(vector))
@@ -639,30 +644,30 @@ def rotation_matrix(vector: Array) -> Array:
 
 
 def shifted_covariance(P: Array, offset: Array) -> Array:
-    """Covariance (6, 6) of the pose of something that is rigidly joined to what P is of.
+    """Return the covariance (6, 6) of the pose of a point that moves rigidly with another pose.
 
     Parameters
     ----------
-    P : (6, 6) of errors (x, y, z, rx, ry, rz) along the axes of the parent frame
-    offset : (3,) from the one to the other, along the same axes, metres
+    P : (6, 6) covariance of the other pose, errors (x, y, z, rx, ry, rz) in the parent frame
+    offset : (3,) vector from the other pose to the point in the parent frame, metres
     """
     x, y, z = offset
-    F = np.eye(6)  # an error of the rotation moves what lies ahead: e x (x, y, z)
+    F = np.eye(6)  # a rotation error e moves the point by e x offset
     F[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
     return np.asarray(F @ P @ F.T, np.float64)
 
 
 def _diagonal(metres: float, radians: float) -> Array:
-    """Covariance (6, 6) of independent deviations."""
+    """Return the covariance (6, 6) of independent deviations."""
     return np.diag(np.repeat([metres**2, radians**2], 3))
 
 
 def _measured(pose: PoseEvidence) -> Array:
-    """Covariance of an answer: what it says, and what any answer may be off."""
+    """Return the covariance of an answer, with the additional deviation of any answer."""
     least = _diagonal(_ANSWER_M, _ANSWER_RAD)
     return least if pose.covariance is None else pose.covariance + least
 
 
 def _deviation(P: Array) -> float:
-    """Return the largest deviation in any direction."""
+    """Return the largest standard deviation in any direction."""
     return math.sqrt(max(float(np.linalg.eigvalsh(P)[-1]), 0.0))

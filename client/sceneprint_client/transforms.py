@@ -1,9 +1,9 @@
-"""Frames of a robot over time: tf, tf_static and odometry.
+"""Transforms between a robot's frames over time: tf, tf_static and odometry.
 
-TransformTree.add ...  --TransformTree.lookup-->  T_parent_child at M stamps, or why it is unknown
-stamps (N,), samples (N, 7)  --contradictions-->  which of them cannot be one motion
+TransformTree.add ...  --TransformTree.lookup-->  T_parent_child at M stamps, or UnknownTransform
+stamps (N,), samples (N, 7)  --contradictions-->  samples that cannot belong to one motion
 
-tf calls the outer frame the parent: a transform takes coordinates of the child to the parent's.
+As in tf, a transform converts coordinates of the child frame to those of its parent.
 """
 
 from __future__ import annotations
@@ -26,39 +26,38 @@ from sceneprint_client.poses import (
     rotation_of,
 )
 
-#: Seconds between two samples of a transform beyond which nothing between them is known.
+#: Longest interval between two samples in which to interpolate, seconds.
 LONGEST_GAP_S = 0.5
-#: Seconds before the first sample of a transform, or after its last, for which that one stands.
+#: Longest extrapolation before the first and after the last sample, seconds.
 TOLERANCE_S = 0.02
-#: Most samples of moving transforms: hours at the rate of any odometry.
+#: Greatest number of samples of moving transforms: hours of odometry.
 MOST_SAMPLES = 5_000_000
-#: How far the length of a recorded quaternion may be from 1: of a unit quaternion, and of one that
-#: is normalised.
+#: Greatest deviation of the length of a recorded quaternion from 1, without and with normalisation.
 _UNIT, _NEAR_UNIT = 1e-2, 0.1
-#: Farthest believable translation, metres.
+#: Longest plausible translation, metres.
 _FARTHEST_M = 1e7
-#: Names of a robot's base, as REP 105 and practice have them, the first that is there counts.
+#: Names of a robot's base frame in REP 105 and in practice, in order of preference.
 BASES = ("base_link", "base_footprint", "base")
-#: Names of frames that poses lead to, as REP 105 has them, the first that is there counts.
+#: Names of parent frames of poses in REP 105, in order of preference.
 WORLDS = ("map", "odom", "world")
 
 
-#: Motion beyond which two samples contradict each other, metres (or radians) per second, ...
+#: Speed above which two samples contradict each other, metres (or radians) per second, ...
 FASTEST = 50.0
-#: ... and by which they may differ besides, metres or radians.
+#: ... with this tolerance, metres or radians.
 _JITTER = 0.1
-#: A jump, metres or radians, and a change of motion, per second^2, that samples of one motion do
-#: not show; a jump that is taken back within so many seconds is of two publishers.
+#: A jump, metres or radians, and an acceleration, per second^2, that one motion cannot show; a
+#: jump and its reversal within this time, seconds, indicate two publishers.
 _JUMP, _HARDEST, _BACK_S = 0.5, 10.0, 2.0
 
 
 class UnknownTransform(NamedTuple):
-    """Why a transform is not known at a time.
+    """Reason why a transform is unknown at a time.
 
     Parameters
     ----------
-    transform : such as "odom -> base_link"
-    nearest_s : seconds to its nearest sample; None where its samples contradict each other
+    transform : name such as "odom -> base_link"
+    nearest_s : seconds to the nearest sample; None if the samples contradict each other
     """
 
     transform: str
@@ -67,15 +66,15 @@ class UnknownTransform(NamedTuple):
 
 @dataclass(eq=False)
 class _Edge:
-    """Samples of one transform; a fixed one has one sample and no stamp."""
+    """Samples of one transform; a fixed transform has one sample and no stamp."""
 
     fixed: bool
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
-    samples: array[float] = field(default_factory=lambda: array("d"))  # 7 each: x y z, x y z w
+    samples: array[float] = field(default_factory=lambda: array("d"))  # rows of 7: x y z, x y z w
 
     @property
     def is_constant(self) -> bool:
-        """Return whether it never moved, as a fixed joint that is published repeatedly."""
+        """Return whether it never moved, like a fixed joint that is published repeatedly."""
         rows = np.frombuffer(self.samples, np.float64).reshape(-1, 7)
         return self.fixed or bool((np.ptp(rows, axis=0) < 1e-9).all())
 
@@ -87,30 +86,30 @@ class TransformTree:
         self._edges: dict[str, dict[str, _Edge]] = {}  # by child, then by parent
         self._count = 0
         self._origin_ns: int | None = None
-        #: Transforms (parent, child) of which samples were passed over: the reason, and how many.
+        #: Transforms (parent, child) with ignored samples: the reason and their number.
         self.passed_over: dict[tuple[str, str], tuple[str, int]] = {}
-        #: Transforms whose quaternions were normalised: the length of the last one.
+        #: Transforms with normalised quaternions: the length of the last one.
         self.normalised: dict[tuple[str, str], float] = {}
 
     def add(
         self, parent: str, child: str, stamp_ns: int, sample: Sequence[float], *, fixed: bool
     ) -> bool:
-        """Add a sample of a transform; one that is not rigid is ignored, and noted.
+        """Add a sample of a transform; a sample that is not rigid is ignored and recorded.
 
         Parameters
         ----------
-        parent, child : names; a leading slash, as ROS 1 wrote it, is no part of them
-        stamp_ns : when; not looked at of a fixed one
-        sample : x y z in metres, and a unit quaternion x y z w: T_parent_child
-        fixed : whether it holds at all times; the last one counts
+        parent, child : names of the frames; a leading slash of ROS 1 is removed
+        stamp_ns : stamp, nanoseconds; ignored for a fixed transform
+        sample : T_parent_child as x y z, metres, and a unit quaternion x y z w
+        fixed : whether the transform holds at all times; the last sample counts
 
         Returns
         -------
-        added : False where the sample was ignored
+        added : False if the sample was ignored
 
         Raises
         ------
-        DatasetError : there are more than 5 million; `forget` makes room.
+        DatasetError : If there are more than 5 million samples; `forget` removes old samples.
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)
@@ -147,30 +146,30 @@ class TransformTree:
         return True
 
     def pass_over(self, parent: str, child: str, reason: str) -> None:
-        """Note a sample of a transform that was passed over, with the reason."""
+        """Record a sample that was ignored, with the reason."""
         _, count = self.passed_over.get((parent, child), ("", 0))
         self.passed_over[parent, child] = reason, count + 1
 
     def remove(self, parent: str, child: str) -> None:
-        """Drop a transform."""
+        """Remove a transform."""
         edge = self._edges.get(child, {}).pop(parent, None)
         self._count -= 0 if edge is None else len(edge.stamps_ns)
 
     def samples(self, parent: str, child: str) -> Floats:
-        """Return the samples (N, 7) of a transform in the order in which they came."""
+        """Return the samples (N, 7) of a transform in order of arrival."""
         edge = self._edges.get(frame_name(child), {}).get(frame_name(parent))
         rows = np.frombuffer(b"" if edge is None else edge.samples.tobytes(), np.float64)
         return rows.reshape(-1, 7)
 
     def forget_moving(self) -> None:
-        """Drop all that may move, as where the clock jumped."""
+        """Remove all moving transforms, as after a jump of the clock."""
         for edges in self._edges.values():
             for parent in [name for name, edge in edges.items() if not edge.fixed]:
                 self._count -= len(edges.pop(parent).stamps_ns)
         self._origin_ns = None
 
     def forget(self, span_ns: int) -> None:
-        """Drop samples of moving transforms that came before those of so long until the latest."""
+        """Remove samples of moving transforms that are older than a span before the latest."""
         for edges in self._edges.values():
             for edge in edges.values():
                 if not edge.fixed:
@@ -184,18 +183,18 @@ class TransformTree:
         return sorted(parents | self._edges.keys())
 
     def has_edge(self, parent: str, child: str) -> bool:
-        """Return whether there is a transform from a child directly to a parent."""
+        """Return whether a frame is a direct child of another."""
         return frame_name(parent) in self._edges.get(frame_name(child), {})
 
     def ancestors(self, child: str, *, constant: bool = False) -> list[str]:
-        """Return a frame and those above it, nearest first.
+        """Return a frame and its ancestors, nearest first.
 
-        Of several parents that with the most samples is taken.
+        Of several parents, the one with the most samples is used.
 
         Parameters
         ----------
-        child : the name
-        constant : stop below the first transform that moves
+        child : name of the frame
+        constant : whether to stop before the first moving transform
         """
         found = [frame_name(child)]
         while True:
@@ -210,7 +209,7 @@ class TransformTree:
             found.append(max(parents, key=lambda name: (len(parents[name].samples), name)))
 
     def path(self, ancestor: str, child: str) -> list[str] | None:
-        """Return the frames from a child up to an ancestor, both included, or None."""
+        """Return the frames from a child up to an ancestor, both included; None without a path."""
         ancestor, child = frame_name(ancestor), frame_name(child)
         came: dict[str, str] = {child: ""}
         waiting = [child]
@@ -228,14 +227,14 @@ class TransformTree:
         return up[::-1]
 
     def leaves(self, frame: str) -> list[str]:
-        """Return the frames below one that have none below them."""
+        """Return the descendants of a frame that have no children."""
         parents = {one for edges in self._edges.values() for one in edges}
         return [
             one for one in sorted(self._edges.keys() - parents) if self.path(frame, one) is not None
         ]
 
     def moves_below(self, frame: str) -> bool:
-        """Return whether a frame directly below one moves in it."""
+        """Return whether a direct child of a frame moves."""
         return any(
             not self._holds_still(frame, child)
             for child, edges in self._edges.items()
@@ -243,15 +242,15 @@ class TransformTree:
         )
 
     def base_of(self, sensor: str, world: str | None) -> str | None:
-        """Return the frame of the robot that carries a sensor; None where nothing tells.
+        """Return the frame of the robot that carries a sensor; None if it cannot be determined.
 
-        It is `base_link` or its like above the sensor; else the last frame above it to which the
-        sensor does not move.
+        It is an ancestor with a name such as `base_link`, or else the highest ancestor to which
+        the sensor is fixed.
 
         Parameters
         ----------
-        sensor : its frame
-        world : what poses lead to; where given, the base lies below it
+        sensor : frame of the sensor
+        world : parent frame of poses, an ancestor of the base; None if unknown
         """
         up = self.ancestors(sensor) if world is None else self.path(world, sensor) or []
         up = up if world is None else up[:-1]
@@ -265,9 +264,9 @@ class TransformTree:
         return still[-1] if still and still[-1] != frame_name(sensor) else None
 
     def world_of(self, sensor: str) -> str | None:
-        """Return the frame that poses of a sensor lead to; None where nothing above it moves.
+        """Return the parent frame of a sensor's poses; None if no ancestor moves.
 
-        It is `map`, else `odom`, else the topmost.
+        It is `map`, else `odom`, else `world`, else the root.
         """
         up = self.ancestors(sensor)
         moves = [
@@ -285,7 +284,7 @@ class TransformTree:
         return up[-1] if any(moves) else None
 
     def fixed_transform(self, target: str, source: str) -> Floats | None:
-        """Return T_target_source (4, 4) of frames that do not move against each other, or None."""
+        """Return T_target_source (4, 4) if the frames are fixed to each other, else None."""
         ups = [self.ancestors(one, constant=True) for one in (target, source)]
         common = next((one for one in ups[1] if one in ups[0]), None)
         if common is None:
@@ -298,26 +297,26 @@ class TransformTree:
         return found
 
     def poses(self, parent: str, child: str, stamps_ns: Sequence[int]) -> list[Floats | None]:
-        """Return what `lookup` does, with None where a transform on the way is not known."""
+        """Return the result of `lookup` with None for unknown transforms."""
         found = self.lookup(parent, child, stamps_ns)
         return [None if isinstance(one, UnknownTransform) else one for one in found]
 
     def lookup(
         self, parent: str, child: str, stamps_ns: Sequence[int]
     ) -> list[Floats | UnknownTransform]:
-        """Return T_parent_child (4, 4) at each stamp, positions linear and rotations by slerp.
+        """Return T_parent_child (4, 4) at each stamp: linear positions, and rotations by slerp.
 
         Parameters
         ----------
-        parent : the child itself, or a frame above it
-        child : a frame
-        stamps_ns : M times, in any order
+        parent : the child itself or one of its ancestors
+        child : name of the frame
+        stamps_ns : M stamps in any order, nanoseconds
 
         Returns
         -------
-        found : of M stamps; the first transform on the way that is not known at that time, where
-            its samples on either side are more than `LONGEST_GAP_S` apart and none lies within
-            `TOLERANCE_S`, or where they contradict each other
+        transforms : M transforms. Each may instead be the first unknown transform on the path: its
+            neighbouring samples contradict each other, or are more than `LONGEST_GAP_S` apart with
+            none within `TOLERANCE_S`
         """
         path = self.path(parent, child)
         if path is None:
@@ -335,9 +334,7 @@ class TransformTree:
         return found
 
     def _holds_still(self, parent: str, child: str) -> bool:
-        """Return whether a transform is fixed: one that never moved counts, but for that of a base,
-        which may have stood still.
-        """
+        """Return whether a transform is fixed; a base that never moved may have stood still."""
         edge = self._edges[child][parent]
         names = {parent.rpartition("/")[2], child.rpartition("/")[2]}
         is_of_base = not names.isdisjoint(WORLDS) or child.rpartition("/")[2] in BASES
@@ -356,19 +353,19 @@ class TransformTree:
         origin = self._origin_ns or 0
         recorded: NDArray[np.int64] = np.frombuffer(edge.stamps_ns, np.int64)
         order = np.argsort(recorded, kind="stable")
-        # seconds since a time of the recording: exact to nanoseconds for a hundred days
+        # Seconds relative to a stamp of the recording are exact to nanoseconds for 100 days.
         times: Floats = (recorded[order] - origin).astype(np.float64) * 1e-9
         rows = rows[order]
-        wanted = (np.asarray(stamps_ns, np.int64) - origin) * 1e-9
-        before = np.maximum(np.searchsorted(times, wanted, "right") - 1, 0)
-        after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
-        distance = np.minimum(np.abs(times[before] - wanted), np.abs(times[after] - wanted))
+        seconds = (np.asarray(stamps_ns, np.int64) - origin) * 1e-9
+        before = np.maximum(np.searchsorted(times, seconds, "right") - 1, 0)
+        after = np.minimum(np.searchsorted(times, seconds), len(times) - 1)
+        distance = np.minimum(np.abs(times[before] - seconds), np.abs(times[after] - seconds))
         doubted = _between_doubts(*contradictions(times, rows), before, after)
 
         _, first = np.unique(times, return_index=True)
         trajectory = SensorTrajectory(times[first], rows[first, :3], rows[first, 3:])
         poses = interpolate(
-            trajectory, wanted.tolist(), longest_gap=LONGEST_GAP_S, tolerance=TOLERANCE_S
+            trajectory, seconds.tolist(), longest_gap=LONGEST_GAP_S, tolerance=TOLERANCE_S
         )
         name = f"{parent} -> {child}"
         return [
@@ -382,24 +379,24 @@ class TransformTree:
 def contradictions(
     times: Floats, rows: Floats
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
-    """Find samples of one transform that cannot be of one motion.
+    """Return which samples of one transform cannot belong to one motion.
 
     Parameters
     ----------
-    times : (N,) seconds, in order; two samples may have one time
-    rows : (N, 7) x y z metres, and unit quaternions x y z w
+    times : (N,) non-decreasing times, seconds
+    rows : (N, 7) x y z, metres, and unit quaternions x y z w
 
     Returns
     -------
-    too_fast : (N - 1,) pairs of neighbours that imply more than `FASTEST`
-    disputed : (N,) samples from a jump to the jump back, as of two publishers
+    too_fast : (N - 1,) whether neighbouring samples imply a speed above `FASTEST`
+    disputed : (N,) whether the sample lies between a jump and its reversal, as of two publishers
     """
     disputed = np.zeros(len(times), np.bool_)
     gap = np.diff(times)
     steps = _steps(rows[:-1], rows[1:])
     reach = motion(rows[:-1], rows[1:])
     too_fast = reach > _JITTER + FASTEST * gap
-    # a jump differs from the motion on both sides of it
+    # A jump differs from the motion before and after it.
     rate = steps / np.maximum(gap, 1e-3)[:, None]
     change = np.full(len(gap), np.inf if len(gap) > 1 else 0.0)
     for k, neighbour in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
@@ -414,14 +411,14 @@ def contradictions(
 
 
 def motion(rows: Floats, others: Floats) -> Floats:
-    """Return how far samples (M, 7) lie from others: metres, where a radian counts as one."""
+    """Return the distances between samples (M, 7), metres; a radian counts as a metre."""
     found: Floats = np.linalg.norm(_steps(rows, others), axis=1)
     return found
 
 
 def _steps(rows: Floats, others: Floats) -> Floats:
-    """Return the steps from samples to others (M, 6): translations, and rotations in the axes of
-    the first, whose length is 2 sin of half the angle.
+    """Return the steps (M, 6) between samples: translations, and rotations in the axes of the first
+    sample, as axes times 2 sin(angle / 2).
     """
     x, y, z, w = rows[:, 3:].T * np.array([[-1.0], [-1.0], [-1.0], [1.0]])
     a, b, c, d = others[:, 3:].T
@@ -434,7 +431,7 @@ def _steps(rows: Floats, others: Floats) -> Floats:
         axis=1,
     )
     real = w * d - x * a - y * b - z * c
-    turn[real < 0.0] *= -1.0  # q and -q are one rotation
+    turn[real < 0.0] *= -1.0  # q and -q are the same rotation
     return np.hstack([others[:, :3] - rows[:, :3], 2.0 * turn])
 
 
@@ -442,7 +439,7 @@ def _between_doubts(
     too_fast: NDArray[np.bool_], disputed: NDArray[np.bool_], before: NDArray[np.intp],
     after: NDArray[np.intp],
 ) -> NDArray[np.bool_]:  # fmt: skip
-    """Return whether the samples on either side of M times contradict each other."""
+    """Return whether the samples before and after each of M times contradict each other."""
     low, high = np.minimum(before, after), np.maximum(before, after)
     sums = np.concatenate([[0], np.cumsum(too_fast)])
     found: NDArray[np.bool_] = (sums[high] > sums[low]) | disputed[low] | disputed[high]
@@ -450,5 +447,5 @@ def _between_doubts(
 
 
 def frame_name(name: str) -> str:
-    """Return a frame's name without the leading slash of ROS 1, in one printable line."""
+    """Return a frame's name as one printable line, without the leading slash of ROS 1."""
     return printable(name.lstrip("/"))

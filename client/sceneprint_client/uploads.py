@@ -1,4 +1,4 @@
-"""Uploads: one frame, one under an id of the caller, many at once."""
+"""Client methods for uploads of single frames and of batches."""
 
 from __future__ import annotations
 
@@ -30,46 +30,44 @@ from sceneprint_client.http import (
 if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput, MetaInput
 
-#: Longest time the service is asked to wait for a worker, seconds.
+#: Longest wait for a worker that one request specifies, seconds.
 _LONGEST_WAIT_S = 60
 
 
 class UploadMethods(ServiceConnection):
-    """How frames come into a map."""
+    """Client methods that add frames to a map."""
 
     def upload(
         self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
-        """Upload a frame into a map. It is durable when this returns, and signed soon after.
+        """Upload a frame. It is durable when this returns; a worker signs it soon after.
 
         Parameters
         ----------
-        map_name : of the map
-        frame : a path, the content of a PNG or NPY file or of a cloud, a frame of
-            `find_sequences`, or an array: (H, W) depth, uint16 in stored units or floating in
-            metres, or (N, 3) points; or an image or cloud of Open3D, or an image of Pillow
-        meta : metadata; default: what `meta_of` finds. Or only the camera:
-            CameraIntrinsics, Open3D's PinholeCameraIntrinsic, or for an array a (3, 3) matrix or
-            (fx, fy, cx, cy)
-        wait_s : seconds to wait until it is signed; default: none
+        frame : path or content of a file, frame of `find_sequences`, or array: (H, W) depth,
+            uint16 in stored units or floating point in metres, or (N, 3) points; or an image or
+            cloud of Open3D, or an image of Pillow
+        meta : metadata; default: those of `meta_of`. Or only the camera: CameraIntrinsics,
+            Open3D's PinholeCameraIntrinsic, or for an array a (3, 3) matrix or (fx, fy, cx, cy)
+        wait_s : longest wait until the frame is signed, seconds; default: no wait
         priority : -10 to 10; frames of higher priority are signed first
-        if_novel : keep it only if its place is new to the map: its nearest frame is farther than
-            this share of the distance between unrelated frames (True: 0.3);
-            else the frame becomes `redundant`, and `reason` names the near frame
-        up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar
+        if_novel : distance to the nearest frame of the map from which the frame is kept, as a
+            fraction of the distance between unrelated frames (True: 0.3). A closer frame becomes
+            `redundant`, and `reason` names its neighbour
+        up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar file
 
         Returns
         -------
-        added : its state says whether it is signed yet
+        added : the upload; its state shows whether the frame is signed
 
         Raises
         ------
-        UnknownMap : no such map.
-        FrameError, DatasetError : the frame cannot be read, or its camera or pose is invalid.
-        FrameConflict : the map has the same content with other metadata.
-        InvalidRequest : a priority or `if_novel` out of range.
+        UnknownMap : If the map does not exist.
+        FrameError, DatasetError : If the frame cannot be read, or its camera or pose is invalid.
+        FrameConflict : If the map has the same content with other metadata.
+        InvalidRequest : If `priority` or `if_novel` is out of range.
         """
         until = time.monotonic() + (wait_s or 0.0)
         added, _ = self.add(
@@ -82,9 +80,9 @@ class UploadMethods(ServiceConnection):
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
-        """Like `upload`, with a flag: False if the map already had the frame.
+        """Upload a frame like `upload`, and return whether it is new to the map.
 
-        The wait may end early; `upload` waits until the end.
+        The service may end the wait early; `upload` repeats it until `wait_s` has passed.
         """
         return self._upload(
             "POST", f"{map_path(map_name)}/frames", frame, meta, wait_s or 0.0,
@@ -96,20 +94,19 @@ class UploadMethods(ServiceConnection):
         meta: MetaInput | None = None, *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
-        """Upload a frame under an id of your own; sending it again has no further effect.
+        """Upload a frame under an id of your own; a repetition has no further effect.
 
         Parameters
         ----------
-        map_name : of the map
-        frame_id : up to 64 letters, digits, dots, hyphens and underscores, the first a letter or
-            digit
-        frame, meta, wait_s, priority, if_novel, up : as for `upload`
+        frame_id : up to 64 letters, digits, dots, hyphens and underscores, starting with a letter
+            or digit
+        frame, meta, wait_s, priority, if_novel, up : see `upload`
 
         Raises
         ------
-        UnknownMap, FrameError, DatasetError : as for `upload`.
-        FrameConflict : that id has a frame with other content or metadata.
-        InvalidRequest : an invalid id; a priority or `if_novel` out of range.
+        UnknownMap, FrameError, DatasetError : See `upload`.
+        FrameConflict : If a frame with this id has other content or metadata.
+        InvalidRequest : If the id is invalid, or `priority` or `if_novel` is out of range.
         """
         check_frame_id(frame_id)
         until = time.monotonic() + (wait_s or 0.0)
@@ -128,26 +125,25 @@ class UploadMethods(ServiceConnection):
 
         Parameters
         ----------
-        map_name : of the map
-        frames, metas : as for `upload`; one for all, or one for each
-        priority, if_novel : for all
+        frames, metas : see `upload`; one `meta` for all frames, or one for each
+        priority, if_novel : see `upload`; for all frames
 
         Returns
         -------
-        items : one for each frame, in order
+        items : result for each frame, in order
 
         Raises
         ------
-        UnknownMap : no such map.
-        UnreadableFrame, DatasetError : a file cannot be read, and nothing was sent.
-        InvalidRequest : too many frames, or another number of metadata.
+        UnknownMap : If the map does not exist.
+        UnreadableFrame, DatasetError : If a file cannot be read; no frame has been sent.
+        InvalidRequest : If there are too many frames, or the number of metadata differs.
         """
         if isinstance(metas, FrameMeta):
             metas = [metas] * len(frames)
         if not 1 <= len(frames) <= MOST_OF_BATCH or (metas and len(metas) != len(frames)):
             raise InvalidRequest(
-                f"The batch has {len(frames)} frames. Give 1 to {MOST_OF_BATCH}, and one `meta` "
-                "for all or for each.",
+                f"The batch has {len(frames)} frames. Pass 1 to {MOST_OF_BATCH} frames, and one "
+                "`meta` for all or for each.",
                 (("frames", "too many or too few"),),
             )
         known = [None] * len(frames) if metas is None else metas
@@ -159,10 +155,10 @@ class UploadMethods(ServiceConnection):
         self, method: str, path: str, frame: FrameInput, meta: MetaInput | None,
         wait_s: float, fields: dict[str, str], up: Sequence[float] | None,
     ) -> tuple[Added, bool]:  # fmt: skip
-        """Send a frame; the service does not wait for one it had already."""
+        """Send a frame; the service does not wait if the map already has it."""
         sent = frame_form(*frame_bytes(frame, meta, with_pose=True, up=up))
         sent["data"] |= fields
-        # where this process is the worker, nobody would sign it meanwhile
+        # A service in this process has no other worker that could sign the frame meanwhile.
         wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)
         response = self._send(
             method, path, headers={"Prefer": f"wait={wait}"} if wait else {},
@@ -171,7 +167,7 @@ class UploadMethods(ServiceConnection):
         return read_record(Added, response), response.status_code != 200
 
     def _settled(self, map_name: str, added: Added, until: float) -> Added:
-        """Return an upload once its job is over, or as it is at a time of `time.monotonic`."""
+        """Wait for the job of an upload until a time of `time.monotonic`, and return the upload."""
         for pause in growing_pauses(until):
             if added.state not in (FrameState.RECEIVED, FrameState.SIGNING):
                 break
@@ -182,11 +178,11 @@ class UploadMethods(ServiceConnection):
 
 
 def upload_fields(priority: int, if_novel: float | bool | None) -> dict[str, str]:
-    """Return the fields of an upload beside the frame, those with other values than the default."""
+    """Return the non-default fields of an upload other than the frame."""
     if abs(priority) > MOST_PRIORITY:
         raise InvalidRequest(
-            f"The priority is {priority}. Give one from {-MOST_PRIORITY} to {MOST_PRIORITY}.",
-            (("priority", "out of its range"),),
+            f"The priority is {priority}. Pass one from {-MOST_PRIORITY} to {MOST_PRIORITY}.",
+            (("priority", "out of range"),),
         )
     novelty = novelty_of(if_novel)
     fields = {"priority": str(priority)} if priority else {}

@@ -77,16 +77,16 @@ def test_calls_have_no_other_keywords() -> None:
 @pytest.mark.parametrize(
     ("array", "camera", "error", "message"),
     [
-        (np.zeros((3, 4), np.int32), CAMERA, UnreadableFrame, "int32, and depth is"),
+        (np.zeros((3, 4), np.int32), CAMERA, UnreadableFrame, "int32. Convert it to depth"),
         (np.zeros((3, 4, 1), np.uint16), CAMERA, UnreadableFrame, r"shape \(3, 4, 1\)"),
         (np.zeros((0, 4), np.uint16), CAMERA, UnreadableFrame, r"shape \(0, 4\)"),
-        (np.zeros((3, 5), np.uint16), None, UnreadableFrame, "give its camera"),
-        (np.zeros((3, 3), np.uint16), None, UnreadableCloud, "uint16, and points are"),
+        (np.zeros((3, 5), np.uint16), None, UnreadableFrame, "pass its camera"),
+        (np.zeros((3, 3), np.uint16), None, UnreadableCloud, "uint16. Convert it to points"),
         (np.zeros(3), None, UnreadableCloud, r"shape \(3,\)"),
-        (np.zeros((3, 4)), (5, 6, 1.5), InvalidIntrinsics, "camera is none"),
-        (np.zeros((3, 4)), (5, 0, 1.5, 1), InvalidIntrinsics, "camera is none"),
-        (np.zeros((3, 4)), np.diag([5, 6, 2]), InvalidIntrinsics, "camera is none"),
-        (np.zeros((3, 4)), "camera", InvalidIntrinsics, "camera is none"),
+        (np.zeros((3, 4)), (5, 6, 1.5), InvalidIntrinsics, "camera is invalid"),
+        (np.zeros((3, 4)), (5, 0, 1.5, 1), InvalidIntrinsics, "camera is invalid"),
+        (np.zeros((3, 4)), np.diag([5, 6, 2]), InvalidIntrinsics, "camera is invalid"),
+        (np.zeros((3, 4)), "camera", InvalidIntrinsics, "camera is invalid"),
     ],
 )
 def test_other_arrays_are_refused(
@@ -100,13 +100,13 @@ def test_what_is_no_frame_is_refused(references: tuple[FrameReference, ...]) -> 
     wrong: Any = [[1, 2], [3, 4]]
     with pytest.raises(TypeError, match="not list"):
         sendable(wrong, CAMERA, with_pose=False)
-    with pytest.raises(TypeError, match="how large the image"):
+    with pytest.raises(TypeError, match="lacks the image size"):
         sendable(references[0].path, (5, 6, 1.5, 1), with_pose=False)
     known: Any = {"robot": "a"}
     for frame in (references[0].path, references[0], b"P5"):
         with pytest.raises(TypeError) as caught:
             sendable(frame, known, with_pose=False)
-        assert str(caught.value) == "meta is a FrameMeta or CameraIntrinsics, not dict"
+        assert str(caught.value) == "pass a FrameMeta or CameraIntrinsics as meta, not dict"
 
 
 def test_a_path_string_and_arrays_are_one_frame(

@@ -123,7 +123,7 @@ def test_jobs_that_are_over(
     for priority in (-11, 11):
         with pytest.raises(InvalidRequest, match=f"is {priority}") as told:
             client.upload(map_name, references[1], priority=priority)
-        assert told.value.fields == (("priority", "out of its range"),)
+        assert told.value.fields == (("priority", "out of range"),)
 
 
 def test_a_job_is_cancelled_before_anybody_waits_for_it(

@@ -309,7 +309,7 @@ def test_a_full_file_system_is_told_and_emptied_by_sync(
     told, counted, emptied, explained = ran.stdout.splitlines()
     assert told == (
         f"{tmp_path}/spool: The disk has no room for the spool (database or disk is full), and "
-        "nothing was changed. Free some, or upload the frames: `sceneprint spool FILE --to MAP`."
+        "nothing was changed. Free some space, or upload frames: `sceneprint spool FILE --to MAP`."
     )
     taken = int(counted.split()[0])
     assert 0.4 * most <= taken <= most
@@ -559,7 +559,7 @@ def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
         database.execute("PRAGMA user_version = 2")
         database.commit()
     before = path.read_bytes()
-    with pytest.raises(UnusableStore, match="of another version"):
+    with pytest.raises(UnusableStore, match="another version"):
         Spool(path)
     assert path.read_bytes() == before
 

@@ -48,14 +48,14 @@ def test_what_is_told_of_points() -> None:
 def test_bytes_that_are_no_points_are_refused() -> None:
     data = encode_points(CORNERS)
     for bad, why in (
-        (b"", "do not begin"),
-        (b"PNG!" + data[4:], "do not begin"),
-        (data[:47], "do not begin"),
-        (data[:-1], "143 bytes are not those of 8 points"),
-        (data + b"\0", "145 bytes are not those of 8 points"),
-        (data[:8] + struct.pack("<I", 2**32 - 1) + data[12:], "of 4294967295 points"),
-        (data[:4] + b"\2\0" + data[6:], "version 2"),
-        (data[:12] + b"\x10" + data[13:], "16 bytes a point"),
+        (b"", "header is wrong"),
+        (b"PNG!" + data[4:], "header is wrong"),
+        (data[:47], "header is wrong"),
+        (data[:-1], "143 bytes do not hold 8 points"),
+        (data + b"\0", "145 bytes do not hold 8 points"),
+        (data[:8] + struct.pack("<I", 2**32 - 1) + data[12:], "hold 4294967295 points"),
+        (data[:4] + b"\2\0" + data[6:], "version is 2"),
+        (data[:12] + b"\x10" + data[13:], "16 bytes per point"),
     ):
         with pytest.raises(Refused, match=why):
             decode_points(bad)

@@ -140,7 +140,7 @@ def test_one_answer_never_moves_it() -> None:
     wrong = found(at(50, 21, 0, 90))
     state = step(core, 1, 1, wrong)
     assert state.status == "tracking"
-    assert "not moved" in state.reason
+    assert "pose is unchanged" in state.reason
     np.testing.assert_allclose(state.T_map_sensor, at(10, 21, 0, 90), atol=1e-12)
     assert state.age == 1
     # an answer that agrees makes it forgotten: the next wrong one is a first one again

@@ -123,7 +123,7 @@ def test_rows_that_clouds_json_names(tmp_path: Path) -> None:
         assert archive.data_of(one) == first.read_bytes()
     (folder / "0.bin").write_bytes(rows.tobytes()[:-4])
     with pytest.raises(
-        UnreadableCloud, match=r"0\.bin: The file has 236 bytes, and rows of range,z,y,x,i have 20"
+        UnreadableCloud, match=r"0\.bin: The file has 236 bytes, which is not a multiple of 20"
     ):
         points_of(first)
 
@@ -131,12 +131,12 @@ def test_rows_that_clouds_json_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"row": "x,y,i"}', "does not name x, y and z once each"),
-        ('{"row": "x,y,z,x"}', "does not name x, y and z once each"),
-        ('{"row": "x,y,z", "format": "npy"}', "row is of .bin files, and format is npy"),
+        ('{"row": "x,y,i"}', "must name x, y and z once each"),
+        ('{"row": "x,y,z,x"}', "must name x, y and z once each"),
+        ('{"row": "x,y,z", "format": "npy"}', "only for .bin files, but format is npy"),
         ("{", "not JSON"),
-        ("[]", "no JSON object"),
-        ('{"view": 1}', "'view' is no field"),
+        ("[]", "not a JSON object"),
+        ('{"view": 1}', "'view' is not a field"),
         ('{"format": "stl"}', "format is 'stl'"),
         ('{"format": ["ply"]}', "format is"),
         ('{"units_per_metre": 0}', "units_per_metre is 0"),
@@ -213,7 +213,7 @@ def test_in_an_archive(hall: Path, tmp_path: Path) -> None:
 
 
 def test_a_frame_is_one_or_the_other(hall: Path) -> None:
-    with pytest.raises(ValueError, match="a depth image with a camera, or a cloud"):
+    with pytest.raises(ValueError, match="either a depth image with `camera`"):
         FrameReference("a", hall / "scan-1.ply", None)
 
 

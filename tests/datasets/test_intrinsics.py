@@ -92,11 +92,11 @@ BAD = {
     "no JSON": ("{'width': 640}", "not JSON"),
     "empty": ("", "not JSON"),
     "cut": (json.dumps(GOOD)[:-4], "not JSON"),
-    "a list": ("[1, 2]", "no JSON object"),
+    "a list": ("[1, 2]", "not a JSON object"),
     "deep": ("[" * 60_000, "not JSON"),
     "no fields": ("{}", "width, height, fx, fy, cx, cy is missing"),
     "missing": (GOOD | {"cy": None}, "cy is None, not a number"),
-    "unknown": (GOOD | {"distorsion": []}, "distorsion' is no field"),
+    "unknown": (GOOD | {"distorsion": []}, "distorsion' is not a field"),
     "bool": (GOOD | {"fx": True}, "fx is True, not a number"),
     "bool size": (GOOD | {"width": True}, "width is True, not a whole"),
     "text": (GOOD | {"fy": "525"}, "fy is '525'"),
@@ -119,8 +119,8 @@ BAD = {
     "infinite coefficients": (
         json.dumps(GOOD)[:-1] + ', "distortion": [0, 0, 0, Infinity]}', "not all finite",
     ),
-    "distortion by name": (GOOD | {"distortion": {"k1": 1}}, "distortion is no list"),
-    "half along the ray": (GOOD | {"depth_along_ray": 1}, "neither true nor false"),
+    "distortion by name": (GOOD | {"distortion": {"k1": 1}}, "distortion is not a list"),
+    "half along the ray": (GOOD | {"depth_along_ray": 1}, "is not a boolean"),
 }  # fmt: skip
 
 
@@ -138,7 +138,7 @@ def test_bad_files(case: str, tmp_path: Path) -> None:
 def test_no_text_and_too_much(tmp_path: Path) -> None:
     path = tmp_path / "intrinsics.json"
     path.write_bytes(b"\xff\xfe{")
-    with pytest.raises(InvalidIntrinsics, match="no text"):
+    with pytest.raises(InvalidIntrinsics, match="not UTF-8 text"):
         read_camera(path)
     path.write_text(" " * 70_000)
     with pytest.raises(InvalidIntrinsics, match="more than 65536 bytes"):

@@ -61,7 +61,7 @@ BAD = {
     "": "0 words",
     "1 2 3": "3 words",
     "1 " * 17: "17 words",
-    "a " + "1 " * 15: "no number",
+    "a " + "1 " * 15: "not a number",
     "1 0 0 nan 0 1 0 0 0 0 1 0 0 0 0 1": "not finite",
     "-inf " * 16: "not finite",
     "1 0 0 1 0 1 0 2 0 0 1 3 0 0 0 2": "last row",
@@ -69,7 +69,7 @@ BAD = {
     "1.02 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1": "not orthonormal",
     "0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 1": "not orthonormal",
     "1e300 0 0 0 0 1e300 0 0 0 0 1e300 0 0 0 0 1": "not orthonormal",
-    "1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1": "mirrors",
+    "1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1": "is a reflection",
 }
 
 
@@ -86,7 +86,7 @@ def test_no_pose_file(tmp_path: Path) -> None:
     with pytest.raises(InvalidPose, match=r"a\.txt: .*No such file"):
         read_pose(tmp_path / "a.txt")
     (tmp_path / "b.txt").write_bytes(b"\x00\xff\x89")
-    with pytest.raises(InvalidPose, match=r"b\.txt: .*no text"):
+    with pytest.raises(InvalidPose, match=r"b\.txt: .*not UTF-8 text"):
         read_pose(tmp_path / "b.txt")
 
 

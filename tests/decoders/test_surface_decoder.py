@@ -80,7 +80,7 @@ def test_errors_are_the_same_as_in_this_process(tmp_path: Path) -> None:
 
 def test_what_is_no_file_of_a_map_starts_no_process(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(UnreadableCloud, match=r"a\.ply: This is no regular file"):
+    with pytest.raises(UnreadableCloud, match=r"a\.ply: This is not a regular file"):
         read_surface_confined(tmp_path / "pipe", "a.ply")
     (tmp_path / "text").write_text("hello")
     with pytest.raises(UnreadableCloud, match=r"a\.txt: This is none of PCD"):

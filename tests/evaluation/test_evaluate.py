@@ -255,7 +255,7 @@ def test_seven_scenes_that_are_not_there(
     assert main(["evaluate", "--7scenes", str(tmp_path)]) == 2
     assert "chess" in capsys.readouterr().err.splitlines()[-1]
     assert main(["evaluate"]) == 2
-    assert "Name a PATH, or --7scenes DIR" in capsys.readouterr().err
+    assert "Specify a PATH, or --7scenes DIR" in capsys.readouterr().err
 
 
 def test_what_cannot_be_written_is_said_before_the_work(
@@ -297,7 +297,7 @@ def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_pat
         (["{room}", "--db", "0-4", "--queries", "5:6"], "is no range of frames"),
         (["{room}", "--db", "0:4", "--queries", "5:99"], "outside its 12 frames"),
         (["{room}", "--db", "0:4", "--queries", "3:6"], "chosen twice"),
-        (["{room}@db=0:4,queries=5:6", "--db", "0:4", "--queries", "5:6"], "Leave them out"),
+        (["{room}@db=0:4,queries=5:6", "--db", "0:4", "--queries", "5:6"], "Omit them"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--levels", "9"], "Choose from 1 to"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--max-overlap", "2"], "--max-overlap"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--metric", "l3"], "--metric"),

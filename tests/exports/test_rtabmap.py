@@ -408,7 +408,7 @@ def test_rvl_of_random_images_and_zeros_is_read_back() -> None:
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 400, bytes(400), b"\x77" * 400])
 def test_damaged_rvl_is_refused(content: bytes) -> None:
-    with pytest.raises(UnreadableFrame, match="RVL is damaged"):
+    with pytest.raises(UnreadableFrame, match="RVL-compressed image is damaged"):
         depth_samples(b"DEPTHRVL" + struct.pack("<II", 20, 10) + content)
 
 

@@ -171,13 +171,13 @@ def test_compressed_depth_by_rvl(encoding: str, tmp_path: Path, ros: SimpleNames
     stored = samples if encoding == "16UC1" else expected
     np.testing.assert_allclose(np.asarray(body), stored, rtol=1e-6)
     for cut in (4, 30, len(rvl(samples)) - 200):
-        with pytest.raises(UnreadableFrame, match="RVL is damaged"):
+        with pytest.raises(UnreadableFrame, match="RVL-compressed image is damaged"):
             rvl_samples(rvl(samples)[:cut])
 
 
 def test_rvl_of_more_than_16_bits_is_damaged() -> None:
     for wrong in (65_536, -1):
-        with pytest.raises(UnreadableFrame, match="RVL is damaged"):
+        with pytest.raises(UnreadableFrame, match="RVL-compressed image is damaged"):
             rvl_samples(rvl(np.array([[5, wrong, 7]])))
     np.testing.assert_array_equal(rvl_samples(rvl(np.array([[5, 65_535]]))), [[5, 65_535]])
 
@@ -200,7 +200,7 @@ def test_what_cannot_be_read_is_not_promised(tmp_path: Path, ros: SimpleNamespac
 
     outline = bag_outline(ros.write(tmp_path, fill), ALL)
     assert outline.sequences == ()
-    assert outline.problem.endswith("compressed by RVL is damaged. Record it again.")
+    assert outline.problem.endswith("RVL-compressed image is damaged. Record it again.")
 
 
 @pytest.mark.parametrize("form", ["16UC1; png compressed ", "png", "mono16; png compressed"])

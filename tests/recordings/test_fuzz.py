@@ -234,15 +234,15 @@ def test_points_of_absurd_sizes(more: dict[str, int], tmp_path: Path, ros: Simpl
 def test_points_without_coordinates(tmp_path: Path, ros: SimpleNamespace) -> None:
     rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("intensity", "<f4")])
     (sequence,) = find_sequences(ros.write(tmp_path, lambda writer: writer.points(0.0, rows)))
-    with pytest.raises(UnreadableCloud, match="has the fields x, y, intensity, and x, y and z"):
+    with pytest.raises(UnreadableCloud, match="has the fields x, y, intensity, but x, y and z"):
         sequence.frames[0].read()
 
 
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "only PNG"), (b"\x00" * 12, "only PNG"), (b"\x00" * 12 + b"\xff\xd8\xff", "only PNG"),
-        (b"\x00" * 80 + b"\x89PNG\r\n\x1a\n", "only PNG"),
+        (b"", "PNG and"), (b"\x00" * 12, "PNG and"), (b"\x00" * 12 + b"\xff\xd8\xff", "PNG and"),
+        (b"\x00" * 80 + b"\x89PNG\r\n\x1a\n", "PNG and"),
         (b"\x00" * 12 + b"\x89PNG\r\n\x1a\n", "ends early"),
     ],
 )  # fmt: skip

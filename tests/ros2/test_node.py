@@ -144,7 +144,7 @@ def test_a_node_that_is_stopped_closes(bus: Any, node_module: ModuleType) -> Non
                       "url": "http://127.0.0.1:9"}  # fmt: skip
     assert node_module.main() == 0
     assert not bus.is_up
-    assert bus.log == ["lost: nothing was seen yet"]
+    assert bus.log == ["lost: no frame has been queried"]
 
 
 # What lies beside the node.

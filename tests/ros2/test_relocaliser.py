@@ -145,7 +145,7 @@ def test_a_drive_is_tracked_as_the_truth_is(
 def test_nothing_is_told_of_a_place_that_is_not_known(ros: SimpleNamespace) -> None:
     with scripted(lambda number: None) as (core, _):
         before = core.report(ros.start * SECOND)
-        assert (before.level, before.message) == (Level.STALE, "no frame has come")
+        assert (before.level, before.message) == (Level.STALE, "no frame has arrived")
         (report,) = run(core, still(ros).written)
     assert report.pose is None
     assert (report.level, report.is_fix) == (Level.WARN, False)
@@ -193,7 +193,7 @@ def test_what_is_silent_is_not_told(ros: SimpleNamespace) -> None:
         assert core.report(ros.start * SECOND + 2 * SECOND).pose is not None
         silent = core.report(ros.start * SECOND + 3 * SECOND)
         assert (silent.pose, silent.level) == (None, Level.STALE)
-        assert silent.message == "no frame has come for 3.0 s"
+        assert silent.message == "no frame has arrived for 3.0 s"
         again = core.report(ros.start * SECOND)
         assert (again.pose is not None, again.is_fix) == (True, False)
 
@@ -206,7 +206,7 @@ def test_relocalising_forgets_and_asks_at_once(ros: SimpleNamespace) -> None:
         core.relocalise()
         lost = core.report(ros.start * SECOND + SECOND)
         assert (lost.state.status, lost.pose) == ("lost", None)
-        assert "relocalise" in lost.message
+        assert "relocalisation" in lost.message
         (found,) = run(core, still(ros, 1, start=2.0).written)
         assert found.is_fix
         assert len(client.asked) == 2
@@ -273,7 +273,7 @@ def test_a_fix_in_another_frame_is_not_told(ros: SimpleNamespace) -> None:
         (report,) = run(core, still(ros).written)
     assert (report.state.status, report.pose) == ("tracking", None)
     assert (report.level, report.message) == (
-        Level.WARN, "tracked in site, and the map here is hall"
+        Level.WARN, "tracked in site, but this map is hall"
     )  # fmt: skip
 
 
@@ -335,7 +335,7 @@ def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros: SimpleNamespace)
         take(core, *writer.written[-1])
         assert core.report((ros.start + 1) * SECOND).message.startswith("A frame has no stamp.")
     assert [one.level for one in reports] == [Level.ERROR, Level.ERROR, Level.OK]
-    assert reports[0].message.startswith("No calibrated camera info has come.")
+    assert reports[0].message.startswith("No calibrated camera info has arrived.")
     assert "encoding 'rgb8'" in reports[1].message
 
 

@@ -93,7 +93,7 @@ def test_a_message_may_end_with_its_last_byte_and_no_earlier(
     data = serialize(rows)
     end = data.rindex(rows.tobytes()) + rows.nbytes + 1  # is_dense; what follows is padding
     assert bytes(read_point_cloud(data[:end]).data) == rows.tobytes()
-    with pytest.raises(UnreadableCloud, match="ends early: 1 bytes are announced"):
+    with pytest.raises(UnreadableCloud, match="truncated: 1 bytes are due"):
         read_point_cloud(data[: end - 1])
 
 
@@ -129,9 +129,9 @@ def test_wrong_numbers_are_named(serialize: Any, points: np.ndarray) -> None:
     for place, word, why in (
         (4 + 4, 10**9, "stamp"), (12, huge, "A name"), (count, huge, "20000000"),
         (count, 2, "2 rows"), (count + 4, huge, "20000000"), (count + 8, huge, "fields"),
-        (count + 8, 4, "ends early|fields|is announced|name"), (step, 0, "0 bytes"),
-        (step, huge, "are announced"), (step, 11, "do not fit|are announced"),
-        (step + 8, huge, "ends early"), (step + 8, 0, "follow the end"),
+        (count + 8, 4, "truncated|fields|is announced|name"), (step, 0, "0 bytes"),
+        (step, huge, "but announces"), (step, 11, "do not fit|but announces"),
+        (step + 8, huge, "truncated"), (step + 8, 0, "follow the end"),
     ):  # fmt: skip
         changed = patched(data, place, word)
         with pytest.raises(UnreadableCloud, match=why):

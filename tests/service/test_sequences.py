@@ -71,5 +71,5 @@ def test_the_client_sends_a_sequence(served, path, shots):
         assert there.status == "found"
         assert there.pose is not None
         np.testing.assert_allclose(there.pose.matrix, shots[0].pose, atol=0.03)
-        with pytest.raises(InvalidRequest, match="Give one for each"):
+        with pytest.raises(InvalidRequest, match="Pass one for each"):
             client.localize_sequence(name, frames, metas[:1])

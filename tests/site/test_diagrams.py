@@ -49,10 +49,10 @@ def test_a_text_is_read_as_nodes_and_edges() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("graph LR\n a --> b", "begin with `flowchart LR`"),
-        ("flowchart LR\n accTitle: t\n a ==> b", "is no node, no edge"),
-        ("flowchart LR\n a --> b", "needs a line `accTitle"),
-        ("flowchart LR\n accTitle: t\n a --> a", "leads back to its node"),
+        ("graph LR\n a --> b", "Start with `flowchart LR`"),
+        ("flowchart LR\n accTitle: t\n a ==> b", "is not a node"),
+        ("flowchart LR\n a --> b", "has no title"),
+        ("flowchart LR\n accTitle: t\n a --> a", "from a node to itself"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(text: str, message: str) -> None:

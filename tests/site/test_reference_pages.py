@@ -89,7 +89,7 @@ def test_every_error_is_listed_with_its_status_and_what_to_do(
             assert row[3] == cell(remedy(kind))
     assert problems["/problems/rate-limited"] == [
         "429 Too Many Requests", "`/problems/rate-limited`",
-        "The caller sends more requests than it may.", "Wait for the seconds in `Retry-After`.",
+        "The caller exceeds its request rate.", "Wait for the seconds in `Retry-After`.",
     ]  # fmt: skip
     # whatever the reference by hand lists is there, too
     table = (ROOT / "docs/reference.md").read_text().split("## Problems")[1]
@@ -106,5 +106,7 @@ def test_everything_that_the_client_offers_is_described(pages: dict[str, Generat
     }
     assert len(methods) > 90
     assert "embedded(path: str | Path) -> Self" in methods["embedded"]
-    assert ["`UnknownMap`, `UnknownFrame`", "it does not exist."] in rows(methods["query"])
+    assert ["`UnknownMap`, `UnknownFrame`", "If the map or frame does not exist."] in rows(
+        methods["query"]
+    )
     assert set(sections(found["Tracker"], 3)) >= {"update"}

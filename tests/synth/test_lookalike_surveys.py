@@ -21,9 +21,9 @@ from sceneprint_lab.synth.lookalike_surveys import (
     Stop,
     bay,
     block,
+    distinct_fraction,
     drifted,
     row_of,
-    told_apart,
 )
 from sceneprint_lab.synth.lookalikes import Likeness
 from sceneprint_lab.synth.sensors import Rosette, Spinning
@@ -96,8 +96,8 @@ def test_a_scan_does_not_tell_equal_places_apart_and_tells_others() -> None:
     hall = symmetric_hall(rng)
     T = scanner_pose(3.0, 1.0, 1.2, 0.4, rng)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    assert told_apart(Stop(hall, T), hall, half_turn @ T, SMALL) < 0.01
-    assert told_apart(Stop(hall, T), hall, np.diag([1.0, -1.0, -1.0, 1.0]) @ T, SMALL) > 0.1
+    assert distinct_fraction(Stop(hall, T), hall, half_turn @ T, SMALL) < 0.01
+    assert distinct_fraction(Stop(hall, T), hall, np.diag([1.0, -1.0, -1.0, 1.0]) @ T, SMALL) > 0.1
 
 
 def test_drift_is_a_random_walk_that_starts_true() -> None:
