@@ -1,6 +1,6 @@
 """Commands that the lab adds to `sceneprint`."""
 
-#: The line of each in `sceneprint --help`; the entry points of this distribution name the modules.
+#: Summary of each command in `sceneprint --help`; the entry points name the modules.
 COMMANDS = {
     "demo": "run a service, upload a map, query it over HTTP and print the accuracy",
     "evaluate": "measure retrieval, validation and pose accuracy on frames with known poses",

@@ -1,9 +1,9 @@
-"""Learn the confidence of answers: `python -m sceneprint_lab.cli.confidence_fit --evidence FILE`.
+"""Fit the confidence of answers: `python -m sceneprint_lab.cli.confidence_fit --evidence FILE`.
 
-Sites of every kind are built, most of them with maps that lack frames and whose poses drift, and
-all their queries are answered. The penalties are fitted to which candidate pose was right.
-Recordings take no part. With --views the frames of each map are joined to one surface, and rendered
-views replace them: this learns the confidence in maps that were imported as one file.
+The command generates sites of every kind, most of them with incomplete maps and drifting poses,
+answers all their queries, and fits the penalties to the candidate poses that are correct.
+Recordings are not used. With --views, the frames of each map are fused to a surface and replaced
+by rendered views of it, which fits the confidence in maps that were imported from one file.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from sceneprint_lab.evaluation.measures import calibration
 from sceneprint_lab.evaluation.protocol import map_over
 from sceneprint_lab.evaluation.sites import MapFlaws, SiteAnswer, ask_site
 
-#: Of a hundred queries, the number at places of each kind: a confidence is a probability among
-#: queries of this mixture. Most robots are in ordinary rooms, or drive about.
+#: Percentage of queries at places of each kind. A confidence is a probability over queries of this
+#: mixture, in which most robots are in ordinary rooms or on the move.
 SHARES: dict[str, dict[str, float]] = {
     "depth": {
         "rooms": 79, "absent": 10, "offices": 4, "opposite": 2, "object": 2, "kitchens": 1,
@@ -37,32 +37,32 @@ SHARES: dict[str, dict[str, float]] = {
         "sites": 70, "absent": 10, "bays": 6, "streets": 6, "halls": 4, "unmapped": 4,
     },
 }  # fmt: skip
-#: Kinds of which more sites are built, as the evidence that decides there is rare.
+#: Kinds with more sites, since their decisive evidence is rare.
 TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
-#: Flaws of two maps in three. Scans are taken so often that most may be missing; their poses drift
-#: as it is.
+#: Flaws of two maps in three. Scans are so dense that most may be missing, and their poses already
+#: drift.
 FLAWS = {"depth": MapFlaws(0.5, 0.01, 0.004), "lidar": MapFlaws(0.9, 0.0, 0.0)}
-#: The same of maps whose frames become one surface, which have fewer gaps.
+#: Flaws of maps whose frames are fused to one surface, which has fewer gaps.
 SURFACE_FLAWS = {"depth": MapFlaws(0.3, 0.01, 0.004), "lidar": MapFlaws(0.3, 0.0, 0.0)}
-#: Least step of the penalty of a pose that one view alone suggests. Two scans of a real street
-#: often agree metres along it, and synthetic streets are too rich to show that.
+#: Smallest penalty of a pose that a single view supports. Two scans of a real street often agree
+#: at offsets of metres along it, and synthetic streets have too much detail to show this.
 LONE = {"depth": 0.0, "lidar": 2.5}
 
 
 def collect(
     preset: str, sensor: str, seed: int, sites: int, queries: int, jobs: int, views: bool
 ) -> Iterator[list[SiteAnswer]]:
-    """Yield ask sites of every kind with a preset, one site after another.
+    """Yield the answers of each site of every kind with a preset.
 
-    Every query is answered with the best pose there is, so that frames elsewhere that look alike
-    are always compared, as they are before a pose is found.
+    Every query is answered with the best available pose, so that similar frames elsewhere are
+    always compared, as for a query without a pose.
 
     Parameters
     ----------
-    preset, sensor, seed : of the model, "depth" or "lidar", and of the sites
-    sites, queries : of each kind, and of each site
-    jobs : processes
-    views : whether maps are views of the surface that their frames show
+    preset, sensor, seed : model, sensor ("depth" or "lidar"), and seed of the sites
+    sites, queries : number of sites of each kind, and of queries of each site
+    jobs : number of processes
+    views : whether maps are views of the fused surface of their frames
     """
     work = [
         (kind, index * TIMES.get(kind, 1) + k, queries)
@@ -84,7 +84,7 @@ def _ask(
 
 
 def read_samples(path: Path) -> list[JudgedQuery]:
-    """Return the samples of a file, one JSON object a line."""
+    """Return the samples of a file with one JSON object per line."""
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     return [
         JudgedQuery(
@@ -96,19 +96,19 @@ def read_samples(path: Path) -> list[JudgedQuery]:
 
 
 def main() -> None:
-    """Collect samples, fit the numbers of a preset, and write them into a model file."""
+    """Collect samples, fit the parameters of a preset, and write them to a model file."""
     parser = argparse.ArgumentParser(
         prog="python -m sceneprint_lab.cli.confidence_fit", description=__doc__
     )
     parser.add_argument("--preset", choices=PRESETS, default=PRESETS[0])
-    parser.add_argument("--seed", type=int, default=70, help="of the sites (default: 70)")
-    parser.add_argument("--sites", type=int, default=10, help="of each kind (default: 10)")
-    parser.add_argument("--queries", type=int, default=12, help="of each site (default: 12)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
-    parser.add_argument("--views", action="store_true", help="maps are views of a surface")
+    parser.add_argument("--seed", type=int, default=70, help="seed of the sites (default: 70)")
+    parser.add_argument("--sites", type=int, default=10, help="sites of each kind (default: 10)")
+    parser.add_argument("--queries", type=int, default=12, help="queries per site (default: 12)")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
+    parser.add_argument("--views", action="store_true", help="use views of a fused surface as maps")
     parser.add_argument("--evidence", type=Path, required=True,
                         help="file of samples, which is read if it exists")  # fmt: skip
-    parser.add_argument("--out", type=Path, help="model file that gets the numbers")
+    parser.add_argument("--out", type=Path, help="model file to write")
     options = parser.parse_args()
     model = read_model(options.preset)
     sensor = "lidar" if options.preset == "lidar" else "depth"

@@ -1,4 +1,4 @@
-"""Run the main job from start to end, through a service: `sceneprint demo`."""
+"""The command `sceneprint demo`: upload, query and evaluate frames through a service."""
 
 from __future__ import annotations
 
@@ -45,23 +45,23 @@ from sceneprint_client.api import Added, Answer, JobState
 from sceneprint_lab.evaluation.report import FramePlace, answer_rows, decimal, judge_answers
 
 SEED = 11
-#: Frames of a walk through a room of the building, 3 to 8 cm apart. Of every ten, those of the map
-#: and those of the queries, which are 10 to 30 cm away from any of the map.
+#: Number of frames of a walk through a room, 3 to 8 cm apart, and the positions in every ten frames
+#: of the map and of the queries. Each query is 10 to 30 cm away from any frame of the map.
 WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7,)
 DEPTH_SCALE = 1000.0
 
 
 def write_building(folder: Path, rooms: int) -> Generator[None]:
-    """Write rooms in 7-Scenes layout with split files, and yield after each.
+    """Write rooms in 7-Scenes layout with split files; yield after each room.
 
     Parameters
     ----------
-    folder : new
-    rooms : how many
+    folder : new folder
+    rooms : number of rooms
     """
     write = partial(_write_room, folder)
     jobs = min(os.cpu_count() or 1, rooms)
-    if jobs == 1:  # a process of its own would import all modules again
+    if jobs == 1:  # a child process would import all modules again
         yield from map(write, range(rooms))
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
@@ -87,15 +87,15 @@ def _write_room(folder: Path, number: int) -> None:
             write_pose(run / f"frame-{i:06d}.pose.txt", pose)
 
 
-#: Without split files: shares of each sequence that are the map, and that separate it.
+#: Without split files: fractions of each sequence for the map, and for the gap after it.
 DATABASE_SHARE, GAP_SHARE = 0.60, 0.05
-#: Most frames of either, evenly spread, so that the demo takes minutes.
+#: Greatest number of database and query frames, evenly spread, so that the demo takes minutes.
 MOST_DATABASE, MOST_QUERIES = 300, 180
 
 
 @dataclass(frozen=True, eq=False)
 class DemoFrame:
-    """A frame that takes part, the frame its pose leads to, and the run it is of."""
+    """A frame of the demo, the parent frame of its pose, and its sequence."""
 
     parent: str
     session: str
@@ -104,22 +104,22 @@ class DemoFrame:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The frames of the demo."""
+    """Database and query frames of the demo."""
 
     database: list[DemoFrame]
     queries: list[DemoFrame]
 
 
 def choose_frames(path: Path) -> Choice:
-    """Return database and queries, by split files where the scene has them.
+    """Return database and query frames, by the split files of the scene if it has them.
 
     Parameters
     ----------
-    path : of one or several sequences
+    path : path of one or several sequences
 
     Raises
     ------
-    DatasetError : no sequence there, or too few frames for both.
+    DatasetError : If there is no sequence, or too few frames for both.
     """
     database: list[DemoFrame] = []
     queries: list[DemoFrame] = []
@@ -136,7 +136,7 @@ def choose_frames(path: Path) -> Choice:
             queries += frames[round((DATABASE_SHARE + GAP_SHARE) * n) :]
     if not database or not queries:
         raise DatasetError(
-            f"{path}: has {len(database)} frames for the map and {len(queries)} to query, and "
+            f"{path}: There are {len(database)} frames for the map and {len(queries)} to query; "
             "the demo needs both. Use a longer sequence."
         )
     return Choice(_thinned(database, MOST_DATABASE), _thinned(queries, MOST_QUERIES))
@@ -196,7 +196,7 @@ def run_demo(options: argparse.Namespace) -> int:
 
 def _building(folder: Path, rooms: int) -> Path:
     start = time.perf_counter()
-    # closed before the folder is removed, as its processes write there
+    # The generator is closed before the folder is removed, since its processes write there.
     with closing(write_building(folder, rooms)) as written:
         for _ in tqdm(written, total=rooms, desc="synthetic building", unit="room", disable=None):
             pass
@@ -205,15 +205,15 @@ def _building(folder: Path, rooms: int) -> Path:
 
 
 DEMO_MAP = "demo"
-#: Uploads in flight.
+#: Number of concurrent uploads.
 PARALLEL = 4
-#: Errors of a single frame, after which the demo continues.
+#: Errors of a single frame that do not stop the demo.
 _OF_FRAME = (FrameError, FrameConflict)
 
 
 @dataclass(frozen=True, eq=False)
 class DemoQuery:
-    """A query and its answers: of VR and of VDR, and what the latter took, seconds."""
+    """A query, its answers with VR and with VDR, and the time of the latter, seconds."""
 
     chosen: DemoFrame
     ranked: Answer
@@ -222,16 +222,16 @@ class DemoQuery:
 
 
 def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
-    """Upload the database and wait until it is signed.
+    """Upload the database and wait until all frames are signed.
 
     Returns
     -------
-    indexed : the frames that are indexed, by their ids
+    indexed : indexed frames by id
 
     Raises
     ------
-    DatasetError : none could be.
-    ServiceError : some were not signed in time.
+    DatasetError : If no frame could be signed.
+    ServiceError : If some frames were not signed in time.
     """
     client.create_map(DEMO_MAP, model=model)
     indexed: dict[str, DemoFrame] = {}
@@ -248,7 +248,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
                 continue
             indexed[added.frame_id] = one
             jobs.append(added.job_id)
-    finally:  # after an error, uploads that are not in flight are not begun
+    finally:  # after an error, no further upload starts
         pool.shutdown(cancel_futures=True)
     with tqdm(total=len(jobs), desc="sign", unit="frame", disable=None) as bar:
 
@@ -257,7 +257,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
         done = client.wait(jobs, progress=progress)
     late = sum(not job.state.over for job in done)
-    if late:  # queries would find them, and their poses would be unknown
+    if late:  # queries would match these frames, whose ids are not in `indexed`
         raise ServiceError(
             f"{late} of {len(done)} map frames were not signed in time. Run the demo with more "
             "--workers or a shorter --dataset."
@@ -279,10 +279,10 @@ def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
     """Query every frame, without and with diversification."""
     answered, begun = [], time.perf_counter()
     for one in tqdm(choice.queries, desc="query", unit="frame", disable=None):
-        meta = meta_of(one.reference, with_pose=False)  # a lost robot has none
+        meta = meta_of(one.reference, with_pose=False)  # a lost robot has no pose
         path = one.reference.path
         try:
-            # all that are validated, as `sceneprint evaluate` does
+            # `sceneprint evaluate` validates this many frames too
             ranked = client.query(
                 DEMO_MAP, path, meta, k=CANDIDATES, stages=("retrieve", "validate")
             )
@@ -311,7 +311,7 @@ _NAMES = {
 
 
 def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> None:
-    """Print the table, if true poses are known, and the time of a query."""
+    """Print the table if true poses are known, and the duration of a query."""
     counts = Counter(one.diverse.status for one in queries)
     states = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     print(f"queries: {len(queries)}: {states or 'none could be sent'}")
@@ -322,7 +322,7 @@ def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> No
     if judged and len(judged) == len(queries):
         print(*table(answer_rows(judged)), sep="\n")
     else:
-        print("no table: it needs the true pose of every frame")
+        print("no table: the true pose of every frame is required")
     if queries:
         medians = [
             f"{stage} {statistics.median(one.diverse.milliseconds[stage] for one in queries):.0f}"
@@ -334,7 +334,7 @@ def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> No
 
 
 def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the rows as lines to read; figures as `answer_rows` returns them."""
+    """Return the rows as text lines; figures as `answer_rows` returns them."""
     lines = [
         f"{'first answer within':26}{'5cm/5deg':>10}{'10cm/10deg':>12}{'median cm':>11}{'deg':>7}"
         f"{'first five: m from the query':>32}"
@@ -358,7 +358,7 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def draw(
     indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery], preset: str, out: Path
 ) -> None:
-    """Draw the accepted match that turns the query most: it shows alignment best."""
+    """Draw the accepted match with the largest rotation, which shows the alignment best."""
     accepted = [
         (one, match, np.array(match.transform.matrix))
         for one in queries
@@ -381,12 +381,12 @@ def draw(
 
 
 def place_of(one: DemoFrame) -> FramePlace | None:
-    """Return where a frame was taken, or None if that is unknown."""
+    """Return the true pose of a frame, or None if it is unknown."""
     pose = one.reference.pose
     return None if pose is None else FramePlace(one.parent, pose)
 
 
-#: Seconds that the service may take to start, on a machine that compiles first, and to stop.
+#: Time limits of the service to start, including a compilation, and to stop, seconds.
 START_S, STOP_S = 120.0, 30.0
 _READY = "sceneprint: serving "
 
@@ -397,16 +397,16 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 
     Parameters
     ----------
-    data : folder for database, blobs and log
-    workers : processes that sign
+    data : folder for the database, blobs and log
+    workers : number of processes that sign frames
 
     Yields
     ------
-    url : of the service, which answers
+    url : URL of the ready service
 
     Raises
     ------
-    Unreachable : it did not start; with the end of its log.
+    Unreachable : If the service did not start; the message includes the end of its log.
     """
     log = data / "service.log"
     arguments = ["--port", "0", "--data", str(data), "--workers", str(workers)]
@@ -429,7 +429,7 @@ def serving(data: Path, workers: int) -> Iterator[str]:
         try:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(STOP_S)
-        finally:  # also where Ctrl-C ends the wait
+        finally:  # Ctrl-C may end the wait
             process.kill()
             process.wait()
             if process.stdout is not None:
@@ -441,7 +441,7 @@ def _first_line(pipe: IO[bytes]) -> str:
 
     Raises
     ------
-    Unreachable : none came in time.
+    Unreachable : If no line arrived in time.
     """
     data, until = b"", time.monotonic() + START_S
     with DefaultSelector() as selector:
@@ -452,7 +452,7 @@ def _first_line(pipe: IO[bytes]) -> str:
                     f"The service did not start within {START_S:g} s. "
                     "Run `sceneprint doctor` to see what is missing, or try again."
                 )
-            more = os.read(pipe.fileno(), 4096)  # it does not wait for a whole line
+            more = os.read(pipe.fileno(), 4096)  # returns a partial line without waiting
             if not more:
                 break
             data += more

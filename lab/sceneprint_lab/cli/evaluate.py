@@ -1,4 +1,4 @@
-"""Measure how well frames are found again and registered: `evaluate`, `evaluate-pairs`."""
+"""The commands `evaluate` and `evaluate-pairs`: accuracy of retrieval and registration."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _EXAMPLES = """\
-frames are counted from 0 over all sequences of a PATH, in order; STOP is not included:
+frames are numbered from 0 over all sequences of a PATH, in order; STOP is excluded:
   sceneprint evaluate redkitchen --db 0:600:2 --queries 650:1000:2
 each PATH may have its own ranges, joined by +; all PATHs form one database:
   sceneprint evaluate redkitchen@db=0:600:2,queries=650:1000:2 \\
@@ -35,7 +35,7 @@ each PATH may have its own ranges, joined by +; all PATHs form one database:
 without ranges, TrainSplit.txt and TestSplit.txt of each scene define the split: one row for
 each scene, and with several also Average and Combine (all scenes in one database):
   sceneprint evaluate 7scenes --db-step 10 --query-step 10
-the benchmark of the paper, on the official download with its archives unpacked:
+the benchmark of the paper, on the official download with all archives unpacked:
   sceneprint evaluate --7scenes 7scenes --db-step 5 --query-step 10
 a scanner that returns to a place after more than 30 m of travel:
   sceneprint evaluate hall --model lidar --gap-m 30 --within 5 --baselines
@@ -52,8 +52,8 @@ def add_evaluate(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--7scenes", type=Path, dest="seven_scenes", metavar="DIR",
         help="evaluate the scenes of 7-Scenes in this folder by their official splits, and print "
-        "the paper's table beside its figures; without intrinsics.json the Kinect's camera is "
-        "taken (585 pixels, centre 320, 240)",
+        "the paper's table beside its figures; without intrinsics.json, use the Kinect's camera "
+        "(585 pixels, centre 320, 240)",
     )  # fmt: skip
     add_model_options(command)
     _add_frames(command)
@@ -77,7 +77,7 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--distractors", type=Path, nargs="+", default=[], metavar="PATH",
-        help="use all frames of these in the database",
+        help="use all frames of these PATHs in the database",
     )  # fmt: skip
     command.add_argument(
         "--gap-m", type=positive_number, metavar="METRES",
@@ -113,8 +113,8 @@ def _add_method(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--baselines", nargs="*", metavar="NAME",
         help="also rank by these baselines: thumbnail_l1, thumbnail_zncc, fpfh_vlad, rings "
-        "(give it after the PATHs; without names: all, with a notice for those that do not "
-        "support the frames)",
+        "(after the PATHs; without names: all, with a notice for those that do not support the "
+        "frames)",
     )  # fmt: skip
     command.add_argument(
         "--candidates", type=positive, default=10, metavar="N",
@@ -141,7 +141,7 @@ def _add_judging(command: argparse.ArgumentParser) -> None:
 
 
 def _share(text: str) -> float:
-    """Return a number above 0, up to 1."""
+    """Return a number above 0 and up to 1."""
     return number_within(text, lambda number: 0 < number <= 1, "a share above 0, up to 1")
 
 
@@ -159,7 +159,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
     if options.levels is not None and signer.model.whitening is not None:
         raise DatasetError(
             f"--levels {options.levels}: the signatures of model {signer.model.label} cannot be "
-            "split by level. Add --signature psi, or leave --levels out."
+            "split by level. Add --signature psi, or omit --levels."
         )
     if (options.levels or 1) > (most := len(signer.model.levels)):
         raise DatasetError(
@@ -202,7 +202,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
 def _check_writable(file: Path | None) -> None:
     """Create the folder of the figures, and check that they can be written.
 
-    A file that cannot be written must not cost the work of an hour.
+    The check precedes the evaluation, which may take an hour.
     """
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -210,7 +210,7 @@ def _check_writable(file: Path | None) -> None:
 
 
 def _settings_of(options: argparse.Namespace, model_id: str, *keys: str) -> dict[str, Any]:
-    """Return some options with versions: everything that is needed to repeat the evaluation."""
+    """Return options and versions that are needed to repeat the evaluation."""
     from sceneprint import __version__
 
     def plain(value: Any) -> Any:
@@ -230,7 +230,7 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
     from sceneprint_lab.evaluation.protocol import PathRanges, choose, parse_part, parse_ranges
 
     if options.seven_scenes is not None:
-        from sceneprint_lab.synth import KINECT  # the camera of 7-Scenes, by its page
+        from sceneprint_lab.synth import KINECT  # camera of 7-Scenes according to its web page
 
         return choose(
             [PathRanges(scene) for scene in _seven_scenes(options)],
@@ -239,18 +239,18 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
             find=partial(sequences_at, options=options, camera=Camera(KINECT)),
         )
     if not options.paths:
-        raise DatasetError("There is nothing to evaluate. Name a PATH, or --7scenes DIR.")
+        raise DatasetError("There is nothing to evaluate. Specify a PATH, or --7scenes DIR.")
     parts = [parse_part(text) for text in options.paths]
     both = options.db is not None, options.queries is not None
     ranged = [part for part in parts if part.database is None and part.queries is None]
     elsewhere = options.distractors or any(part.database for part in parts)
     if any(both) and not all(both) and not (both[1] and elsewhere):
         one, other = ("--db", "--queries") if both[0] else ("--queries", "--db")
-        raise DatasetError(f"{one} needs {other}. Give both or neither.")
+        raise DatasetError(f"{one} requires {other}. Specify both or neither.")
     if any(both) and not ranged:
         raise DatasetError(
             "--db and --queries apply only to a PATH without its own ranges, and every PATH has "
-            "some. Leave them out."
+            "some. Omit them."
         )
     return choose(
         parts, options.distractors, database=parse_ranges(options.db) if both[0] else None,
@@ -261,7 +261,7 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
 
 
 def _seven_scenes(options: argparse.Namespace) -> list[Path]:
-    """Return the folders of the scenes; name missing ones on standard error."""
+    """Return the folders of the scenes; list missing ones on standard error."""
     from sceneprint_lab.evaluation.report import PAPER
 
     for value, name in (
@@ -270,8 +270,8 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
     ):  # fmt: skip
         if value:
             raise DatasetError(
-                f"--7scenes takes database and queries from the splits of its scenes. Leave {name} "
-                "out, or name the scenes as PATHs."
+                f"--7scenes uses the splits of its scenes for database and queries. Omit {name}, "
+                "or specify the scenes as PATHs."
             )
     folder: Path = options.seven_scenes
     names = list(PAPER)
@@ -280,8 +280,8 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
     if not found:
         raise DatasetError(
             f"{folder}: There is no folder {', '.join(names[:-1])} or {names[-1]} here. Download "
-            "7-Scenes, unpack the archive of each scene and those of its sequences, and name the "
-            "folder that holds them."
+            "7-Scenes, unpack the archive of each scene and those of its sequences, and specify "
+            "the folder that holds them."
         )
     if missing:
         print(f"not in {folder}: {', '.join(missing)}", file=sys.stderr)
@@ -289,13 +289,13 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
 
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
-    """Return the baselines to use, in the order of BASELINES."""
+    """Return the requested baselines, in the order of BASELINES."""
     from sceneprint_lab.evaluation.baselines import BASELINES
 
     if unknown := [name for name in names or () if name not in BASELINES]:
         raise DatasetError(
-            f"--baselines {unknown[0]}: no such baseline. Choose from {', '.join(BASELINES)}; "
-            "put the PATHs first."
+            f"--baselines {unknown[0]}: There is no such baseline. Choose from "
+            f"{', '.join(BASELINES)}; put the PATHs first."
         )
     return () if names is None else tuple(one for one in BASELINES if one in names or not names)
 
@@ -304,12 +304,11 @@ def _watch(items: Iterable[T], stage: str, total: int) -> Iterable[T]:
     return tqdm(items, desc=stage, total=total, disable=None)
 
 
-#: Most frames of a scene, as the overlap of all with all is computed.
+#: Greatest number of frames of a scene, since the overlap of all pairs is computed.
 _MOST = 2000
 _PAIR_EXAMPLES = """\
 pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes are
-negatives, a quarter of them drawn from pairs with a frame that shows little but
-one plane:
+negatives, and in a quarter of these one frame shows little more than a plane:
   sceneprint evaluate-pairs redkitchen studyroom2 fr1_rpy --negatives 3000 --json pairs.json
 compare with Open3D (FPFH with RANSAC or FGR, then ICP):
   sceneprint evaluate-pairs redkitchen --baselines
@@ -320,18 +319,18 @@ def add_evaluate_pairs(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint evaluate-pairs`."""
     command.epilog = _PAIR_EXAMPLES
     command.formatter_class = argparse.RawDescriptionHelpFormatter
-    command.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="of sequences")
+    command.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="path of sequences")
     add_model_options(command)
     _add_drawing(command)
     _add_judging(command)
     command.add_argument(
         "--right", nargs=2, type=_limit, default=[0.1, 10.0], metavar=("METRES", "DEGREES"),
-        help="errors up to which a transform counts as correct (default: 0.1 10)",
+        help="greatest errors of a correct transform (default: 0.1 10)",
     )  # fmt: skip
     command.add_argument(
         "--baselines",
         action="store_true",
-        help="also register overlapping pairs with Open3D, at about a second each",
+        help="also register overlapping pairs with Open3D, in about a second per pair",
     )
     command.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N",
@@ -366,7 +365,7 @@ def _frames(text: str) -> int:
 
 
 def _limit(text: str) -> float:
-    """Return a number above 0, up to 180."""
+    """Return a number above 0 and up to 180."""
     return number_within(text, lambda number: 0 < number <= 180, "a number above 0, up to 180")
 
 

@@ -1,9 +1,9 @@
-"""Answer queries at places that look alike: `python -m sceneprint_lab.cli.lookalike_answers`.
+"""Answer queries at ambiguous places: `python -m sceneprint_lab.cli.lookalike_answers`.
 
-With `--model lidar` the sites are scanned by a laser, and an answer is right within 50 cm and 10
-degrees; it is grossly wrong beyond 2.5 m or 15 degrees.
+With `--model lidar` the sites are laser scans. An answer is then correct within 50 cm and 10
+degrees, and grossly wrong beyond 2.5 m or 15 degrees.
 
-Seeds 1 to 99 are for choosing numbers; judge by seeds from 1000 on that nobody has looked at.
+Use seeds 1 to 99 to tune parameters, and unused seeds from 1000 for the final evaluation.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from sceneprint_lab.evaluation.sites import SiteAnswer, ask_site, kinds_of
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
-#: Queries of one site of the kind "absent", which --absent asks by the thousand.
+#: Number of queries per site of the kind "absent" for --absent, which needs thousands.
 ABSENT_BLOCK = 100
-#: Columns of the table and the shares in them, by their names in `measures.answers`.
+#: Columns of the table, and the names of their values in `measures.answers`.
 SHARES = {
     "found and right": "found_right", "found and wrong": "found_wrong",
     "wrong of found": "wrong_of_found", "grossly wrong": "grossly_wrong",
@@ -39,7 +39,7 @@ SHARES = {
 
 
 def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
-    """Return the shares by kind and over all as lines of Markdown."""
+    """Return the fractions by kind and in total as lines of Markdown."""
     lines = [
         f"| kind | queries | answerable | {' | '.join(SHARES)} | ms |",
         f"|---|{'--:|' * (len(SHARES) + 3)}",
@@ -56,17 +56,17 @@ def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
 
 
 def main() -> None:
-    """Ask the sites and print the table."""
+    """Answer the queries of the sites and print the table."""
     parser = argparse.ArgumentParser(
         prog="python -m sceneprint_lab.cli.lookalike_answers", description=__doc__
     )
-    parser.add_argument("--seed", type=int, default=1, help="of the sites (default: 1)")
-    parser.add_argument("--sites", type=int, default=3, help="of each kind (default: 3)")
-    parser.add_argument("--first", type=int, default=0, help="index of the first (default: 0)")
-    parser.add_argument("--queries", type=int, default=16, help="of each site (default: 16)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the sites (default: 1)")
+    parser.add_argument("--sites", type=int, default=3, help="sites of each kind (default: 3)")
+    parser.add_argument("--first", type=int, default=0, help="index of the first site (default: 0)")
+    parser.add_argument("--queries", type=int, default=16, help="queries per site (default: 16)")
     parser.add_argument(
         "--kinds", nargs="+", choices=[*dict.fromkeys(KINDS + ORDINARY + SURVEYED_KINDS)],
-        help="default: all kinds of the model's sensor in which places look alike",
+        help="default: all ambiguous kinds of the model's sensor",
     )  # fmt: skip
     parser.add_argument("--absent", type=int, default=0, metavar="N",
                         help="query N frames of other places instead")  # fmt: skip
@@ -75,7 +75,7 @@ def main() -> None:
         help="error of the robot's prior in metres, as 0 0.3 or 1.5 4 (default: no prior)",
     )  # fmt: skip
     parser.add_argument("--candidates", type=int, default=10, help="size of C (default: 10)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: 1)")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
     parser.add_argument("--model", default=PRESETS[0])
     parser.add_argument("--json", type=Path, help="write every answer to this file")
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""`sceneprint synth`: synthetic rooms, or sites scanned by a laser, as a data set."""
+"""The command `sceneprint synth`: synthetic rooms or laser-scanned sites as a data set."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Stored units per metre.
 DEPTH_SCALE = 1000.0
-#: Kinds of look-alike sites of a sensor, as `lookalikes` and `lookalike_surveys` have them.
+#: Kinds of look-alike sites of each sensor.
 LOOKALIKES = {
     "kinect": ("object", "offices", "unmapped", "kitchens", "opposite", "absent"),
     "lidar": ("bays", "streets", "halls", "unmapped", "absent", "sites"),
@@ -41,14 +41,14 @@ def add_synth(command: argparse.ArgumentParser) -> None:
         "--lookalikes",
         choices=sorted({kind for kinds in LOOKALIKES.values() for kind in kinds}),
         metavar="KIND",
-        help="object: a symmetric object circled on a bare floor; offices: a row of equal rooms, "
-        "or a hall of equal bays; unmapped: such a row, the queries from a room that the map "
-        "lacks; kitchens: the queries from another kitchen with the same furniture; opposite: "
-        "furniture in a room, the queries from its other side; absent: the queries from other "
-        "rooms. With --sensor lidar: bays: a hall of equal bays; streets: a street of equal "
-        "blocks; halls: a hall that is the same after half a turn; unmapped: equal halls or "
-        "streets, the queries from one that the map lacks; absent: the queries from other halls "
-        "and streets; sites: ordinary halls, storeys and blocks, which do not repeat",
+        help="object: a circle around a symmetric object on a bare floor; offices: a row of equal "
+        "rooms, or a hall of equal bays; unmapped: such a row, with queries from a room that the "
+        "map lacks; kitchens: queries from another kitchen with the same furniture; opposite: "
+        "furniture in a room, with queries from its other side; absent: queries from other rooms. "
+        "With --sensor lidar: bays: a hall of equal bays; streets: a street of equal blocks; "
+        "halls: a hall with a symmetry of half a turn; unmapped: equal halls or streets, with "
+        "queries from one that the map lacks; absent: queries from other halls and streets; "
+        "sites: ordinary halls, storeys and blocks, which do not repeat",
     )
     command.add_argument(
         "--rooms", type=positive, default=4, metavar="N",
@@ -65,7 +65,7 @@ def add_synth(command: argparse.ArgumentParser) -> None:
         help="place views along a hand-held path, a few centimetres apart, instead of at "
         "random; with --sensor lidar along a walk, 1.5 m apart",
     )
-    command.add_argument("--perfect", action="store_true", help="without sensor noise")
+    command.add_argument("--perfect", action="store_true", help="omit sensor noise")
     command.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
     )
@@ -73,27 +73,26 @@ def add_synth(command: argparse.ArgumentParser) -> None:
 
 
 def run_synth(options: argparse.Namespace) -> int:
-    """Render furnished rooms as a Kinect would see them, in 7-Scenes layout:
+    """Render furnished rooms as a Kinect sees them, in 7-Scenes layout:
     OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: halls, storeys
-    and blocks as a spinning laser would see them, OUT/site-000/scan-000000.ply and .pose.txt.
-    With --lookalikes: sites that look like themselves or like another, as scenes whose
-    TrainSplit.txt and TestSplit.txt say what is the map and what the queries, so that
-    `sceneprint evaluate OUT` measures wrong answers.
+    and blocks as a spinning laser sees them, OUT/site-000/scan-000000.ply and .pose.txt.
+    With --lookalikes: ambiguous sites as scenes whose TrainSplit.txt and TestSplit.txt separate
+    map and queries, so that `sceneprint evaluate OUT` measures wrong answers.
     """
     if options.lookalikes and options.path:
         raise DatasetError(
-            "--lookalikes and --path: look-alike sites have paths of their own. Leave --path out."
+            "--lookalikes and --path: look-alike sites have their own paths. Omit --path."
         )
     kinds = LOOKALIKES[options.sensor]
     if options.lookalikes and options.lookalikes not in kinds:
         raise DatasetError(
-            f"--lookalikes {options.lookalikes}: there is no such kind for --sensor "
+            f"--lookalikes {options.lookalikes}: There is no such kind for --sensor "
             f"{options.sensor}. Choose from {', '.join(kinds)}."
         )
     if options.out.exists() and any(options.out.iterdir()):
         raise DatasetError(
-            f"{options.out}: is not empty, and frames of two runs must not be mixed. Use a new "
-            "folder, or empty this one."
+            f"{options.out}: The folder is not empty; frames of two runs must not be mixed. Use a "
+            "new folder, or empty this one."
         )
     options.out.mkdir(parents=True, exist_ok=True)
     with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:
@@ -111,7 +110,7 @@ def _rooms(options: argparse.Namespace) -> Iterator[None]:
     if options.lookalikes:
         write = partial(_write_lookalike, *where, options.lookalikes)
     jobs = min(options.jobs, options.rooms)
-    if jobs == 1:  # a process of its own would import all modules again
+    if jobs == 1:  # a child process would import all modules again
         yield from map(write, range(options.rooms))
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
@@ -135,7 +134,7 @@ def _write_room(
 def _write_lookalike(
     out: Path, seed: int, queries: int, lidar: bool, perfect: bool, kind: str, index: int
 ) -> None:
-    """Write a scene of two sequences, or two scenes if the map lacks the queries' place."""
+    """Write a scene with two sequences, or two scenes if the map lacks the queries' place."""
     from sceneprint_lab.synth import (
         KinectNoise,
         synthesise_lookalike,
@@ -157,7 +156,7 @@ def _write_lookalike(
 
 
 def _write_sequence(folder: Path, frames: Sequence[AnyFrame]) -> None:
-    """Write scans with their poses, or depth images with those and the camera of the scene."""
+    """Write scans with their poses, or depth images with their poses and camera."""
     folder.mkdir(parents=True)
     for number, frame in enumerate(frames):
         if isinstance(frame, Cloud):

@@ -1,4 +1,4 @@
-"""`sceneprint train`: synthetic rooms, and frames of your own, to a model."""
+"""The command `sceneprint train`: a model from synthetic rooms and your own frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def add_train(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--preset", choices=PRESETS, default=PRESETS[0],
-        help=f"base of signature size, lengths and scenes (default: {PRESETS[0]})",
+        help=f"preset with signature size, lengths and scenes (default: {PRESETS[0]})",
     )  # fmt: skip
     command.add_argument(
         "--rooms", type=whole_number, default=100, metavar="N",
@@ -32,8 +32,8 @@ def add_train(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--whitening-rooms", type=whole_number, metavar="N",
-        help="number of synthetic rooms or sites to fit the whitening of signatures; 0 stores "
-        "psi itself (default: 500; lidar 400, paper 0)",
+        help="number of synthetic rooms or sites to fit the whitening of signatures; 0 stores psi "
+        "without whitening (default: 500; lidar 400, paper 0)",
     )  # fmt: skip
     command.add_argument("--seed", type=whole_number, default=0, metavar="S")
     command.add_argument(
@@ -77,7 +77,7 @@ def run_train(options: argparse.Namespace) -> int:
     ]
     options.out.parent.mkdir(parents=True, exist_ok=True)
     if options.out.is_dir():
-        raise TrainingError(f"{options.out}: is a folder. Name a file for the model.")
+        raise TrainingError(f"{options.out}: This is a folder. Specify a file for the model.")
     scenes, views = preset_scenes(options.preset)
     levels, whitening, whitening_rooms = preset_whitening(options.preset)
     if options.whitening_rooms is not None:
@@ -105,9 +105,9 @@ def run_train(options: argparse.Namespace) -> int:
 
 
 def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
-    """Return the same for a sensor of another range, of depth images and of clouds."""
+    """Return the parameters with another range of the sensor, for depth images and clouds."""
     if least >= most:
-        raise TrainingError(f"--range {least:g} {most:g}: give the smaller distance first.")
+        raise TrainingError(f"--range {least:g} {most:g}: Put the smaller distance first.")
     return replace(
         p,
         depth=replace(p.depth, minimum_depth=least, maximum_depth=most),
@@ -116,7 +116,7 @@ def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
 
 
 class _Bars:
-    """A progress bar for each stage, in the order in which they come."""
+    """Progress bars of stages, one after the other."""
 
     def __init__(self) -> None:
         self.stage = ""
@@ -130,7 +130,7 @@ class _Bars:
             self.bar.close()
 
     def report(self, stage: str, done: int, total: int) -> None:
-        """Advance the bar of a stage, closing the one before it."""
+        """Advance the bar of a stage, and close the bar of the stage before."""
         if stage != self.stage:
             self.__exit__()
             self.stage, self.bar = stage, tqdm(desc=stage, total=total, disable=None)

@@ -4,7 +4,7 @@
     kind, seed, index  --synthesise_lookalike-->  frames of a map, and queries
     kind, seed, index  --synthesise_lookalike_survey-->  clouds of a map, and queries
 
-Nothing here reads or writes files.
+This package reads and writes no files.
 """
 
 from sceneprint_lab.synth.dataset import (

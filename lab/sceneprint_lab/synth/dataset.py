@@ -1,4 +1,4 @@
-"""From a seed to depth frames with exact poses.
+"""Synthetic sequences of depth frames and laser scans, with exact poses.
 
 seed, index  --synthesise_room-->  SynthRoom: frames with poses
 """
@@ -26,21 +26,21 @@ from sceneprint_lab.synth.sensors import (
 )
 from sceneprint_lab.synth.trajectories import scattered, scattered_poses, trajectory, walk
 
-LEAST_VALID = 0.45  #: share of a scattered view that has depth; others are taken again
+LEAST_VALID = 0.45  #: smallest valid fraction of an independent view; others are taken again
 
-#: the camera of 7-Scenes
+#: The camera of 7-Scenes.
 KINECT = Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)
 
 
 @dataclass(frozen=True, eq=False)
 class SynthRoom:
-    """One synthetic sequence.
+    """A synthetic sequence of a room.
 
     Parameters
     ----------
-    name : "room-000" and so on
-    seed, index : what it was made from
-    frames : depth in whole millimetres where noisy; pose is T_world_camera
+    name : name such as "room-000"
+    seed, index : arguments that the room was generated from
+    frames : frames with T_world_camera; depth is in whole millimetres with sensor noise
     """
 
     name: str
@@ -55,20 +55,19 @@ def synthesise_room(
 ) -> SynthRoom:  # fmt: skip
     """Furnish a room and take depth frames in it.
 
-    The outcome depends on the arguments only, so rooms can be made in any order and in
-    any process.
+    The result depends only on the arguments, so rooms can be generated in any order and process.
 
     Parameters
     ----------
     seed, index : the room is number `index` of the collection `seed`
-    views : how many frames
-    along_path : whether the frames follow one hand-held path; else they are independent
-    step : along a path, take only each `step`-th view
-    noise : the sensor; None gives ideal depth
+    views : number of frames
+    along_path : whether the frames follow a hand-held path; else they are independent
+    step : interval of frames along the path
+    noise : sensor noise; None for ideal depth
 
     Raises
     ------
-    MissingDependency : Embree cannot be imported.
+    MissingDependency : If Embree cannot be imported.
     """
     room, rng = room_and_rng(seed, index)
     sensor = own_sensor(noise, intrinsics, rng) if noise else None
@@ -85,7 +84,7 @@ def synthesise_room(
         while len(taken) < views:
             new = shots(scattered_poses(room, views - len(taken), rng))
             taken += [(depth, T) for depth, T in new if np.mean(depth > 0) >= least]
-            least *= 0.98  # never for ever
+            least *= 0.98  # the limit falls, so the loop ends
     name = f"room-{index:03d}"
     frames = (
         DepthFrame(depth, intrinsics, f"{name}/frame-{k:06d}", T)
@@ -95,7 +94,7 @@ def synthesise_room(
 
 
 def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
-    """Return room number `index` of collection `seed`, and the generator as it stands after it."""
+    """Return room number `index` of collection `seed`, and the generator in its state after it."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     return make_room(rng), rng
 
@@ -103,7 +102,7 @@ def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
 def render(
     scene: Room | SyntheticMesh | Caster, T_world_camera: Floats, intrinsics: Intrinsics = KINECT
 ) -> Floats32:
-    """Return (H, W) float32 ideal depth in metres, 0 where nothing is met."""
+    """Return ideal depth (H, W) float32, metres, 0 where a ray meets no surface."""
     return cast_depth(_caster(scene), T_world_camera, intrinsics)[0]
 
 
@@ -111,7 +110,7 @@ def take(
     scene: Room | SyntheticMesh | Caster, T_world_camera: Floats, intrinsics: Intrinsics,
     rng: np.random.Generator, noise: KinectNoise = KINECT_V1,
 ) -> Floats32:  # fmt: skip
-    """Return (H, W) float32 depth as a Kinect gives it: whole millimetres, in metres, 0 missing."""
+    """Return depth (H, W) float32 of a Kinect: whole millimetres, in metres, 0 if missing."""
     caster = _caster(scene)
     depth, cosine, face = cast_faces(caster, T_world_camera, intrinsics)
     loss = np.append(caster.mesh.loss, np.float32(0))[face]
@@ -126,7 +125,7 @@ def _caster(scene: Room | SyntheticMesh | Caster) -> Caster:
 
 
 def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Generator) -> KinectNoise:
-    """Return the sensor of one room: no two are quite equal."""
+    """Return the sensor of one room, with parameters that vary slightly between rooms."""
     s = rng.uniform(0.8, 1.4)
     most = intrinsics.width // 18 if rng.random() < 0.4 else 0
     left, right, top, bottom = rng.integers(0, most + 1, 4).tolist()
@@ -136,15 +135,15 @@ def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Genera
     )  # fmt: skip
 
 
-# From a seed to the scans of a spinning laser in a hall, a storey or a block.
+# Laser scans of a hall, a storey or a block.
 #
 # seed, index  --synthesise_survey-->  Survey: clouds with poses
 
-LEAST_POINTS = 2000  #: of a scan; a scattered one of fewer is taken elsewhere
+LEAST_POINTS = 2000  #: smallest number of points of an independent scan; others are taken again
 _TRIES = 5
 
 _MAKERS = {"hall": make_hall, "storey": make_storey, "block": make_block}
-#: kinds in the order of indices: of five sites two are halls, two storeys and one is a block
+#: Kinds in the order of indices: of five sites two are halls, two are storeys and one is a block.
 _ORDER = ("hall", "storey", "hall", "block", "storey")
 
 
@@ -154,10 +153,10 @@ class Survey:
 
     Parameters
     ----------
-    name : "site-000" and so on
+    name : name such as "site-000"
     kind : "hall", "storey" or "block"
-    sensor : what took them
-    clouds : sensor frame; pose is T_world_sensor
+    sensor : scanner
+    clouds : points in the sensor frame, with T_world_sensor
     """
 
     name: str
@@ -172,21 +171,20 @@ def synthesise_survey(
 ) -> Survey:  # fmt: skip
     """Build a site and scan it.
 
-    The outcome depends on the arguments only, so sites can be made in any order and in any
-    process.
+    The result depends only on the arguments, so sites can be generated in any order and process.
 
     Parameters
     ----------
     seed, index : the site is number `index` of the collection `seed`
-    views : how many scans
-    along_path : whether they follow one walk, 1.5 m apart; else they are independent
-    kind : "hall", "storey" or "block"; default: by the index
-    sensor : default: one of its own for each site
-    perfect : whether it makes no errors and loses nothing
+    views : number of scans
+    along_path : whether the scans follow a walk, 1.5 m apart; else they are independent
+    kind : "hall", "storey" or "block"; default: depends on the index
+    sensor : scanner; default: a random scanner for each site
+    perfect : whether the scanner has no errors and loses no returns
 
     Raises
     ------
-    MissingDependency : Embree cannot be imported.
+    MissingDependency : If Embree cannot be imported.
     """
     premises, rng = premises_and_rng(seed, index, kind)
     drawn = own_scanner(rng)
@@ -208,6 +206,6 @@ def synthesise_survey(
 def premises_and_rng(
     seed: int, index: int, kind: str | None = None
 ) -> tuple[Premises, np.random.Generator]:
-    """Return site number `index` of collection `seed`, and the generator as it stands after it."""
+    """Return site number `index` of collection `seed`, and the generator in its state after it."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
     return _MAKERS[kind or _ORDER[index % len(_ORDER)]](rng), rng

@@ -1,9 +1,9 @@
-"""A piece of furniture: its mesh, its footprint, and where other things can rest on it.
+"""Pieces of furniture: meshes, footprints, and surfaces for small objects.
 
-    Surface, rng  --scatter-->  small objects on that surface
+    Shelf, rng  --scatter-->  small objects on that surface
 
-A piece stands on z = 0 with its footprint centred on the origin; its back, the side that
-goes to a wall, faces +y, its front faces -y.
+A piece stands on z = 0 with its footprint centred on the origin. Its back, which faces a wall,
+is at +y, and its front is at -y.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from sceneprint_lab.synth.mesh import (
     tube,
 )
 
-# Small things that lie about: each builder returns one object resting on z = 0.
+# Small objects: each builder returns one object that rests on z = 0.
 #
-# rng  --small_thing-->  Mesh, 5 to 60 cm, yaw left to the caller
+# rng  --small_thing-->  SyntheticMesh, 5 to 60 cm; the caller turns it
 
 Builder = Callable[[np.random.Generator], SyntheticMesh]
 
 
 def packet(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a carton of any proportion: cereals, tissues, parcels."""
+    """Return a carton of any proportion, such as a cereal packet or a parcel."""
     return box(*rng.uniform((0.05, 0.04, 0.04), (0.3, 0.22, 0.3)))
 
 
 def flat_thing(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a book, magazine, tablet or pile of paper."""
+    """Return a book, magazine, tablet or stack of paper."""
     return box(rng.uniform(0.12, 0.32), rng.uniform(0.1, 0.24), rng.uniform(0.004, 0.05))
 
 
 def stack(rng: np.random.Generator) -> SyntheticMesh:
-    """Return books or boxes on top of each other, each turned a little."""
+    """Return a stack of books or boxes, each turned slightly."""
     parts, z = [], 0.0
     w, d = rng.uniform((0.15, 0.12), (0.4, 0.3))
     for _ in range(rng.integers(2, 7)):
@@ -74,7 +74,7 @@ def mug(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def bottle(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a bottle, jug or vase: a smooth random profile."""
+    """Return a bottle, jug or vase with a smooth random profile."""
     r, h = rng.uniform(0.03, 0.06), rng.uniform(0.15, 0.35)
     neck = rng.uniform(0.2, 0.7)
     s = rng.uniform(0.5, 0.75)
@@ -114,7 +114,7 @@ def bag(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def basket(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a tapered open tray or basket: a floor and four leaning walls."""
+    """Return a tapered open tray or basket with a floor and four leaning walls."""
     w, d, h = rng.uniform((0.15, 0.12, 0.06), (0.45, 0.32, 0.25))
     t = 0.012
     walls = [box(w, t, h, (0, y, 0)) for y in (-d / 2, d / 2)]
@@ -124,7 +124,7 @@ def basket(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def lamp(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a table lamp: foot, stem, shade."""
+    """Return a table lamp with a foot, a stem and a shade."""
     h = rng.uniform(0.3, 0.6)
     r = rng.uniform(0.08, 0.18)
     lean = rng.uniform(0, 0.2) if rng.random() < 0.5 else 0.0
@@ -134,7 +134,7 @@ def lamp(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def plant(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a pot with leaves, a ball of leaves, or a few branches."""
+    """Return a pot with leaves, a ball of leaves or a few branches."""
     r, h = rng.uniform(0.05, 0.16), rng.uniform(0.08, 0.26)
     size = rng.uniform(1.0, 2.5) * r + 0.08
     pot = cone(r * 0.75, r, h)
@@ -160,7 +160,7 @@ def _pitch(angle: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
 
 
 def tool(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a long thin thing that lies down: pen box, ruler, remote, rolled paper."""
+    """Return a long thin object that lies flat, such as a ruler or a remote control."""
     if rng.random() < 0.5:
         return box(rng.uniform(0.1, 0.45), rng.uniform(0.02, 0.06), rng.uniform(0.01, 0.04))
     half, r = rng.uniform(0.08, 0.3), rng.uniform(0.01, 0.04)
@@ -168,7 +168,7 @@ def tool(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def appliance(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a microwave, printer, toaster or coffee machine: a body with parts set on or in."""
+    """Return a microwave, printer, toaster or coffee machine: a body with attached parts."""
     w, d, h = rng.uniform((0.18, 0.15, 0.15), (0.52, 0.42, 0.38))
     face = box(w * 0.6, 0.02, h * 0.7, (-w * 0.12, -d / 2, h * 0.15))
     top = box(w * rng.uniform(0.4, 0.95), d * rng.uniform(0.4, 0.9), h * 0.2, (0, 0, h))
@@ -186,14 +186,14 @@ def kettle(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def tray(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a tapered solid: a bread, a pan with a handle, a hard hat of a thing."""
+    """Return a tapered solid, such as a loaf, a pan with a handle or a hard hat."""
     w, d, h = rng.uniform((0.1, 0.1, 0.03), (0.35, 0.25, 0.12))
     s = rng.uniform(0.5, 1.2)
     handle = tube([(w / 2, 0, h * 0.7), (w / 2 + 0.18, 0, h * 0.9)], 0.011)
     return join([tapered_box((w * s, d * s), (w, d), h)] + ([handle] if rng.random() < 0.4 else []))
 
 
-#: what may stand on any surface, and how often
+#: Small objects for any surface, with weights.
 SMALL: tuple[tuple[Builder, float], ...] = (
     (packet, 4), (flat_thing, 4), (stack, 2), (mug, 3), (bottle, 2), (bowl, 1.5), (jar, 2),
     (ball, 1), (bag, 1), (basket, 1), (lamp, 0.5), (plant, 1), (tool, 2), (appliance, 0.7),
@@ -203,7 +203,7 @@ _WEIGHTS = np.array([w for _, w in SMALL]) / sum(w for _, w in SMALL)
 
 
 def small_thing(rng: np.random.Generator) -> SyntheticMesh:
-    """Return any small object; one in eight is dark or shiny and answers badly."""
+    """Return a random small object; one in eight is dark or shiny and loses samples."""
     builder = SMALL[int(rng.choice(len(SMALL), p=_WEIGHTS))][0]
     thing = builder(rng)
     return thing.with_loss(rng.uniform(0.2, 0.95)) if rng.random() < 0.12 else thing
@@ -211,15 +211,15 @@ def small_thing(rng: np.random.Generator) -> SyntheticMesh:
 
 @dataclass(frozen=True)
 class Shelf:
-    """A horizontal rectangle on which things rest.
+    """A horizontal rectangle that carries objects.
 
     Parameters
     ----------
-    x, y : middle, metres, in the piece's frame
+    x, y : centre in the piece's frame, metres
     width, depth : extent along x and y, metres
     z : height, metres
     headroom : free height above, metres
-    density : objects a square metre
+    density : objects per square metre
     """
 
     x: float
@@ -239,8 +239,8 @@ class Piece:
     ----------
     mesh : standing on z = 0, back towards +y
     width, depth : footprint along x and y, metres
-    surfaces : where things rest
-    seats : 1 for a chair at its front; -n for n chairs, each at any side; 0 for none
+    surfaces : surfaces that carry objects
+    seats : 1 for a chair at its front; -n for n chairs, each at a random side; 0 for none
     """
 
     mesh: SyntheticMesh
@@ -251,7 +251,7 @@ class Piece:
 
 
 def scatter(surface: Shelf, rng: np.random.Generator) -> SyntheticMesh:
-    """Return small objects that rest on a surface, apart from each other, mostly square to it."""
+    """Return small objects on a surface, without overlaps, mostly aligned with it."""
     wanted = rng.poisson(surface.density * surface.width * surface.depth)
     placed: list[tuple[float, float, float]] = []
     parts: list[SyntheticMesh] = []
@@ -275,7 +275,7 @@ def scatter(surface: Shelf, rng: np.random.Generator) -> SyntheticMesh:
 
 
 def furnished(piece: Piece, rng: np.random.Generator) -> SyntheticMesh:
-    """Return the piece with things on all its surfaces, more or fewer by piece."""
+    """Return a piece with objects on all its surfaces; the number varies between pieces."""
     fullness = float(np.clip(rng.lognormal(0.1, 0.7), 0.1, 3.0))
     loads = [
         scatter(Shelf(**{**vars(s), "density": s.density * fullness}), rng) for s in piece.surfaces
@@ -283,13 +283,13 @@ def furnished(piece: Piece, rng: np.random.Generator) -> SyntheticMesh:
     return join([piece.mesh, *loads])
 
 
-# Things to sit and lie on.
+# Furniture for sitting and lying.
 #
 # rng  --chair, swivel_chair, stool, sofa, bed-->  Piece, its back towards +y
 
 
 def chair(rng: np.random.Generator) -> Piece:
-    """Return a four-legged chair: a slatted, solid or bent back, sometimes arms."""
+    """Return a four-legged chair with a slatted, solid or bent back, sometimes with arms."""
     w, d, h = rng.uniform(0.38, 0.5), rng.uniform(0.38, 0.48), rng.uniform(0.42, 0.48)
     t, rise = rng.uniform(0.02, 0.045), rng.uniform(0.35, 0.55)
     round_legs = rng.random() < 0.5
@@ -311,7 +311,7 @@ def chair(rng: np.random.Generator) -> Piece:
 
 
 def swivel_chair(rng: np.random.Generator) -> Piece:
-    """Return an office chair: star foot with castors, column, padded seat and back."""
+    """Return an office chair with a star foot on castors, a column, a padded seat and a back."""
     h, r = rng.uniform(0.42, 0.52), rng.uniform(0.27, 0.34)
     turn, rise = rng.uniform(0, 2), rng.uniform(0.45, 0.75)
     parts = [cylinder(0.03, h, 10), cylinder(0.05, 0.12, 10).moved((0, 0, 0.06))]
@@ -347,7 +347,7 @@ def stool(rng: np.random.Generator) -> Piece:
 
 
 def sofa(rng: np.random.Generator) -> Piece:
-    """Return a sofa or armchair: base, back, arms, seat cushions, loose cushions."""
+    """Return a sofa or armchair with a base, a back, arms and cushions."""
     places = int(rng.integers(1, 4))
     arm, seat = rng.uniform(0.08, 0.25), rng.uniform(0.5, 0.75)
     w, d = places * seat + 2 * arm, rng.uniform(0.75, 1.0)
@@ -372,7 +372,7 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def bed(rng: np.random.Generator) -> Piece:
-    """Return a bed with mattress, quilt and pillows, its head at the back."""
+    """Return a bed with a mattress, a quilt and pillows; its head is at the back."""
     w, d, h = rng.choice((0.9, 1.4, 1.7)) + rng.uniform(0, 0.1), 2.05, rng.uniform(0.3, 0.5)
     parts = [box(w, d, h - 0.18, (0, 0, 0.08)), _pillow(w, d, 0.25, 0.15).moved((0, 0, h - 0.2))]
     if rng.random() < 0.7:
@@ -407,17 +407,17 @@ def _pillow(w: float, d: float, h: float, soft: float) -> SyntheticMesh:
 
 
 def _leaning(mesh: SyntheticMesh, slope: float, at: tuple[float, float, float]) -> SyntheticMesh:
-    """Return leant backwards (+y) by slope radians about its foot, then put at a point."""
+    """Lean a mesh backwards (+y) about its foot by `slope` radians, then move it to a point."""
     return mesh.turned(rotation_x(-slope), at)
 
 
-# Tables and desks, with what usually stands on a desk.
+# Tables, and desks with their usual equipment.
 #
 # rng  --table, round_table, desk-->  Piece
 
 
 def table(rng: np.random.Generator) -> Piece:
-    """Return a rectangular table for eating or meeting; low and small ones are coffee tables."""
+    """Return a rectangular dining, meeting or coffee table."""
     low = rng.random() < 0.25
     w, d = rng.uniform((0.8, 0.6), (2.0, 1.0))
     h = rng.uniform(0.38, 0.5) if low else rng.uniform(0.7, 0.77)
@@ -440,7 +440,7 @@ def round_table(rng: np.random.Generator) -> Piece:
 
 
 def desk(rng: np.random.Generator) -> Piece:
-    """Return a desk: monitors at the back, keyboard, drawers below, sometimes a screen wall."""
+    """Return a desk with monitors, a keyboard, drawers and sometimes a partition."""
     w, d, h = rng.uniform(1.0, 2.0), rng.uniform(0.6, 0.9), rng.uniform(0.68, 0.78)
     parts = [_top(rng, w, d, h), *_legs(rng, w, d, h)]
     if rng.random() < 0.6:
@@ -467,7 +467,7 @@ def desk(rng: np.random.Generator) -> Piece:
 
 
 def monitor(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a flat screen on a foot, facing -y; its glass often answers badly."""
+    """Return a flat screen on a foot, facing -y; its glass often loses samples."""
     w = rng.uniform(0.4, 0.72)
     h = w * rng.uniform(0.56, 0.75)
     rise = rng.uniform(0.08, 0.2)
@@ -488,7 +488,7 @@ def laptop(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def pc_tower(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a computer case with a ledge at its front."""
+    """Return a computer case with a ledge on its front."""
     w, d, h = rng.uniform((0.15, 0.35, 0.33), (0.23, 0.5, 0.5))
     return join([box(w, d, h), box(w * 0.9, 0.02, h * 0.3, (0, -d / 2, h * 0.6))])
 
@@ -517,7 +517,7 @@ def _legs(rng: np.random.Generator, w: float, d: float, h: float) -> list[Synthe
     if style == 0:
         return [box(t, t, h - 0.02, (a, b, 0)) for a, b in corners]
     if style == 1:
-        s = rng.uniform(0.8, 1.0)  # legs that lean outward
+        s = rng.uniform(0.8, 1.0)  # splayed legs
         return [tube([(a, b, 0), (a * s, b * s, h - 0.02)], t / 2) for a, b in corners]
     if style == 2:  # two side panels
         return [box(0.03, d * 0.95, h - 0.02, (a, 0, 0)) for a in (-x, x)]
@@ -525,13 +525,13 @@ def _legs(rng: np.random.Generator, w: float, d: float, h: float) -> list[Synthe
     return [*feet, *(box(t, t * 1.5, h - 0.02, (a, 0, 0)) for a in (-x, x))]
 
 
-# Things that hold things: cupboards, shelves, kitchen rows, and what stands on a floor.
+# Storage furniture, kitchen units and free-standing objects.
 #
 # rng  --cupboard, shelf, kitchen_row, ...-->  Piece, its back towards +y
 
 
 def cupboard(rng: np.random.Generator) -> Piece:
-    """Return a chest of drawers, sideboard or wardrobe with fronts, gaps and handles."""
+    """Return a chest of drawers, a sideboard or a wardrobe with fronts, gaps and handles."""
     h = rng.choice((rng.uniform(0.45, 1.2), rng.uniform(1.6, 2.25)))
     w, d = rng.uniform(0.45, 1.6), rng.uniform(0.3, 0.65)
     mesh = join([box(w, d, h), _fronts(rng, w, h - 0.05, 0.05).moved((0, -d / 2, 0))])
@@ -539,7 +539,7 @@ def cupboard(rng: np.random.Generator) -> Piece:
 
 
 def shelf(rng: np.random.Generator) -> Piece:
-    """Return an open shelf: sides, boards, a back or none, rows of books and boxes."""
+    """Return an open shelf with boards, an optional back, and rows of books and boxes."""
     w, d, h = rng.uniform(0.5, 1.8), rng.uniform(0.22, 0.4), rng.uniform(0.8, 2.2)
     n = max(2, round(h / rng.uniform(0.28, 0.45)))
     t, gap = rng.uniform(0.015, 0.03), h / n
@@ -559,7 +559,7 @@ def shelf(rng: np.random.Generator) -> Piece:
 
 
 def books(rng: np.random.Generator, width: float, depth: float, headroom: float) -> SyntheticMesh:
-    """Return a row of books or binders, with gaps; some lean."""
+    """Return a row of books or binders with gaps; some of them lean."""
     parts: list[SyntheticMesh] = []
     x, end = -width / 2, width / 2
     size = rng.uniform(0.5, 0.95) * headroom
@@ -577,7 +577,7 @@ def books(rng: np.random.Generator, width: float, depth: float, headroom: float)
 
 
 def kitchen_row(rng: np.random.Generator) -> Piece:
-    """Return base units under a worktop with a sink or hob, wall units above, perhaps a fridge."""
+    """Return base units under a worktop with a sink or hob, wall units, and sometimes a fridge."""
     unit = rng.uniform(0.45, 0.65)
     n = int(rng.integers(2, 6))
     w, d, h, t = n * unit, 0.6, rng.uniform(0.85, 0.94), rng.uniform(0.025, 0.05)
@@ -590,7 +590,7 @@ def kitchen_row(rng: np.random.Generator) -> Piece:
     parts += [_slab(xs[0], xs[1], d, h - t, t), _slab(xs[2], xs[3], d, h - t, t)]
     parts += _sink(rng, xs[1], xs[2], d, h, t)
     surfaces = [Shelf(0, -0.02, w, d - 0.1, h, 0.45, 7)]
-    if rng.random() < 0.7:  # wall units leave a gap over the worktop
+    if rng.random() < 0.7:  # wall units above a gap
         z, high, deep = h + rng.uniform(0.45, 0.6), rng.uniform(0.4, 0.85), rng.uniform(0.3, 0.38)
         m = int(rng.integers(1, n + 1))
         for k in range(m):
@@ -599,7 +599,7 @@ def kitchen_row(rng: np.random.Generator) -> Piece:
             front = _fronts(rng, unit - 0.008, high - 0.02, 0.01)
             parts.append(front.moved((x, d / 2 - deep, z)))
         surfaces.append(Shelf((m - n) * unit / 2, 0.13, m * unit, deep, z + high, 0.3, 5))
-    elif rng.random() < 0.6:  # or a board with things on it
+    elif rng.random() < 0.6:  # a board with objects
         z = h + rng.uniform(0.35, 0.6)
         parts.append(box(w, 0.22, 0.025, (0, d / 2 - 0.11, z)))
         surfaces.append(Shelf(0, d / 2 - 0.11, w, 0.22, z + 0.025, 0.4, 14))
@@ -607,7 +607,7 @@ def kitchen_row(rng: np.random.Generator) -> Piece:
 
 
 def fridge(rng: np.random.Generator) -> Piece:
-    """Return a fridge, oven tower or locker."""
+    """Return a fridge, an oven tower or a locker."""
     w, d, h = rng.uniform((0.5, 0.55, 0.85), (0.75, 0.72, 2.1))
     split = h * rng.uniform(0.3, 0.7)
     doors = [
@@ -620,7 +620,7 @@ def fridge(rng: np.random.Generator) -> Piece:
 
 
 def counter(rng: np.random.Generator) -> Piece:
-    """Return a bar or island: a body with an overhanging top, often free-standing."""
+    """Return a bar or kitchen island, often free-standing, with an overhanging top."""
     w, d, h = rng.uniform((1.0, 0.4, 0.85), (2.4, 0.9, 1.15))
     body = box(w - 0.1, d * rng.uniform(0.6, 0.95), h - 0.04)
     return Piece(
@@ -629,7 +629,7 @@ def counter(rng: np.random.Generator) -> Piece:
 
 
 def floor_thing(rng: np.random.Generator) -> Piece:
-    """Return what stands on floors: bins, boxes in a pile, plants, lamps, bags, fans, buckets."""
+    """Return an object that stands on the floor, such as a bin, a plant, a lamp or a bucket."""
     kind = rng.choice(5, p=(0.2, 0.35, 0.2, 0.15, 0.1))
     if kind == 0:
         r = rng.uniform(0.12, 0.22)
@@ -653,7 +653,7 @@ def floor_thing(rng: np.random.Generator) -> Piece:
 
 
 def stairs(rng: np.random.Generator) -> Piece:
-    """Return a straight flight of steps that rises towards the back."""
+    """Return a straight flight of stairs that rises towards the back."""
     n, rise, tread = int(rng.integers(3, 11)), rng.uniform(0.16, 0.19), rng.uniform(0.24, 0.3)
     w, d = rng.uniform(0.8, 1.2), n * tread
     steps = [box(w, d - k * tread, rise, (0, k * tread / 2, k * rise)) for k in range(n)]
@@ -662,7 +662,7 @@ def stairs(rng: np.random.Generator) -> Piece:
 
 
 def _fronts(rng: np.random.Generator, w: float, h: float, z: float) -> SyntheticMesh:
-    """Return doors or drawers of a body, in the plane y = 0, from height z on."""
+    """Return doors or drawers of a body in the plane y = 0, above the height `z`."""
     columns = max(1, round(w / rng.uniform(0.4, 0.7)))
     rows = int(rng.choice((1, 1, 2, 3, 4)))
     a, b, gap = w / columns, h / rows, 0.006
@@ -682,7 +682,7 @@ def _slab(x0: float, x1: float, d: float, z: float, t: float) -> SyntheticMesh:
 def _sink(
     rng: np.random.Generator, x0: float, x1: float, d: float, h: float, t: float
 ) -> list[SyntheticMesh]:
-    """Return the worktop around a basin set between x0 and x1, with a tap."""
+    """Return a worktop with a basin between x0 and x1, and a tap."""
     x, w, wide = (x0 + x1) / 2, x1 - x0, rng.uniform(0.09, 0.14)
     rims = [box(w, wide, t, (x, s * (d / 2 - wide / 2 + 0.01) - 0.01, h - t)) for s in (-1, 1)]
     back = d / 2 - 0.06
@@ -690,15 +690,15 @@ def _sink(
     return [*rims, tube(tap, 0.014)]
 
 
-# What belongs to walls: doors, windows and niches cut into them, and things mounted on them.
+# Walls: doors, windows and niches, and objects mounted on walls.
 #
 # Wall, rng  --pierced-->  Wall with openings  --fittings-->  Mesh
 
-DOOR_TOP = 2.03  #: metres; every ceiling is higher
+DOOR_TOP = 2.03  #: height of door openings, metres, below every ceiling
 
 
 def pierced(wall: Wall, rng: np.random.Generator, deepest: float) -> Wall:
-    """Return the wall with doors, windows and niches side by side; `deepest` bounds their depth."""
+    """Return a wall with doors, windows and niches side by side, at most `deepest` metres deep."""
     openings: list[Opening] = []
     u = rng.uniform(0.1, 0.8)
     while u < wall.length - 0.6:
@@ -722,7 +722,7 @@ def pierced(wall: Wall, rng: np.random.Generator, deepest: float) -> Wall:
 
 
 def fittings(wall: Wall, top: Ceiling, rng: np.random.Generator) -> SyntheticMesh:
-    """Return frames, sills, radiators, curtains, skirting, pipes, pictures, boards on one wall."""
+    """Return the frames, radiators, curtains, pipes, pictures and boards of one wall."""
     parts = [m for o in wall.openings for m in _around(o, rng)]
     if rng.random() < 0.5:
         parts += _skirting(wall, rng.uniform(0.04, 0.12))
@@ -737,7 +737,7 @@ def fittings(wall: Wall, top: Ceiling, rng: np.random.Generator) -> SyntheticMes
         elif draw < 0.7:
             parts.append(box(0.08, 0.012, 0.08, (u + wide / 2, 0.006, rng.choice((0.3, 1.1)))))
     if rng.random() < 0.15:
-        z = rng.uniform(0.8, 1.1)  # a duct for cables
+        z = rng.uniform(0.8, 1.1)  # a cable duct
         parts.append(box(wall.length - 0.02, 0.07, 0.13, (wall.length / 2, 0.035, z)))
     frame = np.eye(3)
     frame[:2, 0], frame[:2, 1] = wall.along, wall.inward
@@ -745,7 +745,7 @@ def fittings(wall: Wall, top: Ceiling, rng: np.random.Generator) -> SyntheticMes
 
 
 def overhead(outline: Floats, top: Ceiling, rng: np.random.Generator) -> SyntheticMesh:
-    """Return beams, lamps and pipes under a ceiling (outline (n, 2) of the room, metres)."""
+    """Return beams, lamps and pipes below a ceiling; `outline` (n, 2) of the room, metres."""
     parts: list[SyntheticMesh] = []
     low, high = outline.min(axis=0), outline.max(axis=0)
     middle, span = (low + high) / 2, high - low
@@ -768,7 +768,7 @@ def overhead(outline: Floats, top: Ceiling, rng: np.random.Generator) -> Synthet
 
 
 def radiator(wide: float, high: float, rng: np.random.Generator) -> SyntheticMesh:
-    """Return a ribbed or flat radiator; its back in the plane y = 0, its front towards +y."""
+    """Return a ribbed or flat radiator with its back in the plane y = 0 and its front at +y."""
     if rng.random() < 0.4:
         return box(wide, 0.06, high, (0, 0.07, 0.12))
     ribs = np.arange(-wide / 2 + 0.03, wide / 2, 0.06)
@@ -778,7 +778,7 @@ def radiator(wide: float, high: float, rng: np.random.Generator) -> SyntheticMes
 
 
 def curtain(wide: float, high: float, rng: np.random.Generator) -> SyntheticMesh:
-    """Return a wavy sheet along x, its lower edge on z = 0."""
+    """Return a wavy sheet along x with its lower edge at z = 0."""
     xs = np.linspace(-wide / 2, wide / 2, max(12, int(wide / 0.02)))
     pitch, swing = rng.uniform(0.09, 0.22), rng.uniform(0.02, 0.06)
     phase = 2 * math.pi * xs / pitch + 0.7 * np.sin(xs * rng.uniform(3, 9))
@@ -786,7 +786,7 @@ def curtain(wide: float, high: float, rng: np.random.Generator) -> SyntheticMesh
 
 
 def _around(o: Opening, rng: np.random.Generator) -> list[SyntheticMesh]:
-    """Return frame, sill, bars, radiator, curtains of one opening, in the wall's frame."""
+    """Return the frame, sill, bars, radiator and curtains of an opening, in the wall's frame."""
     middle, wide = (o.start + o.end) / 2, o.end - o.start
     parts: list[SyntheticMesh] = []
     if o.low == 0.0 and o.deep < 0.3:
@@ -816,7 +816,7 @@ def _around(o: Opening, rng: np.random.Generator) -> list[SyntheticMesh]:
 
 
 def _gaps(wall: Wall) -> list[tuple[float, float]]:
-    """Return (start, width) of the stretches between openings that are wider than 0.5 m."""
+    """Return (start, width) of each stretch between openings that is wider than 0.5 m."""
     edges = [0.0, *(u for o in wall.openings for u in (o.start, o.end)), wall.length]
     spans = zip(edges[::2], edges[1::2], strict=True)
     return [(a + 0.1, b - a - 0.2) for a, b in spans if b - a > 0.5]
@@ -835,7 +835,7 @@ def _pictures(u: float, wide: float, rng: np.random.Generator) -> list[Synthetic
 
 
 def _mounted(u: float, wide: float, rng: np.random.Generator) -> SyntheticMesh:
-    """Return a board on brackets with things on it."""
+    """Return a board on brackets with objects on it."""
     w, d, z = min(rng.uniform(0.4, 1.4), wide), rng.uniform(0.15, 0.32), rng.uniform(1.2, 1.8)
     x = u + w / 2 + (wide - w) * rng.random()
     ends = [box(0.02, d * 0.8, 0.15, (x + s * w * 0.4, d * 0.4, z - 0.15)) for s in (-1, 1)]
@@ -857,21 +857,21 @@ def _skirting(wall: Wall, high: float) -> list[SyntheticMesh]:
 
 
 def wall_yaw(wall: Wall) -> float:
-    """Return yaw (radians) that turns a piece's back, +y, to the wall."""
+    """Return the yaw, radians, that turns the back of a piece, +y, to a wall."""
     out = -wall.inward
     return math.atan2(out[1], out[0]) - math.pi / 2
 
 
-# Large things, of halls and of streets: what a laser sees from tens of metres away.
+# Large objects of halls and streets, which a laser sees from tens of metres away.
 #
 # rng  --machine, rack, vehicle, tree, ...-->  Piece
 
-#: lays the z axis along x
+#: Rotation that lays the z axis along x.
 _LYING = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def machine(rng: np.random.Generator) -> Piece:
-    """Return a base that carries cabinets, drums, hoods and pipes."""
+    """Return a base with cabinets, drums, hoods and pipes."""
     w, d = rng.uniform((1.2, 0.8), (6.0, 2.6))
     h = rng.uniform(0.3, 1.3)
     parts = [box(w, d, h)]
@@ -896,7 +896,7 @@ def machine(rng: np.random.Generator) -> Piece:
 
 
 def rack(rng: np.random.Generator) -> Piece:
-    """Return shelving for pallets or boxes, one or more bays wide, partly filled."""
+    """Return a partly filled rack for pallets or boxes with one or more bays."""
     bays, bay = int(rng.integers(1, 6)), rng.uniform(1.2, 2.8)
     d, levels, rise = rng.uniform(0.5, 1.2), int(rng.integers(2, 6)), rng.uniform(0.5, 1.4)
     w, h = bays * bay, levels * rise
@@ -918,7 +918,7 @@ def rack(rng: np.random.Generator) -> Piece:
 
 
 def pile(rng: np.random.Generator) -> Piece:
-    """Return crates or pallets in a heap."""
+    """Return a pile of crates or pallets."""
     a, b, c = rng.uniform((0.6, 0.5, 0.15), (1.6, 1.2, 1.0))
     parts, z = [], 0.0
     for _ in range(int(rng.integers(1, 5))):
@@ -929,7 +929,7 @@ def pile(rng: np.random.Generator) -> Piece:
 
 
 def tank(rng: np.random.Generator) -> Piece:
-    """Return a standing or lying tank, a silo, a reel."""
+    """Return an upright or horizontal tank, a silo or a reel."""
     r, h = rng.uniform(0.3, 1.5), rng.uniform(1.0, 4.0)
     if rng.random() < 0.6:
         mesh = join([cylinder(r, h, 20), cone(r, 0.2 * r, 0.4 * r, 20).moved((0, 0, h))])
@@ -940,7 +940,7 @@ def tank(rng: np.random.Generator) -> Piece:
 
 
 def cabin(rng: np.random.Generator) -> Piece:
-    """Return a room within the room: an office, a booth, a container."""
+    """Return a room within a room: an office, a booth or a container."""
     w, d, h = rng.uniform((2.0, 2.0, 2.2), (8.0, 4.0, 3.2))
     x = rng.uniform(-0.3, 0.3) * w
     door = box(0.95, 0.06, 2.05, (x, -d / 2 - 0.03, 0))
@@ -949,7 +949,7 @@ def cabin(rng: np.random.Generator) -> Piece:
 
 
 def screen(rng: np.random.Generator) -> Piece:
-    """Return a free-standing wall, straight or bent, or a fence of posts and rails."""
+    """Return a free-standing wall, straight or bent, or a fence with posts and rails."""
     w, h = rng.uniform(1.5, 8.0), rng.uniform(0.9, 3.0)
     if rng.random() < 0.6:
         x = np.linspace(-w / 2, w / 2, 4)
@@ -962,7 +962,7 @@ def screen(rng: np.random.Generator) -> Piece:
 
 
 def vehicle(rng: np.random.Generator) -> Piece:
-    """Return a car, a van, a lorry, a fork lift: body, cab, wheels."""
+    """Return a car, van, lorry or forklift with a body, a cab and wheels."""
     kind = int(rng.choice(4, p=(0.55, 0.2, 0.1, 0.15)))
     low = np.array([(3.8, 1.65, 0.6), (4.8, 1.9, 1.4), (6.5, 2.3, 1.0), (1.8, 1.0, 0.9)][kind])
     w, d, h = low * rng.uniform(0.95, 1.15, 3)
@@ -981,7 +981,7 @@ def vehicle(rng: np.random.Generator) -> Piece:
 
 
 def tree(rng: np.random.Generator) -> Piece:
-    """Return a trunk that carries one to four crowns."""
+    """Return a trunk with one to four crowns."""
     h, r = rng.uniform(1.2, 4.0), rng.uniform(0.07, 0.3)
     parts = [cone(r * 1.3, r * 0.8, h + 0.5, 9)]
     for _ in range(int(rng.integers(1, 5))):
@@ -992,13 +992,13 @@ def tree(rng: np.random.Generator) -> Piece:
 
 
 def bush(rng: np.random.Generator) -> Piece:
-    """Return a bush, a flower bed's hedge, a boulder."""
+    """Return a bush, a hedge or a boulder."""
     w, d, h = rng.uniform((0.6, 0.5, 0.4), (3.5, 1.4, 1.8))
     return Piece(blob(rng, (w / 2, d / 2, h / 2), 0.2), w, d)
 
 
 def pole(rng: np.random.Generator) -> Piece:
-    """Return a lamp post, a sign, a bollard."""
+    """Return a lamp post, a sign or a bollard."""
     h, r = rng.uniform(0.7, 6.0), rng.uniform(0.03, 0.14)
     parts = [cylinder(r, h, 10)]
     if h > 2.0 and rng.random() < 0.6:
@@ -1007,7 +1007,7 @@ def pole(rng: np.random.Generator) -> Piece:
 
 
 def person(rng: np.random.Generator) -> Piece:
-    """Return somebody who stands: legs, trunk, head."""
+    """Return a standing person with legs, trunk and head."""
     h = rng.uniform(1.55, 1.9)
     trunk = ellipsoid((0.24, 0.15, 0.3 * h / 1.7), 0.8, 12).moved((0, 0, 0.46 * h))
     legs = [cylinder(0.08, 0.5 * h, 8).moved((s * 0.1, 0.05 * s, 0)) for s in (-1, 1)]

@@ -1,6 +1,6 @@
-"""Large scenes while they are built, and when they are ready: halls, storeys, streets.
+"""Large scenes for laser scans: halls, storeys and blocks of streets.
 
-outline, rng  --Premises-->  what is built, where one can walk, and rays to cast
+outline, rng  --Premises-->  surfaces, walkable floor, and ray casting
 """
 
 from __future__ import annotations
@@ -68,19 +68,19 @@ from sceneprint_lab.synth.rooms import (
 )
 from sceneprint_lab.synth.sensors import Caster
 
-CELL = 0.2  #: metres a cell of the ground's grid
-CLEARANCE = 0.45  #: of a scanner from whatever stands about, metres
+CELL = 0.2  #: side of a cell of the ground's grid, metres
+CLEARANCE = 0.45  #: smallest distance of a scanner from objects, metres
 
 
 @dataclass(frozen=True, eq=False)
 class Premises:
-    """A large scene in which a scanner can be carried about.
+    """A large scene through which a scanner can be carried.
 
     Parameters
     ----------
     kind : "hall", "storey" or "block"
     mesh : all surfaces
-    floor : the ground and what of it is taken
+    floor : the ground and its occupied cells
     """
 
     kind: str
@@ -89,12 +89,12 @@ class Premises:
 
     @cached_property
     def caster(self) -> Caster:
-        """Return the mesh ready for rays; built at the first use."""
+        """Return the ray caster of the mesh, which the first use builds."""
         return Caster(self.mesh)
 
     @cached_property
     def walkable(self) -> NDArray[np.bool_]:
-        """Return (nx, ny) cells of the floor's grid that are clear and hang together."""
+        """Return (nx, ny) whether cells of the floor's grid are clear and connected."""
         clear = ndimage.distance_transform_edt(np.pad(~self.floor.claimed, 1))[1:-1, 1:-1]
         parts, n = ndimage.label(clear * self.floor.cell >= CLEARANCE)
         if n == 0:
@@ -103,11 +103,11 @@ class Premises:
         return np.asarray(parts == 1 + int(sizes.argmax()))
 
 
-# Halls: works, stores, foyers, garages of 15 to 75 m.
+# Halls: factories, stores, foyers and garages of 15 to 75 m.
 #
 # rng  --make_hall-->  Premises
 
-#: what stands along the walls of a hall, what stands free, and how often each
+#: Objects along the walls of a hall and free-standing objects, with weights.
 _KINDS: tuple[tuple[Menu, Menu], ...] = (
     ({machine: 3, rack: 2, pile: 2, tank: 1}, {machine: 5, tank: 1, pile: 2, cabin: 1, person: 1}),
     ({rack: 5, pile: 3, stairs: 1}, {rack: 5, pile: 3, vehicle: 1, person: 1}),
@@ -121,7 +121,7 @@ _KINDS: tuple[tuple[Menu, Menu], ...] = (
 
 
 def make_hall(rng: np.random.Generator) -> Premises:
-    """Return a hall with columns, girders, galleries, doors and what stands about in it."""
+    """Return a hall with columns, girders, galleries, doors and objects."""
     outline = floor_plan(rng) * rng.uniform(4.5, 9.0)
     top = Ceiling(float(rng.uniform(3.5, 12.0)), np.zeros(2))
     walls = [hall_wall(wall, top, rng) for wall in walls_of(outline)]
@@ -142,7 +142,7 @@ def make_hall(rng: np.random.Generator) -> Premises:
 
 
 def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
-    """Return the wall with gates, doors and a row of windows, nothing above anything else."""
+    """Return a wall with gates, doors and a row of windows that do not overlap horizontally."""
     openings, u = [], float(rng.uniform(0.5, 4.0))
     high = min(top.height - 0.5, rng.uniform(3.0, 4.5))
     sill = rng.uniform(0.9, max(1.0, top.height - 2.2))
@@ -168,7 +168,7 @@ def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
 
 
 def _columns(site: Site, outline: Floats) -> list[SyntheticMesh]:
-    """Return a grid of columns, some left out."""
+    """Return a grid of columns with gaps."""
     rng = site.rng
     if rng.random() < 0.2:
         return []
@@ -188,7 +188,7 @@ def _columns(site: Site, outline: Floats) -> list[SyntheticMesh]:
 
 
 def _girders(site: Site, outline: Floats) -> list[SyntheticMesh]:
-    """Return girders under the ceiling, ducts and lamps below them."""
+    """Return girders under the ceiling, with ducts and lamps below them."""
     rng, height = site.rng, site.top.height
     low, high = outline.min(axis=0), outline.max(axis=0)
     size, middle = high - low, (low + high) / 2
@@ -208,7 +208,7 @@ def _girders(site: Site, outline: Floats) -> list[SyntheticMesh]:
 
 
 def _gallery(wall: Wall, site: Site) -> list[SyntheticMesh]:
-    """Return a floor half way up along part of a wall, on posts, with a rail."""
+    """Return a gallery along part of a wall at half height, on posts, with a railing."""
     rng = site.rng
     start = rng.uniform(0.0, 0.4) * wall.length
     long = rng.uniform(0.4, 0.9) * (wall.length - start)
@@ -228,7 +228,7 @@ def _gallery(wall: Wall, site: Site) -> list[SyntheticMesh]:
 
 
 def _pilasters(wall: Wall, site: Site) -> list[SyntheticMesh]:
-    """Return half columns along a wall, where no opening is."""
+    """Return half columns along a wall between its openings."""
     rng = site.rng
     if rng.random() < 0.5:
         return []
@@ -247,12 +247,12 @@ def _pilasters(wall: Wall, site: Site) -> list[SyntheticMesh]:
 #
 # rng  --make_storey-->  Premises
 
-#: what stands along the walls of a room, and how often
+#: Objects along the walls of a room, with weights.
 _ROOMS: tuple[Menu, ...] = (
     {desk: 3, shelf: 2, cupboard: 2}, {cupboard: 2, shelf: 2}, {rack: 3, pile: 2, machine: 1},
     {fridge: 2, cupboard: 3, counter: 1},
 )  # fmt: skip
-#: what stands free in any room
+#: Free-standing objects of any room, with weights.
 _OPEN: Menu = {
     desk: 2,
     table: 3,
@@ -266,7 +266,7 @@ _OPEN: Menu = {
 
 
 def make_storey(rng: np.random.Generator) -> Premises:
-    """Return a storey with one corridor along it, perhaps one across, and rooms off them."""
+    """Return a storey with a long corridor, sometimes a cross corridor, and adjoining rooms."""
     long, wide = float(rng.uniform(20.0, 70.0)), float(rng.uniform(9.0, 26.0))
     outline = _rectangle(0.0, long, 0.0, wide)
     top = Ceiling(float(rng.uniform(2.4, 4.2)), np.zeros(2))
@@ -280,7 +280,7 @@ def make_storey(rng: np.random.Generator) -> Premises:
             continue
         x = 0.0
         while x < long - 2.5:
-            if x <= cross < x + 2.5:  # the corridor across passes here
+            if x <= cross < x + 2.5:  # the cross corridor
                 x = cross + float(rng.uniform(2.0, 3.5))
                 continue
             end = min(x + float(rng.uniform(2.8, 11.0)), long, cross if x < cross else math.inf)
@@ -294,7 +294,7 @@ def make_storey(rng: np.random.Generator) -> Premises:
 
 @contextmanager
 def _kept_free(floor: Floor, place: PiecePose, width: float, depth: float) -> Iterator[None]:
-    """Keep a rectangle free until the context ends."""
+    """Reserve a rectangle of the floor until the context ends."""
     before = floor.claimed.copy()
     floor.take(place, width, depth)
     kept = floor.claimed & ~before
@@ -309,11 +309,11 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:
 def _room(
     extent: tuple[float, float, float, float], side: float, site: Site
 ) -> list[SyntheticMesh]:
-    """Return one room: walls towards the next room and the corridor, a door, furniture."""
+    """Return a room with walls to the next room and the corridor, a door and furniture."""
     x0, x1, y0, y1 = extent
     rng, t = site.rng, float(site.rng.uniform(0.1, 0.3))
     parts = _partition((x1, y0), (x1, y1), t, (), site)
-    if rng.random() < 0.08:  # a niche, open to the corridor
+    if rng.random() < 0.08:  # a niche that is open to the corridor
         return parts
     gap = float(rng.uniform(0.9, 2.2))
     start = float(rng.uniform(0.2, max(0.3, x1 - x0 - gap - 0.3)))
@@ -336,7 +336,7 @@ def _partition(
     a: tuple[float, float], b: tuple[float, float], thick: float,
     gaps: tuple[tuple[float, float], ...], site: Site,
 ) -> list[SyntheticMesh]:  # fmt: skip
-    """Return a wall from a to b up to the ceiling; over its gaps there is a lintel."""
+    """Return a wall from a to b up to the ceiling, with lintels over its gaps."""
     length, yaw = math.dist(a, b), math.atan2(b[1] - a[1], b[0] - a[0])
     along, height = np.array([math.cos(yaw), math.sin(yaw)]), site.top.height
     parts, at = [], 0.0
@@ -356,7 +356,7 @@ def _partition(
 #
 # rng  --make_block-->  Premises
 
-#: what stands about outdoors, and how often
+#: Outdoor objects, with weights.
 _MENUS: tuple[Menu, ...] = (
     {vehicle: 4, tree: 3, pole: 2, bush: 1, screen: 1},
     {tree: 5, bush: 3, pole: 1},
@@ -365,7 +365,7 @@ _MENUS: tuple[Menu, ...] = (
 
 
 def make_block(rng: np.random.Generator) -> Premises:
-    """Return buildings on slightly uneven ground, and what stands between."""
+    """Return buildings on slightly uneven ground with objects between them."""
     half = rng.uniform(25.0, 55.0, 2)
     outline = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
     sky = Ceiling(40.0, np.zeros(2))
@@ -382,7 +382,7 @@ def make_block(rng: np.random.Generator) -> Premises:
 
 
 def _ground(half: Floats, rng: np.random.Generator) -> SyntheticMesh:
-    """Return ground to 60 m beyond the block, sunken here and there by up to 30 cm."""
+    """Return the ground up to 60 m beyond the block, with hollows of up to 30 cm."""
     n = 48
     x = np.linspace(-half[0] - 60, half[0] + 60, n)
     y = np.linspace(-half[1] - 60, half[1] + 60, n)
@@ -397,7 +397,7 @@ def _ground(half: Floats, rng: np.random.Generator) -> SyntheticMesh:
 
 
 def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
-    """Return one building with recessed windows and doors, or none where there is no room."""
+    """Return a building with recessed windows and doors, or nothing if there is no room."""
     rng = site.rng
     w, d, h = rng.uniform((6.0, 5.0, 3.0), (32.0, 16.0, 15.0))
     yaw = main + int(rng.integers(0, 2)) * math.pi / 2 + float(rng.normal(0, 0.02))
@@ -412,7 +412,7 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
     rise, deep = float(rng.uniform(2.7, 3.8)), float(rng.uniform(0.1, 0.4))
     walls = [wall_mesh(facade(wall, h, rise, deep, rng), top) for wall in walls_of(corners)]
     parts = [*walls, roof(w, d, h, rng)]
-    for _ in range(int(rng.integers(0, 5))):  # porches, bays, boxes on the wall
+    for _ in range(int(rng.integers(0, 5))):  # porches, bays and boxes on the wall
         a, b, c = rng.uniform((0.8, 0.5, 0.8), (4.0, 2.0, 3.5))
         side = float(rng.choice((-1, 1)))
         x, y = rng.uniform(-0.5, 0.5) * (w - a), side * (d + b) / 2
@@ -426,7 +426,7 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Generator) -> Wall:
-    """Return the wall with windows in rows, some missing, and doors below."""
+    """Return a wall with rows of windows, some of them missing, and doors below."""
     wide, gap = rng.uniform(0.8, 2.2), rng.uniform(0.6, 3.0)
     high, share = rng.uniform(1.0, 1.8), rng.uniform(0.3, 1.0)
     glass = float(rng.choice((0.3, 0.9)))
@@ -445,7 +445,7 @@ def facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Genera
 
 
 def roof(w: float, d: float, h: float, rng: np.random.Generator) -> SyntheticMesh:
-    """Return a flat roof with eaves, or a gable along x."""
+    """Return a flat roof with eaves, or a gable roof along x."""
     if rng.random() < 0.5:
         return box(w + 0.6, d + 0.6, 0.3, (0, 0, h))
     over, up = d / 2 + 0.4, d * rng.uniform(0.2, 0.5)
@@ -465,16 +465,16 @@ def _garden_wall(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
     return [box(long, thick, h + 0.3, (place.x, place.y, -0.3), yaw)]
 
 
-# Scenes made to be hard: the same from several sides, or the same again and again.
+# Ambiguous scenes with symmetries or repetitions.
 #
 # symmetric_box()  -->  Room      corridor(doors)  -->  Room      rng  --symmetric_hall-->  Premises
 
 
 def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
-    """Return a cube in the middle of the floor of an empty square hall, the origin under it.
+    """Return a cube in the centre of an empty square hall, with the origin under it.
 
-    Turned by 90 degrees about z the scene is the same: which side of the box a view shows
-    cannot be told from the view.
+    A turn of 90 degrees about z maps the scene onto itself, so a view does not determine which
+    side of the cube it shows.
 
     Parameters
     ----------
@@ -488,11 +488,11 @@ def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
 
 
 def symmetric_hall(rng: np.random.Generator) -> Premises:
-    """Return a hall about the origin that half a turn about z maps onto itself, with its contents.
+    """Return a hall and its contents with a symmetry of 180 degrees about z, around the origin.
 
-    The half with x > 0 is built as `make_hall` builds a hall; the other is that half, turned.
+    The half with x > 0 is built like `make_hall`; the other half is its copy.
     """
-    # whole cells of the floor's grid, less what rounding could add
+    # Whole cells of the floor's grid, reduced by more than the rounding errors.
     a, b = (CELL * np.round(rng.uniform((8.0, 5.0), (20.0, 13.0)) / CELL) - 1e-9).tolist()
     outline = _rectangle(-a, a, -b, b)
     top = Ceiling(float(rng.uniform(3.5, 10.0)), np.zeros(2))
@@ -521,19 +521,19 @@ def symmetric_hall(rng: np.random.Generator) -> Premises:
 
 
 def corridor(doors: int, pitch: float = 2.0, width: float = 1.8, height: float = 2.5) -> Room:
-    """Return a corridor along +x with identical doors in both long walls, one every `pitch` metres.
+    """Return a corridor along +x with identical doors in both long walls.
 
-    A view shifted by a pitch sees the same doors; only the ends tell where it is. Wide and high it
-    is a hall of equal bays.
+    Views that differ by a pitch see the same doors; only the ends resolve the position. A wide
+    and high corridor is a hall of equal bays.
 
     Parameters
     ----------
-    doors : doors in each wall, at least 1
-    pitch : distance from door to door, metres
+    doors : number of doors in each wall, at least 1
+    pitch : distance between doors, metres
     width, height : metres
     """
     if doors < 1:
-        raise ValueError(f"A corridor of {doors} doors cannot be built; ask for 1 or more.")
+        raise ValueError(f"A corridor of {doors} doors cannot be built; pass at least 1.")
     length, top = doors * pitch, Ceiling(height, np.zeros(2))
     outline: Floats = np.array([(0, 0), (length, 0), (length, width), (0, width)], float)
     walls = [

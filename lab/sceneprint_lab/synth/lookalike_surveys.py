@@ -1,22 +1,22 @@
-"""Sites scanned by a laser that are mistaken for themselves or for another: bays, streets, halls.
+"""Laser scans of ambiguous sites: bays, streets and halls that resemble themselves or each other.
 
 kind, seed, index  --synthesise_lookalike_survey-->  LookalikeSite: scans of a map, and queries
 
-bays      the map: scans along a hall of equal bays; queries: others from its aisle
-streets   the map: scans along a street of equal blocks; queries: others from its carriageway
-halls     the map: a walk in a hall that half a turn maps onto itself but for one to three things;
-          queries: other scans (of four sites two: the map is of one half, the queries of the other,
-          and as many things differ as tell them apart)
-unmapped  the map: all halls but one of a row of equal ones (of four sites two: one of two equal
-          streets); queries: scans of the one that is left out
-absent    the map: an ordinary hall and ordinary blocks; queries: other halls, storeys and blocks
-sites     the map: every second to fourth scan of a walk in an ordinary hall, storey or block;
-          queries: others, every third of them some metres beside the walk
+bays      map: scans along a hall of equal bays; queries: other scans from its aisle
+streets   map: scans along a street of equal blocks; queries: other scans from its carriageway
+halls     map: a walk in a hall with a symmetry of 180 degrees, except for one to three details;
+          queries: other scans (of every four sites, two map one half and query the other, with
+          enough details to distinguish the halves)
+unmapped  map: all halls of a row of equal halls except one (of every four sites, two use two equal
+          streets); queries: scans of the omitted one
+absent    map: an ordinary hall and ordinary blocks; queries: other halls, storeys and blocks
+sites     map: every second to fourth scan of a walk in an ordinary hall, storey or block;
+          queries: other scans, every third of them some metres beside the walk
 
-Every third site (indices 2, 5, ...) is scanned by a `Rosette`, which sees 60 to 80 degrees; the
-others by a `Spinning`. The maps of odd sites have poses that drift: a random walk of 1 to 5 cm and
-.02 to .1 degrees a scan. Every third map (indices 1, 4, ...) lacks scans: a stretch of a sixth of
-them, and one in ten of the others.
+A `Rosette` with a view of 60 to 80 degrees scans every third site (indices 2, 5, ...), a `Spinning`
+the others. Odd sites have maps with drifting poses: a random walk, 1 to 5 cm and .02 to .1 degrees
+per scan. Every third map (indices 1, 4, ...) lacks one stretch of a sixth of its scans, and one in
+ten of the other scans.
 """
 
 from __future__ import annotations
@@ -83,18 +83,18 @@ from sceneprint_lab.synth.sensors import Caster, Rosette, Scanner, own_rosette, 
 from sceneprint_lab.synth.trajectories import scanner_pose, walk
 
 SURVEYED_KINDS = ("bays", "streets", "halls", "unmapped", "absent", "sites")
-#: scans of a map, before some are left out
+#: Number of scans of a map before some are removed.
 MAP_SCANS = 30
 
 
 class Stop(NamedTuple):
-    """Where a scan is to be taken.
+    """Location of a scan.
 
     Parameters
     ----------
-    premises : what is scanned
+    premises : scanned premises
     T : (4, 4) T_premises_sensor
-    origin : (3,) of the premises in the world, metres
+    origin : (3,) origin of the premises in the world, metres
     """
 
     premises: Premises
@@ -103,14 +103,14 @@ class Stop(NamedTuple):
 
     @property
     def pose(self) -> Floats:
-        """Return (4, 4) T_world_sensor."""
+        """Return T_world_sensor (4, 4)."""
         T = self.T.copy()
         T[:3, 3] += self.origin
         return T
 
 
 class Round(NamedTuple):
-    """Where the scans of a site are to be taken: those of the map in the order of a walk."""
+    """Locations of a site's scans; those of the map are in the order of a walk."""
 
     map: list[Stop]
     queries: list[Stop]
@@ -119,22 +119,22 @@ class Round(NamedTuple):
 def synthesise_lookalike_survey(
     kind: str, seed: int, index: int, *, queries: int = 12, perfect: bool = False
 ) -> LookalikeSite[Cloud]:
-    """Build a site that looks like itself or like another, and scan it.
+    """Build an ambiguous site and scan it.
 
-    The outcome depends on the arguments only. Where the poses of the map drift, that of a query is
-    given by the scan of the map nearest to it: it is where the query lies in the map as it is.
+    The result depends only on the arguments. If the poses of the map drift, the pose of a query
+    has the drift of the nearest scan of the map.
 
     Parameters
     ----------
     kind : one of SURVEYED_KINDS
     seed, index : the site is number `index` of its kind in the collection `seed`
-    queries : how many of them
-    perfect : whether the scanner makes no errors and loses nothing, and the map's poses are true
+    queries : number of queries
+    perfect : whether the scanner has no errors and loses no returns, and the map's poses are exact
 
     Raises
     ------
-    MissingDependency : Embree cannot be imported.
-    ValueError : there is no such kind.
+    MissingDependency : If Embree cannot be imported.
+    ValueError : If the kind does not exist.
     """
     if kind not in SURVEYED_KINDS:
         known = ", ".join(SURVEYED_KINDS)
@@ -170,7 +170,7 @@ def synthesise_lookalike_survey(
 
 
 def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
-    """Return all but a stretch of a sixth, and but one in ten of the others."""
+    """Remove a stretch of a sixth of the stops, and one in ten of the others."""
     gap = len(stops) // 6
     start = int(rng.integers(1, len(stops) - gap))
     return [
@@ -181,10 +181,10 @@ def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
 
 
 def drifted(poses: Floats, rng: np.random.Generator) -> Floats:
-    """Return (n, 4, 4) the poses of a walk as odometry gives them: each step is a little off.
+    """Return the poses (n, 4, 4) of a walk with the drift of odometry.
 
-    The first is true. Steps are off by a normal error whose standard deviation, 1 to 5 cm and .02
-    to .1 degrees along and about each axis, the walk has in common.
+    The first pose is exact. Each step has a normal error. Its standard deviation, 1 to 5 cm and .02
+    to .1 degrees along and about each axis, is the same for the whole walk.
     """
     metres, radians = rng.uniform(0.01, 0.05), math.radians(rng.uniform(0.02, 0.1))
     found = [poses[0]]
@@ -198,22 +198,22 @@ def drifted(poses: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _in_map(T: Floats, true: Floats, recorded: Floats) -> Floats:
-    """Return the pose that the nearest scan of the map, as recorded, gives to a true one."""
+    """Return a true pose with the drift of the nearest scan of the recorded map."""
     nearest = int(np.linalg.norm(true[:, :3, 3] - T[:3, 3], axis=1).argmin())
     placed: Floats = recorded[nearest] @ inverse(true[nearest]) @ T
     return placed
 
 
-def told_apart(here: Stop, other: Premises, T: Floats, sensor: Scanner) -> float:
-    """Return share of a scan that another place shows otherwise from an equal pose.
+def distinct_fraction(here: Stop, other: Premises, T: Floats, sensor: Scanner) -> float:
+    """Return the fraction of a scan that differs at another place from an equal pose.
 
-    Of about a thousand rays within 40 m, those whose ranges differ by more than 30 cm + 2 %.
+    About a thousand rays within 40 m are compared; a difference of ranges counts above 30 cm + 2 %.
 
     Parameters
     ----------
-    here : a scan
-    other, T : the other place, and the pose there
-    sensor : what scans
+    here : location of the scan
+    other, T : other place, and the pose there
+    sensor : scanner
     """
     rays = sensor.rays(np.random.default_rng(0))
     rays = rays[:: max(1, len(rays) // 1000)]
@@ -231,48 +231,50 @@ def _most_different(
     stops: Sequence[Stop], rivals: Callable[[Stop], list[tuple[Premises, Floats]]], n: int,
     sensor: Scanner,
 ) -> tuple[list[Stop], float]:  # fmt: skip
-    """Return n stops that differ from each rival by TOLD_SHARE, or the n that differ most.
+    """Return n stops that differ from each rival by TOLD_SHARE, or else the n most different stops.
 
     Returns
     -------
-    stops : n
-    least : of their shares
+    stops : n stops
+    least : smallest fraction of their scans that differs from a rival
     """
-    shares = [min(told_apart(stop, *rival, sensor) for rival in rivals(stop)) for stop in stops]
+    shares = [
+        min(distinct_fraction(stop, *rival, sensor) for rival in rivals(stop)) for stop in stops
+    ]
     fair = [k for k, share in enumerate(shares) if share >= TOLD_SHARE]
     if len(fair) < n:
         fair = sorted(range(len(stops)), key=lambda k: -shares[k])
     return [stops[k] for k in sorted(fair[:n])], min(shares[k] for k in fair[:n])
 
 
-# What is repeated: a bay of a hall, a block of a street.
+# Repeated units: a bay of a hall, a block of a street.
 #
 # rng  --bay, block-->  Unit        Unit, count, Likeness, rng  --row_of-->  Premises
 
-#: what stands in the bays of a hall: a store, works, a car park
+#: Objects in the bays of a store, a factory and a car park, with weights.
 _BAYS: tuple[Menu, ...] = (
     {rack: 4, pile: 3, screen: 1, cabin: 1},
     {machine: 4, tank: 2, rack: 1, pile: 1, screen: 1},
     {vehicle: 6, pole: 1, person: 1},
 )
-#: what stands before the houses of a street
+#: Objects in front of the houses of a street, with weights.
 _FRONTS: Menu = {vehicle: 4, tree: 3, pole: 2, bush: 2, screen: 1}
-#: what people or the wind move
+#: Objects that people or the wind move.
 _LOOSE = (vehicle, pile, person)
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """What repeats along +x, on both sides of a way along y = 0 that is clear.
+    """A unit that repeats along +x, on both sides of a clear path along y = 0.
 
     Parameters
     ----------
-    kind : "hall" or "block", as of Premises
+    kind : "hall" or "block", as in Premises
     pitch : length of a copy along x, metres
-    half_way : half the width of the way, metres
-    built : the same in all copies; x from 0 to pitch
-    things : what stands about in a copy
-    around : gives what surrounds so many copies, as floor and end walls
+    half_way : half the width of the path, metres
+    built : surfaces that all copies share, with x from 0 to pitch
+    things : objects of a copy
+    around : function that returns the surroundings of a number of copies: floor and end walls
     """
 
     kind: str
@@ -284,7 +286,7 @@ class Unit:
 
 
 def bay(rng: np.random.Generator) -> Unit:
-    """Return a bay of a hall: pillars, a girder, perhaps walls; racks, machines or cars."""
+    """Return a bay of a hall with pillars, a girder, walls or none, and racks, machines or cars."""
     pitch, half_way, side = rng.uniform((4.5, 1.5, 4.0), (10.0, 3.5, 12.0)).tolist()
     half, size = half_way + side, float(rng.uniform(0.25, 0.8))
     top = Ceiling(float(rng.uniform(3.0, 9.0)), np.zeros(2))
@@ -299,7 +301,7 @@ def bay(rng: np.random.Generator) -> Unit:
     menu = _BAYS[int(rng.integers(0, len(_BAYS)))]
     sides = [_strip(0.2, pitch - 0.2, s, half_way + size, half - 0.1) for s in (-1, 1)]
     things = [one for outline in sides for one in stand_about(menu, Floor(outline, CELL), rng, 12)]
-    # openings of the walls along the bays and at both ends, in the order of `walls_of`
+    # Openings of the walls along the bays and at both ends, in the order of `walls_of`.
     pierced = [
         hall_wall(Wall(np.zeros(2), np.array([1.0, 0.0]), length), top, rng).openings
         for length in (pitch, 2 * half, pitch, 2 * half)
@@ -317,7 +319,7 @@ def bay(rng: np.random.Generator) -> Unit:
 
 
 def block(rng: np.random.Generator) -> Unit:
-    """Return a house on either side of a street, and what stands before it."""
+    """Return houses on both sides of a street, with objects in front of them."""
     pitch, half_way, front, deep = rng.uniform((9.0, 2.5, 2.5, 8.0), (20.0, 5.0, 6.0, 14.0))
     gap = 0.0 if rng.random() < 0.5 else float(rng.uniform(1.5, 5.0))
     half, parts, things = half_way + front + deep, [], []
@@ -342,7 +344,7 @@ def block(rng: np.random.Generator) -> Unit:
 
 
 def _house(w: float, d: float, rng: np.random.Generator) -> SyntheticMesh:
-    """Return a house about the origin, its front, with steps or porches, towards -y."""
+    """Return a house around the origin; its front, with steps or porches, faces -y."""
     h, rise, deep = rng.uniform((4.0, 2.7, 0.1), (14.0, 3.8, 0.4)).tolist()
     corners = np.array([(-w, -d), (-w, d), (w, d), (w, -d)]) / 2  # clockwise: walls face outward
     top = Ceiling(h, np.zeros(2))
@@ -357,7 +359,7 @@ def _house(w: float, d: float, rng: np.random.Generator) -> SyntheticMesh:
 def stand_about(
     menu: Menu, floor: Floor, rng: np.random.Generator, tries: int
 ) -> list[PlacedPiece]:
-    """Return pieces square to a floor, where there is room for them; it is claimed."""
+    """Return pieces aligned with the floor on free places, which they then occupy."""
     makers, weights = list(menu), np.array(list(menu.values()), float)
     placed = []
     for _ in range(tries):
@@ -375,7 +377,7 @@ def stand_about(
 
 
 def row_of(unit: Unit, count: int, likeness: Likeness, rng: np.random.Generator) -> Premises:
-    """Return copies of a unit along +x from the origin; their way is the floor to walk on."""
+    """Return copies of a unit along +x from the origin; their path is the walkable floor."""
     parts = [unit.around(count)]
     for k in range(count):
         things = furnish(unit.things, 0, likeness, rng)
@@ -397,36 +399,36 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:
 
 
 def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
-    """Return (4, 2) a rectangle on one side of the x axis, from `near` to `far` away from it."""
+    """Return a rectangle (4, 2) on one side of the x axis, from `near` to `far` away from it."""
     return _rectangle(x0, x1, *sorted((side * near, side * far)))
 
 
-# Where the scans are taken.
+# Locations of the scans.
 #
 # rng, index, queries, Scanner  --_ROUNDS[kind]-->  Round
 
 
 def _likeness(rng: np.random.Generator) -> Likeness:
-    """Return how copies differ: by some centimetres, and by what people move or take away."""
+    """Return the differences between copies: a few centimetres, and moved or removed objects."""
     shift, missing = rng.uniform((0.0, 0.0), (0.1, 0.2)).tolist()
     return Likeness(shift, 0.02, float(rng.uniform(0.1, 0.6)), missing=missing)
 
 
 class _Carrier:
-    """Whoever carries the scanner along a row: how high, and how it is mounted."""
+    """Height and mounting of a scanner that is carried along a row."""
 
     def __init__(self, unit: Unit, count: int, sensor: Scanner, rng: np.random.Generator) -> None:
         self.length, self.rng = unit.pitch * count, rng
-        self.reach = unit.half_way - 0.5  # to either side of the middle of the way
+        self.reach = unit.half_way - 0.5  # distance from the centre line of the path
         self.height = float(rng.uniform(0.5, 1.9))
         self.sees_back = not isinstance(sensor, Rosette)
-        # what sees around may be turned anyhow, what does not looks ahead
+        # A scanner with a full view has any heading, one with a partial view looks ahead.
         self.mounted = float(
             rng.uniform(-math.pi, math.pi) if self.sees_back else rng.normal(0, 0.3)
         )
 
     def along(self, n: int) -> list[Floats]:
-        """Return n poses from end to end, winding a little."""
+        """Return n poses from end to end along a slightly winding path."""
         x = np.linspace(1.5, self.length - 1.5, n)
         phase, waves = self.rng.uniform(0, 2 * math.pi), self.rng.uniform(0.5, 3.0)
         y = 0.5 * self.reach * np.sin(phase + 2 * math.pi * waves * x / self.length)
@@ -437,7 +439,7 @@ class _Carrier:
         ]
 
     def anywhere(self, n: int) -> list[Floats]:
-        """Return n poses on all of the way; of scanners that see all around, some face back."""
+        """Return n poses anywhere on the path; some scanners with a full view face back."""
         rng = self.rng
         x = rng.uniform(1.5, self.length - 1.5, n)
         y = rng.uniform(-self.reach, self.reach, n)
@@ -471,12 +473,12 @@ def _streets(rng: np.random.Generator, index: int, queries: int, sensor: Scanner
 
 
 def _another(index: int) -> bool:
-    """Return whether a site is of the second sort of its kind."""
+    """Return whether a site is of the second variant of its kind."""
     return index % 4 in (1, 2)
 
 
 def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:
-    """Leave one of some equal rows out, which differs in sight from all of the map."""
+    """Omit one of some equal rows, with queries that visibly differ from all of the map."""
     street = _another(index)
     unit = block(rng) if street else bay(rng)
     rows, count = (2, int(rng.integers(4, 7))) if street else (3, int(rng.integers(2, 4)))
@@ -505,7 +507,7 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
 
 
 def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:
-    """Map a hall with one to three details, or one half with as many as tell it apart."""
+    """Map a hall with one to three details, or one half with enough details to distinguish it."""
     hall = _with_details(symmetric_hall(rng), rng)
     if not _another(index):
         return _walked(hall, rng, queries)
@@ -528,10 +530,10 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
-    """Return the hall with up to three things more; their places are taken on both sides of it."""
+    """Return the hall with up to three more objects, whose places are occupied in both halves."""
     menu: Menu = {pile: 2, person: 1, cabin: 2, screen: 2, tank: 1, machine: 1}
     things = furnish(stand_about(menu, hall.floor, rng, 3), 0, Likeness(), rng)
-    # whoever can walk somewhere can walk there after half a turn
+    # A walkable place must remain walkable after half a turn.
     hall.floor.claimed[:] |= hall.floor.claimed[::-1, ::-1]
     return Premises("hall", join([hall.mesh, things]), hall.floor)
 
@@ -550,7 +552,7 @@ def _walked(premises: Premises, rng: np.random.Generator, queries: int) -> Round
 
 
 def _beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
-    """Return the pose 1 to 4 m aside, where one can walk, and turned by up to about 20 degrees."""
+    """Return a walkable pose 1 to 4 m beside another, turned by up to about 20 degrees."""
     spots = premises.floor.points[premises.walkable]
     away = np.linalg.norm(spots - T[:2, 3], axis=1)
     spots = spots[(away > 1.0) & (away < 4.0)]
@@ -567,7 +569,7 @@ def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:  # noqa: ARG001
-    """Return sites that have nothing to do with each other, 200 m apart."""
+    """Return sites without common content, 200 m apart."""
     places = [(make(rng), (200.0 * k, 0.0, 0.0)) for k, make in enumerate((make_hall, make_block))]
     of_map = [
         Stop(premises, T, origin)

@@ -1,19 +1,19 @@
-"""Sites made to be mistaken for themselves or for another: symmetric objects, repeated rooms.
+"""Depth frames of ambiguous places: symmetric objects and repeated rooms.
 
 kind, seed, index  --synthesise_lookalike-->  LookalikeSite: frames of a map, and queries
 
-object    the map: every fourth view of a circle around a symmetric object on a bare floor;
+object    map: every fourth view of a circle around a symmetric object on a bare floor;
           queries: other views of the circle
-offices   the map: all rooms of a row of equal ones (odd numbers: all bays of a hall);
+offices   map: all rooms of a row of equal rooms (odd numbers: all bays of a hall);
           queries: other views of them
-unmapped  the map: all rooms of such a row but one; queries: views of that one
-kitchens  the map: one kitchen; queries: another with the same furniture, arranged alike
-opposite  the map: furniture in a room, from one side; queries: from the other side
-absent    the map: rooms and an object; queries: other rooms and another object
+unmapped  map: all rooms of such a row except one; queries: views of the omitted room
+kitchens  map: one kitchen; queries: another kitchen with the same furniture in the same order
+opposite  map: furniture in a room, from one side; queries: from the other side
+absent    map: rooms and an object; queries: other rooms and another object
 
-and ordinary places, to compare with:
+and, for comparison, ordinary places:
 
-rooms     the map: a few different rooms; queries: other views of them
+rooms     map: a few different rooms; queries: other views of them
 """
 
 from __future__ import annotations
@@ -65,29 +65,29 @@ from sceneprint_lab.synth.sensors import KINECT_V1, KinectNoise
 from sceneprint_lab.synth.trajectories import orbit, scattered_poses
 
 KINDS = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")
-#: Kinds of which no two places look alike.
+#: Kinds without similar places.
 ORDINARY = ("rooms",)
-#: kinds of which nothing in the map is the query's place
+#: Kinds whose maps do not contain the place of the query.
 ELSEWHERE = ("unmapped", "kitchens", "absent")
-#: of those, kinds whose queries have a parent frame of their own
+#: Kinds of ELSEWHERE whose queries have their own parent frame.
 APART = ("kitchens", "absent")
 
 
-#: DepthFrame or Cloud
+#: DepthFrame or Cloud.
 F_co = TypeVar("F_co", bound=AnyFrame, covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
 class LookalikeSite(Generic[F_co]):
-    """A map and queries that it may be mistaken about.
+    """A map with ambiguous queries.
 
     Parameters
     ----------
-    name : "object-000" and so on
+    name : name such as "object-000"
     kind : one of KINDS, or of `lookalike_surveys.SURVEYED_KINDS`
-    seed, index : what it was made from
-    map, queries : depth in whole millimetres where noisy, and T_world_camera; or clouds
-    present : whether the queries were taken at a place of the map
+    seed, index : arguments that the site was generated from
+    map, queries : depth frames with T_world_camera, in whole millimetres with noise; or clouds
+    present : whether the queries show places of the map
     """
 
     name: str
@@ -100,13 +100,13 @@ class LookalikeSite(Generic[F_co]):
 
     @property
     def same_frame(self) -> bool:
-        """Return whether map and queries have one parent frame, so that poses can be compared."""
+        """Return whether map and queries have the same parent frame, so poses are comparable."""
         return self.kind not in APART
 
 
 @dataclass(frozen=True, eq=False)
 class Shoot:
-    """Where a site's frames are to be taken: a scene with each T_world_camera, in order."""
+    """Scenes and T_world_camera of a site's frames, in order."""
 
     map: Sequence[tuple[Room, Floats]]
     queries: Sequence[tuple[Room, Floats]]
@@ -117,21 +117,21 @@ def synthesise_lookalike(
     kind: str, seed: int, index: int, *, queries: int = 12, noise: KinectNoise | None = KINECT_V1,
     intrinsics: Intrinsics = KINECT,
 ) -> LookalikeSite[DepthFrame]:  # fmt: skip
-    """Build a site that looks like itself or like another, and take depth frames of it.
+    """Build an ambiguous site and take depth frames of it.
 
-    The outcome depends on the arguments only.
+    The result depends only on the arguments.
 
     Parameters
     ----------
     kind : one of KINDS
     seed, index : the site is number `index` of its kind in the collection `seed`
-    queries : how many of them
-    noise : the sensor; None gives ideal depth
+    queries : number of queries
+    noise : sensor noise; None for ideal depth
 
     Raises
     ------
-    MissingDependency : Embree cannot be imported.
-    ValueError : there is no such kind.
+    MissingDependency : If Embree cannot be imported.
+    ValueError : If the kind does not exist.
     """
     kinds = KINDS + ORDINARY
     if kind not in kinds:
@@ -165,7 +165,7 @@ def synthesise_lookalike(
 
 
 def worn(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
-    """Return a worse one that sees less far, as depth cameras of other makes do."""
+    """Return a worse sensor with a shorter range, like depth cameras of other makes."""
     s = float(rng.uniform(1.0, 2.0))
     return replace(
         sensor, disparity_sigma=sensor.disparity_sigma * s, warp=sensor.warp * s * 1.5,
@@ -174,20 +174,20 @@ def worn(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
     )  # fmt: skip
 
 
-# Objects that are the same from several sides, but for details.
+# Objects that are symmetric except for details.
 #
 # rng  --symmetric_object-->  SymmetricObject
 
 
 @dataclass(frozen=True, eq=False)
 class SymmetricObject:
-    """An object that stands on z = 0 about the z axis.
+    """A symmetric object that stands on z = 0 around the z axis.
 
     Parameters
     ----------
-    body : unchanged by a turn of 2 pi / order about z
-    details : what breaks the symmetry, a few centimetres or less
-    order : of the symmetry
+    body : mesh that is invariant to a turn of 2 pi / order about z
+    details : mesh of a few centimetres or less that breaks the symmetry
+    order : order of the symmetry
     """
 
     body: SyntheticMesh
@@ -196,14 +196,14 @@ class SymmetricObject:
 
     @property
     def mesh(self) -> SyntheticMesh:
-        """Return body and details as one mesh."""
+        """Return body and details as a single mesh."""
         return join([self.body, self.details])
 
 
 def cabinet(rng: np.random.Generator) -> SymmetricObject:
-    """Return a cabinet with the same doors on both long sides; one has a handle, a gap, a cable.
+    """Return a cabinet with the same doors on both long sides and details on one of them.
 
-    On a plinth or on legs; most carry a narrower upper part.
+    It stands on a plinth or on legs; most have a narrower upper part.
     """
     w, d, h = rng.uniform((0.6, 0.35, 0.5), (1.3, 0.65, 1.1))
     foot, over = rng.uniform(0.03, 0.16), rng.uniform(0.0, 0.03)
@@ -223,20 +223,20 @@ def cabinet(rng: np.random.Generator) -> SymmetricObject:
     if rng.random() < 0.7:
         a, b, c = rng.uniform((0.4, 0.4, 0.15), (0.8, 0.85, 0.5)) * (w, d, 1.0)
         parts.append(box(a, b, c, (0, 0, h + 0.02)))
-        if rng.random() < 0.5:  # and a board on it
+        if rng.random() < 0.5:  # a board on it
             parts.append(box(a + 0.12, b + 0.08, 0.03, (0, 0, h + c + 0.02)))
     return SymmetricObject(join(parts), _details(rng, w, d + 2 * t, h), 2)
 
 
 def four_legs(rng: np.random.Generator) -> SymmetricObject:
-    """Return a table on four legs, with an apron; a cable, something left on it."""
+    """Return a table with four legs and an apron; a cable or a left object breaks its symmetry."""
     w, h = rng.uniform(0.6, 1.3), rng.uniform(0.45, 0.78)
     d = w if rng.random() < 0.5 else w * rng.uniform(0.5, 0.8)
     t, inset = rng.uniform(0.04, 0.09), rng.uniform(0.0, 0.05)
     x, y = (w - t) / 2 - inset, (d - t) / 2 - inset
     parts = [box(t, t, h - 0.03, (a * x, b * y, 0)) for a in (-1, 1) for b in (-1, 1)]
     parts += [box(w, d, 0.03, (0, 0, h - 0.03)), box(2 * x, 2 * y, 0.07, (0, 0, h - 0.1))]
-    found = [box(0.02, 0.02, h - 0.05, (x + t / 2, y, 0.0))]  # a cable's duct along one leg
+    found = [box(0.02, 0.02, h - 0.05, (x + t / 2, y, 0.0))]  # a cable duct along one leg
     if rng.random() < 0.5:
         at = rng.uniform(-0.3, 0.3, 2) * (w, d)
         found.append(small_flat(rng).moved((*at, h), rng.uniform(0, 3)))
@@ -244,7 +244,7 @@ def four_legs(rng: np.random.Generator) -> SymmetricObject:
 
 
 def column(rng: np.random.Generator) -> SymmetricObject:
-    """Return a round or square column on a wider foot; a duct, a socket, a dent."""
+    """Return a round or square column on a wider foot, with a duct, a socket or a dent."""
     size, h, foot = rng.uniform(0.3, 0.65), 2.6, rng.uniform(0.05, 0.3)
     is_round, wider = rng.random() < 0.4, rng.uniform(0.02, 0.08)
     if is_round:
@@ -258,7 +258,7 @@ def column(rng: np.random.Generator) -> SymmetricObject:
 
 
 def double_sofa(rng: np.random.Generator) -> SymmetricObject:
-    """Return seats on both sides of one back; a blanket or cushion lies on one."""
+    """Return seats on both sides of a common back, with a blanket or cushion on one side."""
     w, d, h = rng.uniform((0.9, 0.9, 0.36), (1.8, 1.3, 0.46))
     arm, rise, soft = rng.uniform(0.1, 0.2), rng.uniform(0.25, 0.45), rng.uniform(0.15, 0.4)
     seat = ellipsoid(((w - 2 * arm) / 2, d / 4, 0.09), soft, 20).moved((0, -d / 4, h - 0.14))
@@ -273,12 +273,12 @@ def double_sofa(rng: np.random.Generator) -> SymmetricObject:
 
 
 def small_flat(rng: np.random.Generator) -> SyntheticMesh:
-    """Return something flat that was left lying: a book, a tablet, a pile of paper."""
+    """Return a flat object, such as a book, a tablet or a stack of paper."""
     return box(rng.uniform(0.12, 0.3), rng.uniform(0.1, 0.22), rng.uniform(0.008, 0.03))
 
 
 def _details(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticMesh:
-    """Return one to four things on one long side, y = -d / 2, of a cabinet, or on its top."""
+    """Return one to four details on the side y = -d / 2 or the top of a cabinet."""
     makers: list[Callable[[], SyntheticMesh]] = [
         lambda: box(0.14, 0.025, 0.02, (rng.uniform(-0.4, 0.4) * w, -d / 2, h * 0.6)),
         lambda: box(0.02, 0.006, h * 0.8, (rng.uniform(-0.4, 0.4) * w, -d / 2, h * 0.1)),
@@ -297,7 +297,7 @@ def _cable(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticM
 
 
 def _bump(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticMesh:
-    """Return a dent beaten outward: a flat cap of 4 to 10 mm."""
+    """Return a bump in sheet metal: a flat cap of 4 to 10 mm."""
     out = rng.uniform(0.004, 0.01)
     cap = ellipsoid((rng.uniform(0.03, 0.1), out, rng.uniform(0.03, 0.1)), 1.0, 12)
     return cap.moved((rng.uniform(-0.3, 0.3) * w, -d / 2, h * rng.uniform(0.2, 0.7)))
@@ -313,7 +313,7 @@ def symmetric_object(rng: np.random.Generator) -> SymmetricObject:
 
 
 def bare_floor(thing: SyntheticMesh, rng: np.random.Generator, half: float = 8.0) -> Room:
-    """Return a thing in the middle of a floor, dull or shiny, and nothing else."""
+    """Return an object in the middle of a dull or shiny floor, without anything else."""
     outline = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     floor = mesh_of(np.c_[outline, np.zeros(4)], [(0, 1, 2), (0, 2, 3)])
     mesh = join([floor.with_loss(float(rng.uniform(0.0, 0.2))), thing])
@@ -334,20 +334,20 @@ def _circled_object(rng: np.random.Generator, index: int, queries: int) -> Shoot
 def _every_fourth(
     room: Room, poses: Sequence[Floats], queries: int, rng: np.random.Generator
 ) -> Shoot:
-    """Return every fourth pose for the map, and so many of the others as queries."""
+    """Use every fourth pose for the map, and a number of the other poses as queries."""
     others = [k for k in range(len(poses)) if k % 4]
     chosen = sorted(rng.choice(others, min(queries, len(others)), replace=False).tolist())
     return Shoot([(room, T) for T in poses[::4]], [(room, poses[k]) for k in chosen])
 
 
-# Rooms that are furnished alike: the same pieces at nearly the same places.
+# Rooms with the same furniture at almost the same places.
 #
 # rng, Likeness  --equal_offices | equal_bays-->  rooms
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedPiece:
-    """A piece that stands somewhere; `loose` ones are moved by whoever uses the room."""
+    """A piece at a place; occupants of the room move `loose` ones."""
 
     piece: Piece
     place: PiecePose
@@ -356,14 +356,14 @@ class PlacedPiece:
 
 @dataclass(frozen=True)
 class Likeness:
-    """How alike two copies of a room are.
+    """Parameters of the differences between copies of a room.
 
     Parameters
     ----------
-    shift, turn : standard deviation by which pieces stand elsewhere, metres and radians
-    loose_shift : of chairs and boxes, metres
-    same_load : chance that the same things lie on a piece
-    missing : chance that a piece is not there
+    shift, turn : standard deviation of the place of pieces, metres and radians
+    loose_shift : standard deviation of the place of chairs and boxes, metres
+    same_load : probability that copies have the same objects on a piece
+    missing : probability that a piece is missing
     """
 
     shift: float = 0.0
@@ -382,9 +382,9 @@ def arrange(
     walls: Sequence[Wall], floor: Floor, pieces: Sequence[Piece], middle: Piece | None,
     rng: np.random.Generator,
 ) -> list[PlacedPiece]:  # fmt: skip
-    """Place pieces side by side along the walls, one in the middle, chairs and boxes about.
+    """Place pieces side by side along walls, one in the middle, and chairs and boxes around them.
 
-    The walls are those of a rectangle, counter-clockwise; what has no room is left out.
+    The walls form a rectangle, counter-clockwise; pieces that do not fit are omitted.
     """
     placed: list[PlacedPiece] = []
     ends = [0.15] * len(walls)
@@ -424,14 +424,14 @@ def _loose(piece: Piece, at: Floats, yaw: float, floor: Floor) -> list[PlacedPie
 def furnish(
     placed: Sequence[PlacedPiece], seed: int, likeness: Likeness, rng: np.random.Generator
 ) -> SyntheticMesh:
-    """Return the pieces of one copy, each a little off its place, with what lies on them.
+    """Return the pieces of one copy, each slightly displaced, with the objects on them.
 
     Parameters
     ----------
-    placed : of the arrangement that all copies share
-    seed : of the things that copies have in common
-    likeness : how much they have in common
-    rng : of this copy
+    placed : arrangement that all copies share
+    seed : seed of the objects that copies share
+    likeness : differences between copies
+    rng : generator of this copy
     """
     parts = []
     for number, one in enumerate(placed):
@@ -449,12 +449,12 @@ def furnish(
 
 
 def rectangle(width: float, depth: float) -> Floats:
-    """Return (4, 2) corners of a room from the origin, counter-clockwise, metres."""
+    """Return the corners (4, 2) of a room from the origin, counter-clockwise, metres."""
     return np.array([(0, 0), (width, 0), (width, depth), (0, depth)], float)
 
 
 def _closed(outline: Floats, rng: np.random.Generator, height: float) -> tuple[SyntheticMesh, ...]:
-    """Return shell, fittings and what hangs from the ceiling."""
+    """Return the shell, the fittings and the objects on the ceiling."""
     top = Ceiling(height, np.zeros(2))
     walls = [pierced(wall, rng, 0.3) for wall in walls_of(outline)]
     fitted = [fittings(wall, top, rng) for wall in walls]
@@ -462,7 +462,7 @@ def _closed(outline: Floats, rng: np.random.Generator, height: float) -> tuple[S
 
 
 def equal_offices(count: int, likeness: Likeness, rng: np.random.Generator) -> list[Room]:
-    """Return rooms of one plan, with one set of furniture, that differ in what people move."""
+    """Return rooms with the same plan and furniture whose movable objects differ."""
     outline, height = rectangle(*rng.uniform((3.2, 3.6), (4.8, 5.2))), float(rng.uniform(2.4, 3.0))
     built = _closed(outline, rng, height)
     makers = [_OFFICE[k] for k in rng.permutation(len(_OFFICE))]
@@ -480,7 +480,7 @@ def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tupl
     pitch, wide, height = rng.uniform((3.0, 4.0, 2.8), (4.5, 6.5, 4.0)).tolist()
     bay, outline = rectangle(pitch, wide), rectangle(pitch * count, wide)
     pieces = [make(rng) for make in _BAY]
-    walls = [walls_of(bay)[k] for k in (0, 2)]  # bays are open to each other
+    walls = [walls_of(bay)[k] for k in (0, 2)]  # bays have no walls between them
     placed = arrange(walls, Floor(bay), pieces, table(rng), rng)
     size, seed = float(rng.uniform(0.2, 0.45)), int(rng.integers(2**31))
     top = Ceiling(height, np.zeros(2))
@@ -492,7 +492,7 @@ def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tupl
 
 
 def _row(rng: np.random.Generator, index: int, queries: int) -> Shoot:
-    """Return all rooms of a row, or all bays of a hall, in the map."""
+    """Map all rooms of a row, or all bays of a hall."""
     likeness = Likeness(float(rng.uniform(0.0, 0.03)), float(rng.uniform(0.0, 0.02)))
     if index % 2:
         hall, _ = equal_bays(int(rng.integers(4, 7)), likeness, rng)
@@ -505,7 +505,7 @@ def _row(rng: np.random.Generator, index: int, queries: int) -> Shoot:
 
 
 def _in_a_row(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
-    """Return where the world has each room: side by side, 0.2 m of wall between."""
+    """Return a function with the offset of each room: side by side, with walls of 0.2 m."""
 
     def shift(room: Room) -> Floats:
         k = next(i for i, one in enumerate(rooms) if one is room)
@@ -514,7 +514,7 @@ def _in_a_row(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
     return shift
 
 
-#: A view can be told from another where so much of it differs by more than this, metres.
+#: Fraction of a view, difference in metres, and range in metres that make two views distinct.
 TOLD_SHARE, TOLD_M, TOLD_REACH_M = 0.10, 0.10, 3.5
 _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 
@@ -522,20 +522,20 @@ _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 def difference_share(
     a: Room, b: Room, T_room_camera: Floats, T_other: Floats | None = None
 ) -> float:
-    """Return the share of a view that another room shows otherwise, from `T_other` if given."""
+    """Return the fraction of a view that differs in another room from `T_other`."""
     here = render(a, T_room_camera, _COARSE)
     there = render(b, T_room_camera if T_other is None else T_other, _COARSE)
     nearer = np.minimum(here, there)
-    # what a depth camera tells apart: its noise grows with the square of the depth, up to its reach
+    # The noise of a depth camera grows with the square of the depth, up to its range.
     least = TOLD_M * np.maximum(1.0, nearer**2 / 5.0)
     return float(np.mean((np.abs(here - there) > least) & (nearer < TOLD_REACH_M)))
 
 
 def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Return a row whose last room the map lacks; what is asked differs from all others in sight.
+    """Omit the last room of a row from the map; the queries visibly differ from all other rooms.
 
-    It must differ by more than a moved chair: no method tells an equal room from a mapped one
-    in which somebody moved a chair.
+    They must differ by more than a moved chair, since no method distinguishes an equal room from
+    a mapped room with a moved chair.
     """
     likeness = Likeness(float(rng.uniform(0.02, 0.08)), float(rng.uniform(0.0, 0.04)), 0.3, 0.5)
     rooms = equal_offices(int(rng.integers(2, 4)), likeness, rng)
@@ -548,7 +548,7 @@ def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> Shoot:
             told = min(difference_share(last, room, T) for room in mapped)
             if told >= least and len(asked) < queries:
                 asked.append(T)
-        least *= 0.9  # rooms too equal are asked about all the same
+        least *= 0.9  # rooms that are too similar are queried all the same
     return Shoot(map_of, [(last, T) for T in asked], _in_a_row(rooms))
 
 
@@ -561,7 +561,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Shoot
     likeness = Likeness(float(rng.uniform(0.03, 0.1)), float(rng.uniform(0.01, 0.05)), 0.3, 0.0)
     placed = arrange(walls_of(rectangle(*small)), Floor(rectangle(*small)), pieces, middle, rng)
     rooms = []
-    for k in range(2):  # the second is larger: its far walls stand elsewhere
+    for k in range(2):  # the second is larger, so its far walls are at other places
         outline, height = rectangle(*(small + k * rng.uniform(0.3, 1.5, 2))), rng.uniform(2.4, 3.0)
         mesh = join([*_closed(outline, rng, float(height)), furnish(placed, 0, likeness, rng)])
         rooms.append(Room(mesh, outline, Ceiling(float(height), np.zeros(2))))
@@ -571,7 +571,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Shoot
 
 
 def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Return a piece and its like back to back, other things before each: the map sees one side."""
+    """Put two equal pieces back to back, with other objects around; the map shows one side."""
     make = (desk, shelf, counter, table, cupboard)[int(rng.integers(0, 5))]
     piece = make(rng)
     w, d = piece.width, piece.depth
@@ -580,7 +580,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
         loads = [scatter(replace(s, density=0.4 * s.density), rng) for s in piece.surfaces]
         half = join([piece.mesh, *loads]).moved((0.0, -d / 2 - 0.01, 0.0))
         seats = [swivel_chair(rng).mesh.moved((rng.normal(0, 0.1), -d - 0.35, 0), math.pi)]
-        things = [  # what stands on the floor of one side, and not of the other
+        things = [  # objects on the floor of one side only
             floor_thing(rng).mesh.moved(
                 (rng.uniform(-w / 2, w / 2), -d - rng.uniform(0.2, 0.45), 0.0)
             )
@@ -596,7 +596,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
     middle = (0.0, 0.0, 0.5 * min(float(piece.mesh.vertices[:, 2].max()), 1.2))
     sweep = math.radians(140)
     seen = orbit(middle, radius, 20, rng, first=-math.pi / 2 - sweep / 2, sweep=sweep)
-    # from where the two sides can be told apart at all, as of what nobody can tell nothing is asked
+    # Only views in which the two sides differ, since others have no correct answer.
     views = orbit(middle, radius, 6 * queries, rng, first=math.pi / 2 - sweep / 2, sweep=sweep)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     told = [difference_share(room, room, T, half_turn @ T) for T in views]
@@ -608,7 +608,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
 
 
 def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Return rooms and objects that have nothing to do with each other."""
+    """Return rooms and objects without common content."""
 
     def views(rooms: int, each: int, around: int) -> list[tuple[Room, Floats]]:
         found = []
@@ -627,9 +627,9 @@ def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:
 
 
 def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
-    """Return different rooms side by side, seen from few places or from many, in which people live.
+    """Return different rooms side by side, with views from a few places or from many.
 
-    Things stand about that were elsewhere, or not there, when the map was recorded.
+    The queries see objects that were elsewhere or absent when the map was recorded.
     """
     rooms = [make_room(rng) for _ in range(3)]
     most = int(rng.integers(0, 5))
@@ -648,7 +648,7 @@ def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Shoot
 
 
 def with_things(room: Room, count: int, rng: np.random.Generator) -> Room:
-    """Return a room with so many chairs, boxes and the like somewhere on its floor."""
+    """Return a room with `count` more chairs, boxes and similar objects on its floor."""
     low, high = room.outline.min(axis=0), room.outline.max(axis=0)
     things = []
     for _ in range(count):

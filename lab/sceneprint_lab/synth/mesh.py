@@ -1,7 +1,7 @@
-"""Closed solids of which furniture is made, and the empty room around it.
+"""Meshes of closed solids for furniture, and of empty rooms.
 
-a few lengths (metres)  --box, cylinder, cone, revolve, ...-->  Mesh, outward normals
-rng  --floor_plan-->  outline (n, 2)  --shell-->  Shell(mesh, outline, walls)
+a few lengths (metres)  --box, cylinder, cone, revolve, ...-->  SyntheticMesh, outward normals
+rng  --floor_plan-->  outline (n, 2)  --walls_of, shell-->  SyntheticMesh, inward normals
 
 Every solid rests on z = 0 around the z axis. A shell has walls with openings and a ceiling; its
 normals face inward.
@@ -27,8 +27,8 @@ class SyntheticMesh:
     ----------
     vertices : (V, 3) float64, metres, z up
     faces : (F, 3) int32, indices into vertices, counter-clockwise from outside
-    loss : (F,) float32, share of samples on the face from which a depth camera gets no
-        answer (dark, shiny or transparent surfaces), [0, 1]
+    loss : (F,) float32, fraction of samples on the face that a depth camera loses, [0, 1];
+        positive for dark, shiny or transparent surfaces
     """
 
     vertices: Floats
@@ -44,7 +44,7 @@ class SyntheticMesh:
         return replace(self, vertices=self.vertices @ rotation.T + np.asarray(offset, float))
 
     def with_loss(self, share: float) -> SyntheticMesh:
-        """Return the same mesh with one loss on all faces."""
+        """Return the same mesh with an equal loss on all faces."""
         return replace(self, loss=np.full(len(self.faces), share, np.float32))
 
     def _shifted(self, offset: ArrayLike) -> SyntheticMesh:
@@ -52,7 +52,7 @@ class SyntheticMesh:
 
 
 def mesh_of(vertices: ArrayLike, faces: ArrayLike) -> SyntheticMesh:
-    """Return a mesh without loss, its faces of no area left out."""
+    """Return a mesh without loss and without degenerate faces."""
     v = np.asarray(vertices, np.float64).reshape(-1, 3)
     f: NDArray[np.int32] = np.asarray(faces, np.int32).reshape(-1, 3)
     a, b, c = v[f[:, 0]], v[f[:, 1]], v[f[:, 2]]
@@ -70,7 +70,7 @@ def mesh_of(vertices: ArrayLike, faces: ArrayLike) -> SyntheticMesh:
 
 
 def join(meshes: Iterable[SyntheticMesh]) -> SyntheticMesh:
-    """Return all meshes as one; an empty iterable gives the empty mesh."""
+    """Return all meshes as a single mesh, which is empty for an empty iterable."""
     parts = list(meshes)
     if not parts:
         return SyntheticMesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.float32))
@@ -83,30 +83,30 @@ def join(meshes: Iterable[SyntheticMesh]) -> SyntheticMesh:
 
 
 def rotation_z(yaw: float) -> Floats:
-    """Return (3, 3) rotation about z by yaw radians."""
+    """Return the rotation (3, 3) about z by `yaw` radians."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def rotation_x(angle: float) -> Floats:
-    """Return (3, 3) rotation about x by angle radians."""
+    """Return the rotation (3, 3) about x by `angle` radians."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def face_normals(mesh: SyntheticMesh) -> Floats:
-    """Return (F, 3) normals of the faces, each as long as twice the area of its face, m^2."""
+    """Return the normals (F, 3) of the faces, with lengths of twice the area of a face, m^2."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return np.asarray(np.cross(b - a, c - a))
 
 
 def area(mesh: SyntheticMesh) -> float:
-    """Return area of all faces, m^2."""
+    """Return the total area of the faces, m^2."""
     return float(np.linalg.norm(face_normals(mesh), axis=1).sum() / 2)
 
 
 def volume(mesh: SyntheticMesh) -> float:
-    """Return the enclosed volume, m^3; negative where normals face inward."""
+    """Return the enclosed volume, m^3; negative for normals that face inward."""
     return float((mesh.vertices[mesh.faces[:, 0]] * face_normals(mesh)).sum() / 6)
 
 
@@ -123,7 +123,7 @@ _BOX_FACES = np.array(
 def box(
     width: float, depth: float, height: float, at: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0
 ) -> SyntheticMesh:
-    """Return a cuboid width x depth x height along x, y, z; `at` is the middle of its underside."""
+    """Return a cuboid of width, depth and height along x, y, z; `at` is its base's centre."""
     m = SyntheticMesh(_CORNERS * (width, depth, height), _BOX_FACES, np.zeros(12, np.float32))
     return m.moved(at, yaw)
 
@@ -131,20 +131,20 @@ def box(
 def tapered_box(
     bottom: tuple[float, float], top: tuple[float, float], height: float
 ) -> SyntheticMesh:
-    """Return a box whose underside (width, depth) differs from its upper side."""
+    """Return a box whose base and top have different (width, depth)."""
     scale = np.where(_CORNERS[:, 2:] > 0.5, np.array(top), np.array(bottom))
     xy = _CORNERS[:, :2] * scale
     return mesh_of(np.column_stack([xy, _CORNERS[:, 2] * height]), _BOX_FACES)
 
 
 def revolve(profile: ArrayLike, segments: int = 16) -> SyntheticMesh:
-    """Return the solid swept by a profile that turns about z.
+    """Return the solid of revolution of a profile about z.
 
     Parameters
     ----------
-    profile : (n, 2) radius and height, metres, from the bottom along the outside to the
-        top; ends away from the axis are closed by a disc
-    segments : corners of the circle
+    profile : (n, 2) radius and height, metres, along the outside from the bottom to the top;
+        a disc closes an end away from the axis
+    segments : number of sides
     """
     p = np.asarray(profile, float)
     ends = ([[0.0, p[0, 1]]] if p[0, 0] > 0 else [], [[0.0, p[-1, 1]]] if p[-1, 0] > 0 else [])
@@ -158,26 +158,26 @@ def revolve(profile: ArrayLike, segments: int = 16) -> SyntheticMesh:
 
 
 def cylinder(radius: float, height: float, segments: int = 16) -> SyntheticMesh:
-    """Return an upright cylinder, as a prism of that many sides."""
+    """Return an upright cylinder as a prism with `segments` sides."""
     return revolve([(radius, 0.0), (radius, height)], segments)
 
 
 def cone(lower: float, upper: float, height: float, segments: int = 16) -> SyntheticMesh:
-    """Return a truncated cone from radius lower to radius upper; 0 makes a tip."""
+    """Return a truncated cone from the radius `lower` to `upper`; a radius of 0 is a tip."""
     return revolve([(lower, 0.0), (upper, height)], segments)
 
 
 def ellipsoid(radii: ArrayLike, power: float = 1.0, segments: int = 16) -> SyntheticMesh:
-    """Return a superellipsoid resting on z = 0: power 1 is an ellipsoid, towards 0 a box."""
+    """Return a superellipsoid on z = 0; `power` 1 is an ellipsoid, values towards 0 a box."""
     directions = _sphere(segments)
     shaped = np.sign(directions) * np.abs(directions) ** power
-    # points of the level set |x|^(2/power) + ... = 1 along each direction
+    # Points of the level set |x|^(2/power) + ... = 1 along each direction.
     level = (np.abs(shaped) ** (2 / power)).sum(axis=-1, keepdims=True) ** (-power / 2)
     return _on_sphere(shaped * level * np.asarray(radii, float), segments)
 
 
 def blob(rng: np.random.Generator, radii: ArrayLike, roughness: float = 0.12) -> SyntheticMesh:
-    """Return a sphere bent by a few low-frequency waves: bags, cushions, crumpled cloth."""
+    """Return a sphere deformed by a few low-frequency waves, such as a bag or a cushion."""
     directions = _sphere(26)
     waves = rng.normal(size=(4, 3)) * 2.2
     swell = np.cos(directions @ waves.T + rng.uniform(0, 2 * math.pi, 4)) @ rng.normal(size=4)
@@ -190,7 +190,7 @@ def blob(rng: np.random.Generator, radii: ArrayLike, roughness: float = 0.12) ->
 
 
 def extrude(outline: ArrayLike, height: float) -> SyntheticMesh:
-    """Return a prism over a simple polygon (n, 2), counter-clockwise, metres."""
+    """Return a prism over a simple counter-clockwise polygon (n, 2), metres."""
     p = np.asarray(outline, float)
     n = len(p)
     cap = triangulate(p)
@@ -202,7 +202,7 @@ def extrude(outline: ArrayLike, height: float) -> SyntheticMesh:
 
 
 def ribbon(path: ArrayLike, thickness: float, height: float) -> SyntheticMesh:
-    """Return an upright sheet over an open path (n, 2): curtains, bent panels."""
+    """Return an upright sheet along an open path (n, 2), such as a curtain or a bent panel."""
     p = np.asarray(path, float)
     along = np.gradient(p, axis=0)
     side = np.column_stack([along[:, 1], -along[:, 0]])
@@ -222,7 +222,7 @@ def ribbon(path: ArrayLike, thickness: float, height: float) -> SyntheticMesh:
 
 
 def tube(points: Sequence[ArrayLike], radius: float, segments: int = 8) -> SyntheticMesh:
-    """Return a round rod along a path of points (n, 3): pipes, chair frames, cables, handles."""
+    """Return a round rod along a path (n, 3), such as a pipe, a chair frame or a handle."""
     p = np.asarray(points, float)
     along = np.gradient(p, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -240,7 +240,7 @@ def tube(points: Sequence[ArrayLike], radius: float, segments: int = 8) -> Synth
 
 
 def triangulate(outline: Floats) -> Ints32:
-    """Return (n - 2, 3) triangles that fill a counter-clockwise polygon (n, 2), by ear clipping."""
+    """Return triangles (n - 2, 3) of a counter-clockwise polygon (n, 2), by ear clipping."""
     p = np.asarray(outline, float)
     left = list(range(len(p)))
     triangles = []
@@ -253,7 +253,7 @@ def triangulate(outline: Floats) -> Ints32:
                 for i in others
             ):
                 break
-        else:  # only corners on straight edges are left
+        else:  # all remaining corners lie on straight edges
             k = 1
         triangles.append((left[k - 1], left[k], left[(k + 1) % len(left)]))
         del left[k]
@@ -302,10 +302,10 @@ class Opening:
 
     Parameters
     ----------
-    start, end : along the wall, metres from its first corner
+    start, end : positions along the wall from its first corner, metres
     low, high : heights, metres
-    deep : metres behind the wall's plane
-    loss : share of samples lost on its back plane (glass), [0, 1]
+    deep : depth behind the wall's plane, metres
+    loss : fraction of samples that a camera loses on its back plane (glass), [0, 1]
     """
 
     start: float
@@ -318,14 +318,14 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """One straight wall, seen from inside the room.
+    """A straight wall as seen from inside the room.
 
     Parameters
     ----------
-    corner : (2,) where it starts, metres
-    along : (2,) unit vector to its end; the room lies to the left
+    corner : (2,) start, metres
+    along : (2,) unit vector to the end; the room lies on its left
     length : metres
-    openings : what is recessed in it
+    openings : recesses of the wall
     """
 
     corner: Floats
@@ -335,11 +335,11 @@ class Wall:
 
     @property
     def inward(self) -> Floats:
-        """Return (2,) unit vector from the wall into the room."""
+        """Return the unit vector (2,) from the wall into the room."""
         return np.array([-self.along[1], self.along[0]])
 
     def at(self, distance: float, out: float = 0.0) -> Floats:
-        """Return (2,) the floor point so far along the wall and so far out into the room."""
+        """Return the floor point (2,) at a distance along the wall and `out` into the room."""
         return np.asarray(self.corner + distance * self.along + out * self.inward)
 
 
@@ -351,22 +351,22 @@ class Ceiling:
     slope: Floats
 
     def at(self, points: Floats) -> Floats:
-        """Return (...,) heights over floor points (..., 2)."""
+        """Return the heights (...,) above floor points (..., 2)."""
         return np.asarray(self.height + points @ self.slope)
 
 
 def floor_plan(rng: np.random.Generator) -> Floats:
-    """Return an outline (n, 2), counter-clockwise: rectangle, L, alcove or cut corner."""
+    """Return an outline (n, 2), counter-clockwise: a rectangle, an L, an alcove or a cut corner."""
     w, d = rng.uniform(2.6, 8.0), rng.uniform(2.5, 6.5)
     kind = rng.choice(4, p=(0.4, 0.25, 0.2, 0.15))
     a, b = w * rng.uniform(0.4, 0.7), d * rng.uniform(0.4, 0.7)
-    if kind == 1 and min(w, d) > 3.0:  # L
+    if kind == 1 and min(w, d) > 3.0:  # L shape
         plan = [(0, 0), (w, 0), (w, b), (a, b), (a, d), (0, d)]
     elif kind == 2:  # alcove in the far wall
         deep = rng.uniform(0.4, 1.6)
         left = w * rng.uniform(0.1, 0.3)
         plan = [(0, 0), (w, 0), (w, d), (a, d), (a, d + deep), (left, d + deep), (left, d), (0, d)]
-    elif kind == 3:  # a corner cut off
+    elif kind == 3:  # cut corner
         cut = rng.uniform(0.4, 1.4, 2)
         plan = [(0, 0), (w, 0), (w, d - cut[1]), (w - cut[0], d), (0, d)]
     else:
@@ -375,7 +375,7 @@ def floor_plan(rng: np.random.Generator) -> Floats:
 
 
 def ceiling(rng: np.random.Generator, outline: Floats) -> Ceiling:
-    """Return a flat ceiling, or one in four sloped along x or y."""
+    """Return a ceiling; three in four are flat, the others slope along x or y."""
     height = rng.uniform(2.3, 3.2)
     if rng.random() > 0.25:
         return Ceiling(height, np.zeros(2))
@@ -388,7 +388,7 @@ def ceiling(rng: np.random.Generator, outline: Floats) -> Ceiling:
 
 
 def walls_of(outline: Floats) -> list[Wall]:
-    """Return the walls over the edges of an outline, without openings."""
+    """Return the walls on the edges of an outline, without openings."""
     walls = []
     for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         length = float(np.linalg.norm(b - a))
@@ -397,7 +397,7 @@ def walls_of(outline: Floats) -> list[Wall]:
 
 
 def shell(outline: Floats, walls: list[Wall], top: Ceiling) -> SyntheticMesh:
-    """Return floor, ceiling and walls as one closed surface whose normals face the room."""
+    """Return floor, ceiling and walls as a closed surface whose normals face the room."""
     flat = triangulate(outline)
     floor = mesh_of(np.c_[outline, np.zeros(len(outline))], flat)
     roof = mesh_of(np.c_[outline, top.at(outline)], flat[:, ::-1])
@@ -405,7 +405,7 @@ def shell(outline: Floats, walls: list[Wall], top: Ceiling) -> SyntheticMesh:
 
 
 def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
-    """Return one wall up to the ceiling, its openings cut out and lined."""
+    """Return a wall up to the ceiling, with its openings cut out and lined."""
     us = sorted({0.0, wall.length, *(u for o in wall.openings for u in (o.start, o.end))})
     vs = sorted({0.0, *(v for o in wall.openings for v in (o.low, o.high))})
     grid = np.array([[(u, 0.0, v) for u in us] for v in [*vs, math.inf]])
@@ -425,7 +425,7 @@ def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
 
 
 def _lining(o: Opening) -> SyntheticMesh:
-    """Return sides and back of a recess, in the wall's frame (along, inward, up)."""
+    """Return the sides and back of a recess in the wall's frame (along, inward, up)."""
     ring = ((o.start, o.low), (o.end, o.low), (o.end, o.high), (o.start, o.high))
     front = np.array([(u, 0.0, v) for u, v in ring])
     back = front - (0.0, o.deep, 0.0)
@@ -434,8 +434,8 @@ def _lining(o: Opening) -> SyntheticMesh:
 
 
 def _quads(corners: list[Floats]) -> SyntheticMesh:
-    """Return quadrilaterals in the plane (along, up), given so that they face +inward."""
+    """Return quadrilaterals in the plane (along, up) that face inward."""
     v = np.concatenate(corners)
     first = np.arange(0, len(v), 4)[:, None]
-    # (along, inward, up) is right-handed: along x up points to -inward, so turn them round
+    # (along, inward, up) is right-handed, so along x up is -inward and the order is reversed.
     return mesh_of(v, first + np.array([0, 2, 1, 0, 3, 2]))

@@ -1,4 +1,4 @@
-"""How rooms are furnished: pieces along walls, in the open and on the floor.
+"""Furnished rooms: pieces along walls, in the open and on the floor.
 
 walls, Floor, rng  --along_wall, in_the_open, ...-->  meshes in place
 """
@@ -51,16 +51,16 @@ from sceneprint_lab.synth.mesh import (
 )
 from sceneprint_lab.synth.sensors import Caster
 
-# Where furniture stands: a grid of the floor keeps pieces inside the room and apart.
+# A grid of the floor that keeps pieces inside the room and apart.
 #
-# Piece, place (x, y, yaw)  --Floor.claim-->  its share of the floor, or a refusal
+# PiecePose  --Floor.claim-->  whether the place was free
 
-CELL = 0.05  #: metres a cell of a room's grid
+CELL = 0.05  #: side of a cell of a room's grid, metres
 
 
 @dataclass(frozen=True)
 class PiecePose:
-    """Where a piece stands: x, y metres; yaw radians."""
+    """Pose of a piece: x, y, metres; yaw, radians."""
 
     x: float
     y: float
@@ -68,7 +68,7 @@ class PiecePose:
 
 
 class Floor:
-    """The floor within an outline (n, 2), and what has been claimed of it.
+    """The floor within an outline (n, 2), and its occupied cells.
 
     Parameters
     ----------
@@ -87,20 +87,20 @@ class Floor:
         self.claimed = ~self.inside
 
     def claim(self, place: PiecePose, width: float, depth: float, overlap: float = 0.0) -> bool:
-        """Take a turned rectangle of the floor, or refuse and change nothing.
+        """Occupy a rotated rectangle of the floor if it is free; return whether it was.
 
         Parameters
         ----------
-        place : middle and yaw of the rectangle
-        width, depth : its extents, metres
-        overlap : share of it that others may have claimed already, [0, 1]; none of it may
-            lie outside the room
+        place : centre and yaw of the rectangle
+        width, depth : extents, metres
+        overlap : fraction of the rectangle that may already be occupied, [0, 1]; all of it must
+            lie inside the room
         """
         part, cells = self._cells(place, width, depth)
         total = width * depth / self.cell**2
         within = np.count_nonzero(cells & self.inside[part])
         free = np.count_nonzero(cells & ~self.claimed[part])
-        # a strip of half a cell along the walls may round away
+        # Rounding may remove a strip of half a cell along the walls.
         slack = (width + depth) / self.cell + 2
         if within < total - slack or free < within * (1 - overlap) - 1e-9:
             return False
@@ -108,14 +108,14 @@ class Floor:
         return True
 
     def take(self, place: PiecePose, width: float, depth: float) -> None:
-        """Claim a turned rectangle whatever lies there, inside the outline or not."""
+        """Occupy a rotated rectangle without any check, inside the outline or not."""
         part, cells = self._cells(place, width, depth)
         self.claimed[part] |= cells
 
     def _cells(
         self, place: PiecePose, width: float, depth: float
     ) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-        """Return a part of the grid that holds the rectangle, and which of its cells it covers."""
+        """Return the part of the grid around a rectangle, and which of its cells it covers."""
         reach = math.hypot(width, depth) / 2 + self.cell
         middle = np.array([place.x, place.y])
         first = np.floor((middle - reach - self._low) / self.cell).astype(int).clip(0)
@@ -129,7 +129,7 @@ class Floor:
 
 
 def inside(outline: Floats, points: Floats) -> NDArray[np.bool_]:
-    """Return (...,) whether floor points (..., 2) lie in the outline (n, 2): crossings of a ray."""
+    """Return (...,) whether floor points (..., 2) lie in an outline (n, 2), by ray crossings."""
     x, y = points[..., 0], points[..., 1]
     result = np.zeros(x.shape, bool)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -141,12 +141,12 @@ def inside(outline: Floats, points: Floats) -> NDArray[np.bool_]:
 
 
 Maker = Callable[[np.random.Generator], Piece]
-Menu = Mapping[Maker, float]  #: what may stand somewhere, and how often
+Menu = Mapping[Maker, float]  #: builders of objects, with weights
 
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """A room while it is being furnished: what is built, what is free, and the dice."""
+    """A room under construction: its pieces, its free floor, and the random generator."""
 
     walls: list[Wall]
     top: Ceiling
@@ -155,7 +155,7 @@ class Site:
 
 
 def keep_doors_free(site: Site) -> None:
-    """Claim the floor in front of doors, so that nothing is put there."""
+    """Occupy the floor in front of doors, so that no piece blocks them."""
     for wall in site.walls:
         for o in wall.openings:
             if o.low == 0.0 and o.high > 1.9:
@@ -164,7 +164,7 @@ def keep_doors_free(site: Site) -> None:
 
 
 def along_wall(wall: Wall, menu: Menu, site: Site) -> list[SyntheticMesh]:
-    """Return pieces side by side along a wall; how densely differs from wall to wall."""
+    """Return pieces side by side along a wall; their density varies between walls."""
     rng = site.rng
     parts: list[SyntheticMesh] = []
     u, density = rng.uniform(0.0, 0.5), rng.uniform(0.5, 1.0)
@@ -182,7 +182,7 @@ def along_wall(wall: Wall, menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
-    """Return pieces in the middle of the room, square to it or at any yaw."""
+    """Return pieces in the middle of the room, aligned with it or at a random yaw."""
     rng = site.rng
     parts: list[SyntheticMesh] = []
     spots = site.floor.points[~site.floor.claimed]
@@ -198,7 +198,7 @@ def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def partitions(site: Site) -> list[SyntheticMesh]:
-    """Return now and then a wall or screen that stands out into the room."""
+    """Return a free-standing wall or screen in some of the rooms."""
     rng, floor = site.rng, site.floor
     lowest = float(site.top.at(floor.points[floor.inside]).min())
     parts = []
@@ -215,7 +215,7 @@ def partitions(site: Site) -> list[SyntheticMesh]:
 
 
 def on_the_floor(site: Site) -> list[SyntheticMesh]:
-    """Return bins, boxes, plants and small things on what floor is left."""
+    """Return bins, boxes, plants and small objects on the remaining floor."""
     rng, floor = site.rng, site.floor
     parts = []
     for _ in range(rng.integers(3, 16)):
@@ -248,12 +248,12 @@ def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
         return []
     if not site.floor.claim(place, piece.width, piece.depth):
         return []
-    if rng.random() < 0.06:  # black leather, steel, lacquer
+    if rng.random() < 0.06:  # black leather, steel or lacquer
         mesh = mesh.with_loss(float(rng.choice((rng.uniform(0.05, 0.4), 0.9))))
     parts = [mesh]
     if rng.random() < 0.85:
         seat = swivel_chair if rng.random() < (0.7 if piece.seats == 1 else 0.2) else chair
-        # a desk has one seat, at its front; a table has some, at any of its sides
+        # A desk has one seat, at its front; a table has seats at random sides.
         sides = [0] if piece.seats == 1 else rng.permutation(4)[: max(0, -piece.seats)].tolist()
         for side in sides:
             parts += _seat(seat(rng), side, piece, place, site)
@@ -263,7 +263,7 @@ def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
 def _seat(
     seat: Piece, side: int, piece: Piece, place: PiecePose, site: Site
 ) -> list[SyntheticMesh]:
-    """Return a chair at one side of a table (0 is its front), pushed in more or less."""
+    """Return a chair at one side of a table (0 is its front), pushed in by a random amount."""
     rng = site.rng
     yaw = place.yaw + side * math.pi / 2
     half, span = (piece.depth, piece.width) if side % 2 == 0 else (piece.width, piece.depth)
@@ -277,11 +277,11 @@ def _seat(
     return [seat.mesh.moved((x, y, 0), facing)]
 
 
-# Furnished rooms: the scenes from which synthetic depth frames are taken.
+# Furnished rooms as scenes of synthetic depth frames.
 #
 # rng  --make_room-->  Room: mesh, outline, ceiling
 
-#: kinds of rooms: what stands against walls, what stands free, and how often each
+#: Kinds of rooms: objects along walls and free-standing objects, with weights.
 _KINDS: tuple[tuple[Menu, Menu], ...] = (
     (
         {desk: 5, shelf: 3, cupboard: 2, table: 1, floor_thing: 1},
@@ -301,13 +301,13 @@ _FREQUENCIES = (0.27, 0.23, 0.15, 0.1, 0.1, 0.15)
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A closed scene in which a camera can move.
+    """A closed scene for a camera.
 
     Parameters
     ----------
-    mesh : all surfaces; solids face outward, the shell faces the room
+    mesh : all surfaces; normals of solids face outward, those of the shell inward
     outline : (n, 2) floor plan, counter-clockwise, metres
-    ceiling : height over every point of the floor
+    ceiling : ceiling, with a height for each floor point
     """
 
     mesh: SyntheticMesh
@@ -316,27 +316,27 @@ class Room:
 
     @property
     def vertices(self) -> Floats32:
-        """Return (V, 3) metres, z up."""
+        """Return the vertices (V, 3), metres, z up."""
         return self.mesh.vertices.astype(np.float32)
 
     @property
     def faces(self) -> Ints32:
-        """Return (F, 3) indices into vertices."""
+        """Return the indices (F, 3) of the vertices of each face."""
         return self.mesh.faces
 
     @property
     def size(self) -> Floats:
-        """Return (3,) extents of the room along x, y, z, metres."""
+        """Return the extents (3,) of the room along x, y, z, metres."""
         return np.array([*np.ptp(self.outline, axis=0), self.ceiling.at(self.outline).max()])
 
     @cached_property
     def caster(self) -> Caster:
-        """Return the mesh ready for rays; built at the first use."""
+        """Return the ray caster of the mesh, which the first use builds."""
         return Caster(self.mesh)
 
 
 def make_room(rng: np.random.Generator) -> Room:
-    """Return a room of 2.5 to 8 m with furniture, fittings and clutter, all drawn from rng."""
+    """Return a random room of 2.5 to 8 m with furniture, fittings and clutter."""
     outline = floor_plan(rng)
     top = ceiling(rng, outline)
     walls = [pierced(w, rng, _depth_behind(w, outline)) for w in walls_of(outline)]
@@ -354,11 +354,11 @@ def make_room(rng: np.random.Generator) -> Room:
 
 
 def _depth_behind(wall: Wall, outline: Floats) -> float:
-    """Return how deep a recess may go, metres, without meeting the room or another recess."""
+    """Return the greatest depth of a recess, metres, that does not meet the room or a recess."""
     along = np.linspace(-0.3, wall.length + 0.3, 15)
     for depth in (2.0, 1.0, 0.5, 0.25):
         behind = np.linspace(0.01, depth + 0.1, 12)
         probes = np.array([wall.at(u, -out) for u in along for out in behind])
         if not inside(outline, probes).any():
             return depth
-    return 0.08  # at a corner that juts into the room, where two walls share what is behind
+    return 0.08  # at a re-entrant corner, two walls share the space behind them

@@ -1,10 +1,10 @@
-"""What a Kinect v1 makes of an ideal depth image.
+"""Ray casting, and models of a Kinect v1 and of laser scanners.
 
     depth (H, W), cosine (H, W)  --kinect_noise-->  depth (H, W), 0 missing
 
-A pattern projector beside the camera is matched by disparity d = f b / z: errors and
-steps are even in disparity, so they grow with z^2 in depth. What the projector cannot
-light, what lies flat to the ray and what does not shine back is missing.
+A Kinect matches a projected pattern by its disparity d = f b / z. Errors and steps are uniform in
+disparity, so they grow with z^2 in depth. Samples are missing in the projector's shadow, at grazing
+incidence and on surfaces that do not reflect.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from sceneprint.errors import MissingDependency
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32
 from sceneprint_lab.synth.mesh import SyntheticMesh
 
-# Ray casting: a mesh and a camera to a depth image.
+# Ray casting from a mesh and a camera to a depth image.
 #
-#     Mesh, T_world_camera (4, 4), Intrinsics  --cast_depth-->  depth (H, W), cosine (H, W)
+#     SyntheticMesh, T_world_camera (4, 4), Intrinsics  --cast_depth-->  depth, cosine (H, W)
 #
-# The tree over the triangles is Embree's; it is built once a mesh, in `Caster`.
+# Embree builds the tree over the triangles once per mesh, in `Caster`.
 
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """What rays met first.
+    """First hits of rays.
 
     Parameters
     ----------
-    distance : (R,) float32, in units of the ray's direction; inf where nothing was met
-    face : (R,) int32, index of the face; -1 where nothing was met
-    normal : (R, 3) float32, unit normals of the faces, outward; 0 where nothing was met
+    distance : (R,) float32, in units of the ray's direction; inf without a hit
+    face : (R,) int32, index of the face; -1 without a hit
+    normal : (R, 3) float32, outward unit normals of the faces; 0 without a hit
     """
 
     distance: Floats32
@@ -45,7 +45,7 @@ class RayHits:
 
 
 class Caster:
-    """A mesh made ready for rays; build it once and cast often."""
+    """A mesh prepared for ray casting; build it once and cast many rays."""
 
     def __init__(self, mesh: SyntheticMesh) -> None:
         self.mesh = mesh
@@ -57,11 +57,11 @@ class Caster:
         self._normals = np.concatenate([normals, np.zeros((1, 3))]).astype(np.float32)
 
     def cast(self, origins: Floats32, directions: Floats32) -> RayHits:
-        """Return the first face that each ray meets.
+        """Return the first hit of each ray.
 
         Parameters
         ----------
-        origins, directions : (R, 3) float32, metres; directions of any length
+        origins, directions : (R, 3) float32, metres; directions may have any length
         """
         found = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
@@ -70,28 +70,28 @@ class Caster:
         )
         face = np.asarray(found["primID"], np.int32)
         distance = np.where(face >= 0, found["tfar"], np.float32(np.inf)).astype(np.float32)
-        return RayHits(distance, face, self._normals[face])  # face -1 is the zero row
+        return RayHits(distance, face, self._normals[face])  # face -1 selects the zero row
 
 
 def cast_depth(
     caster: Caster, T_world_camera: Floats, intrinsics: Intrinsics
 ) -> tuple[Floats32, Floats32]:
-    """Return an ideal depth image and how steeply each sample is met.
+    """Return an ideal depth image, and the cosine of incidence of each sample.
 
     Parameters
     ----------
-    caster : the scene, metres
+    caster : scene, metres
     T_world_camera : (4, 4) pose of the optical frame
-    intrinsics : a camera without distortion
+    intrinsics : camera without distortion
 
     Returns
     -------
-    depth : (H, W) float32, metres along the optical axis; 0 where nothing is met
-    cosine : (H, W) float32, |cos| between ray and normal, [0, 1]; 0 where nothing is met
+    depth : (H, W) float32, metres along the optical axis; 0 without a hit
+    cosine : (H, W) float32, |cos| between ray and normal, [0, 1]; 0 without a hit
 
     Raises
     ------
-    MissingDependency : Embree cannot be imported.
+    MissingDependency : If Embree cannot be imported.
     """
     depth, cosine, _ = cast_faces(caster, T_world_camera, intrinsics)
     return depth, cosine
@@ -100,12 +100,12 @@ def cast_depth(
 def cast_faces(
     caster: Caster, T_world_camera: Floats, intrinsics: Intrinsics
 ) -> tuple[Floats32, Floats32, Ints32]:
-    """Return as `cast_depth`, and the index of the face seen: (H, W) int32, -1 for none."""
+    """Return the result of `cast_depth`, and the index of the face (H, W) int32, -1 for none."""
     shape = (intrinsics.height, intrinsics.width)
     rays = pixel_rays(intrinsics) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
     hits = caster.cast(origins, rays)
-    # rays have z = 1 in the camera's frame, so distance along them is depth
+    # Rays have z = 1 in the camera's frame, so their distance is the depth.
     depth = np.where(hits.face >= 0, hits.distance, np.float32(0))
     cosine = np.abs(np.einsum("ij,ij->i", rays, hits.normal))
     cosine /= np.sqrt(np.einsum("ij,ij->i", rays, rays))
@@ -113,7 +113,7 @@ def cast_faces(
 
 
 def pixel_rays(intrinsics: Intrinsics) -> Floats32:
-    """Return (H W, 3) float32 rays through the pixel centres, row by row, with z = 1."""
+    """Return rays (H W, 3) float32 through the pixel centres, row by row, with z = 1."""
     x = (np.arange(intrinsics.width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(intrinsics.height) - intrinsics.cy) / intrinsics.fy
     rays = np.ones((intrinsics.height, intrinsics.width, 3), np.float32)
@@ -128,7 +128,7 @@ def _embree_scene(mesh: SyntheticMesh) -> Any:
         from embreex.rtcore_scene import EmbreeScene
     except ImportError as error:
         raise MissingDependency(
-            "Synthetic scenes are ray-traced with Embree, and the package embreex cannot be "
+            "Synthetic scenes are ray-traced with Embree, but the package embreex cannot be "
             f"imported ({error}). Install it: pip install 'embreex>=4.4,<5' (x86_64 only)."
         ) from error
     scene = EmbreeScene()
@@ -138,27 +138,27 @@ def _embree_scene(mesh: SyntheticMesh) -> Any:
 
 @dataclass(frozen=True)
 class KinectNoise:
-    """The numbers of the sensor; lengths in metres, px in pixels of the image."""
+    """Parameters of a Kinect; lengths in metres, px in pixels of the image."""
 
     baseline: float = 0.075  #: camera to projector, m; the projector is on the right
     disparity_sigma: float = 0.052  #: px; with the steps 1.5 mm at 1 m, 13 mm at 3 m
-    correlation: float = 2.2  #: px; standard deviation of the blur of that error
+    correlation: float = 2.2  #: px; standard deviation of the blur of the disparity error
     warp: float = 0.06  #: px; disparity error that is smooth over the image
-    disparity_step: float = 0.125  #: px; disparity is known in eighths
-    edge_jitter: float = 0.9  #: px; how far a look-up strays, so that edges are ragged
-    edge_block: int = 3  #: px; size of the blocks that stray together
-    shadow_margin: float = 0.5  #: px; least disparity difference that casts a shadow
+    disparity_step: float = 0.125  #: px; resolution of disparity
+    edge_jitter: float = 0.9  #: px; displacement of samples, which makes edges ragged
+    edge_block: int = 3  #: px; size of blocks with a common displacement
+    shadow_margin: float = 0.5  #: px; smallest disparity difference that casts a shadow
     shadow_growth: int = 3  #: px; width of the window that smears shadows
     grazing_start: float = math.radians(71.0)  #: rad; incidence from which samples are lost
-    grazing_end: float = math.radians(84.0)  #: rad; incidence from which all are lost
-    speckle: float = 0.0008  #: share of samples lost anywhere, in patches
+    grazing_end: float = math.radians(84.0)  #: rad; incidence from which all samples are lost
+    speckle: float = 0.0008  #: fraction of samples that are lost anywhere, in patches
     patch: float = 7.0  #: px; size of lost patches
-    border: tuple[int, int, int, int] = (0, 0, 0, 0)  #: px; lost left, right, top, bottom
-    nearest: float = 0.45  #: m; nothing is measured closer
-    farthest: float = 8.0  #: m; nothing is measured farther
+    border: tuple[int, int, int, int] = (0, 0, 0, 0)  #: px; missing left, right, top, bottom
+    nearest: float = 0.45  #: m; smallest measured depth
+    farthest: float = 8.0  #: m; greatest measured depth
 
 
-#: the sensor of 7-Scenes and TUM RGB-D
+#: The sensor of 7-Scenes and TUM RGB-D.
 KINECT_V1 = KinectNoise()
 
 
@@ -166,18 +166,18 @@ def kinect_noise(
     depth: Floats32, cosine: Floats32, intrinsics: Intrinsics, rng: np.random.Generator,
     parameters: KinectNoise = KINECT_V1, loss: Floats32 | None = None,
 ) -> Floats32:  # fmt: skip
-    """Return a depth image as a Kinect v1 would have given it.
+    """Return a depth image with the noise and losses of a Kinect v1.
 
     Parameters
     ----------
-    depth : (H, W) metres, 0 missing; ideal
+    depth : (H, W) ideal depth, metres, 0 if missing
     cosine : (H, W) |cos| of incidence, [0, 1]
     rng : source of all noise
-    loss : (H, W) share of samples lost on the surface seen, [0, 1]; None is none
+    loss : (H, W) fraction of samples that are lost on the visible surface, [0, 1]; None for 0
 
     Returns
     -------
-    depth : (H, W) float32 metres, 0 missing
+    depth : (H, W) float32, metres, 0 if missing
     """
     p = parameters
     rows, columns = _strayed(depth, rng, p)
@@ -187,7 +187,7 @@ def kinect_noise(
     disparity = np.divide(gain, np.where(seen, z, 1), dtype=np.float32)
     seen &= ~_shadowed(depth, gain, p)[rows, columns]
     lost = _lost_share(cos, None if loss is None else loss[rows, columns], p)
-    # a threshold on one smooth field makes losses come in patches
+    # A threshold on one smooth field groups losses in patches.
     hole = _field(depth.shape, p.patch, rng) * np.float32(0.9)
     hole += np.float32(math.sqrt(1 - 0.81)) * rng.standard_normal(depth.shape, np.float32)
     seen &= hole > special.ndtri(lost)
@@ -202,7 +202,7 @@ def kinect_noise(
 def _strayed(
     depth: Floats32, rng: np.random.Generator, p: KinectNoise
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows and columns of samples; near edges of depth, each block strays as one."""
+    """Return displaced rows and columns of samples; near edges of depth, blocks move together."""
     height, width = depth.shape
     small = (-(-height // p.edge_block), -(-width // p.edge_block))
     stray = np.round(rng.normal(0, p.edge_jitter, (2, *small))).astype(np.intp)
@@ -215,7 +215,7 @@ def _strayed(
 
 
 def _within(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
-    """Return (H, W) all but the border."""
+    """Return (H, W) whether a pixel lies inside the border."""
     left, right, top, bottom = p.border
     within = np.zeros(shape, bool)
     within[top : shape[0] - bottom, left : shape[1] - right] = True
@@ -223,10 +223,10 @@ def _within(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
 
 
 def _shadowed(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.bool_]:
-    """Return samples that the projector, to the right of the camera, cannot reach.
+    """Return the samples that the projector, to the right of the camera, does not reach.
 
-    Light leaves the projector in column u - d. Of two samples in one such column the
-    nearer is lit; nearer ones come from farther right.
+    The projector lights column u - d. Of two samples with the same column, the nearer one, whose u
+    is greater, is lit.
     """
     far = np.where(depth > 0, depth, np.float32(1e3))
     column = np.arange(depth.shape[1], dtype=np.float32) - gain / far
@@ -236,7 +236,7 @@ def _shadowed(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.b
 
 
 def _lost_share(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floats32:
-    """Return the chance (H, W) that a sample is missing: patches, grazing rays, poor surfaces."""
+    """Return the probability (H, W) that a sample is lost, without shadows and the border."""
     steep = (math.cos(p.grazing_start) - cosine) / (
         math.cos(p.grazing_start) - math.cos(p.grazing_end)
     )
@@ -247,9 +247,9 @@ def _lost_share(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floa
 
 
 def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats32:
-    """Return (H, W) normal noise of unit variance whose grain is about `size` pixels wide.
+    """Return normal noise (H, W) of unit variance with a grain of about `size` pixels.
 
-    Coarse grain is drawn on a coarse grid and enlarged, which costs a tenth of a blur.
+    Coarse grain is drawn on a coarse grid and enlarged, at a tenth of the cost of a blur.
     """
     step = max(1, int(size / 1.5))
     small = (shape[0] // step + 4, shape[1] // step + 4)
@@ -258,12 +258,12 @@ def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Flo
     if step > 1:
         noise = _enlarged(noise, step)
     noise = noise[: shape[0], : shape[1]]
-    # standard deviation of white noise after a Gaussian blur: 1 / (2 sqrt(pi) sigma)
+    # White noise after a Gaussian blur has the standard deviation 1 / (2 sqrt(pi) sigma).
     return np.asarray(noise * np.float32(2 * math.sqrt(math.pi) * size / step), np.float32)
 
 
 def _enlarged(coarse: Floats32, step: int) -> Floats32:
-    """Return linear interpolation, step samples for each one."""
+    """Return a linear interpolation with `step` samples for each coarse sample."""
     share = (np.arange(step, dtype=np.float32) / step)[:, None]
     rows = coarse[:-1, None] * (1 - share) + coarse[1:, None] * share
     rows = rows.reshape(-1, coarse.shape[1])
@@ -272,27 +272,27 @@ def _enlarged(coarse: Floats32, step: int) -> Floats32:
     return np.asarray(full.reshape(len(rows), -1), np.float32)
 
 
-# Laser scanners: a mesh and a pose to a cloud.
+# Laser scanners: from a mesh and a pose to a cloud.
 #
 # Caster, T_world_sensor (4, 4), Scanner, rng  --scan-->  points (N, 3) in the sensor's frame
 
 
 @dataclass(frozen=True)
 class Spinning:
-    """A scanner that turns about its z axis, and what it gets wrong.
+    """Parameters of a scanner that rotates about its z axis, with its errors.
 
     Parameters
     ----------
-    rings : lasers, one above the other
-    lowest, highest : elevation of the first and of the last, rad
-    azimuth_step : rad from one firing to the next
-    minimum, maximum : range, metres
-    sigma : noise of a range, metres
-    ring_sigma : offset that all ranges of a ring share, metres
-    loss : share of returns that are lost anyhow
-    grazing : cosine of incidence at which half of the returns of the farthest surface are lost
+    rings : number of lasers, one above the other
+    lowest, highest : elevation of the first and of the last laser, rad
+    azimuth_step : angle between two firings, rad
+    minimum, maximum : range limits, metres
+    sigma : standard deviation of a range, metres
+    ring_sigma : standard deviation of the offset of all ranges of a ring, metres
+    loss : fraction of returns that are lost at random
+    grazing : cosine of incidence at which half of the returns at the maximum range are lost
     blind_middle, blind_width : azimuths that the carrier hides, rad
-    blind_below : elevation below which it hides them, rad
+    blind_below : elevation below which the carrier hides them, rad
     """
 
     rings: int = 64
@@ -311,17 +311,17 @@ class Spinning:
 
     @property
     def elevations(self) -> Floats:
-        """Return (rings,) rad, from the lowest up."""
+        """Return the elevations (rings,), rad, in increasing order."""
         return np.linspace(self.lowest, self.highest, self.rings)
 
     @property
     def azimuths(self) -> Floats32:
-        """Return (firings,) rad, from -pi on."""
+        """Return the azimuths (firings,), rad, from -pi."""
         n = round(2 * math.pi / self.azimuth_step)
         return (np.arange(n) * (2 * math.pi / n) - math.pi).astype(np.float32)
 
     def rays(self, rng: np.random.Generator) -> Floats32:  # noqa: ARG002
-        """Return (rings x firings, 3) unit directions, ring by ring; the same in every scan."""
+        """Return unit directions (rings x firings, 3), ring by ring, the same in every scan."""
         azimuth, elevation = self.azimuths, self.elevations.astype(np.float32)[:, None]
         c = np.cos(elevation)
         rays = np.empty((self.rings, len(azimuth), 3), np.float32)
@@ -331,12 +331,12 @@ class Spinning:
         return rays.reshape(-1, 3)
 
     def offsets(self, rng: np.random.Generator) -> Floats32:
-        """Return (rings x firings,) errors that the ranges of a ring have in common, metres."""
+        """Return range errors (rings x firings,) that are common to a ring, metres."""
         own = rng.normal(0, self.ring_sigma, self.rings).astype(np.float32)
         return np.repeat(own, len(self.azimuths))
 
     def hidden(self) -> NDArray[np.bool_]:
-        """Return (rings x firings,) whether the carrier is in the way."""
+        """Return (rings x firings,) whether the carrier blocks the ray."""
         away = np.abs((self.azimuths - self.blind_middle + math.pi) % (2 * math.pi) - math.pi)
         below = (self.elevations < self.blind_below)[:, None]
         return np.asarray(((away < self.blind_width / 2) & below).ravel())
@@ -348,20 +348,20 @@ class Spinning:
 
 @dataclass(frozen=True)
 class Rosette:
-    """A scanner with a small field of view about its x axis that never repeats its pattern.
+    """Parameters of a scanner with a narrow view about its x axis and a non-repeating pattern.
 
-    Two prisms of equal deflection turn the beams of a few lasers at different speeds, as in a
-    Livox Avia (70 degrees, about 24,000 firings in 0.1 s). Each scan starts at other angles of
+    Two prisms of equal deflection turn the beams of a few lasers at different speeds, like a
+    Livox Avia (70 degrees, about 24,000 firings in 0.1 s). Each scan starts at random angles of
     the prisms.
 
     Parameters
     ----------
-    half_angle : of the cone that the middle of the beams fills, rad
-    firings : of one scan
-    turns : of the first and of the second prism in one scan
-    lasers : one above the other
-    laser_step : angle from one laser to the next, rad
-    minimum, maximum, sigma, loss, grazing : as in Spinning
+    half_angle : half angle of the cone that the centres of the beams fill, rad
+    firings : number of firings of a scan
+    turns : turns of the first and of the second prism in a scan
+    lasers : number of lasers, one above the other
+    laser_step : angle between two lasers, rad
+    minimum, maximum, sigma, loss, grazing : see Spinning
     """
 
     half_angle: float = math.radians(35.0)
@@ -376,7 +376,7 @@ class Rosette:
     grazing: float = 0.1
 
     def rays(self, rng: np.random.Generator) -> Floats32:
-        """Return (firings, 3) unit directions in the order of time, other ones in every scan."""
+        """Return unit directions (firings, 3) in order of time, different in every scan."""
         start = rng.uniform(-math.pi, math.pi, 2)
         turned = np.arange(self.firings)[:, None] / self.firings * (2 * math.pi) * self.turns
         waves: NDArray[np.complex128] = np.exp(1j * (turned + start))
@@ -389,11 +389,11 @@ class Rosette:
         return np.stack(rays, axis=1).astype(np.float32)
 
     def offsets(self, rng: np.random.Generator) -> Floats32:  # noqa: ARG002
-        """Return (firings,) of zeros: no ranges have an error in common."""
+        """Return zeros (firings,), since the ranges have no common error."""
         return np.zeros(self.firings, np.float32)
 
     def hidden(self) -> NDArray[np.bool_]:
-        """Return (firings,) False: nothing is in the way."""
+        """Return False (firings,), since the carrier blocks no ray."""
         return np.zeros(self.firings, np.bool_)
 
     def perfect(self) -> Rosette:
@@ -405,12 +405,12 @@ Scanner = Spinning | Rosette
 
 
 def own_scanner(rng: np.random.Generator) -> Spinning:
-    """Return a scanner as there are many: 16 to 128 rings, narrow or tall, near- or far-sighted."""
+    """Return a random realistic scanner with 16 to 128 rings."""
     rings = int(rng.choice((16, 32, 64, 64, 96, 128)))
     low, high = np.radians(rng.uniform((-45.0, 8.0), (-14.0, 45.0)))
-    if rings < 64:  # few rings are never far apart
+    if rings < 64:  # few rings have a small vertical view
         low, high = max(low, -rings * 0.018), min(high, rings * 0.018)
-    # the more rings, the coarser: scanners of many rings have tens of thousands of points as well
+    # Many rings have coarser azimuths, since such scanners also return tens of thousands of points.
     step = math.radians(rng.uniform(0.18, 0.4)) * (1.0 if rings <= 64 else 1.6)
     return Spinning(
         rings=rings, lowest=float(low), highest=float(high), azimuth_step=step,
@@ -424,7 +424,7 @@ def own_scanner(rng: np.random.Generator) -> Spinning:
 
 
 def own_rosette(rng: np.random.Generator) -> Rosette:
-    """Return a scanner of a field of view of 60 to 80 degrees, with 8,000 to 24,000 firings."""
+    """Return a scanner with a view of 60 to 80 degrees and 8,000 to 24,000 firings."""
     return Rosette(
         half_angle=float(np.radians(rng.uniform(30.0, 40.0))),
         firings=int(rng.integers(8_000, 24_001)), minimum=float(rng.uniform(0.4, 1.2)),
@@ -436,17 +436,17 @@ def own_rosette(rng: np.random.Generator) -> Rosette:
 def scan(
     caster: Caster, T_world_sensor: Floats, sensor: Scanner, rng: np.random.Generator
 ) -> Floats32:
-    """Return one scan of a scanner that stands still.
+    """Return a scan of a scanner at rest.
 
     Parameters
     ----------
-    caster : the scene, metres
+    caster : scene, metres
     T_world_sensor : (4, 4) pose
-    rng : of noise and losses, and of the directions of a Rosette
+    rng : generator of noise and losses, and of the directions of a Rosette
 
     Returns
     -------
-    (N, 3) float32, metres, sensor frame: what came back, in the order of the sensor's rays
+    points : (N, 3) float32 returns, metres, in the sensor frame and the order of the sensor's rays
     """
     rays = sensor.rays(rng)
     turned = rays @ T_world_sensor[:3, :3].T.astype(np.float32)
@@ -454,7 +454,7 @@ def scan(
     hits = caster.cast(origins, turned)
     distance = hits.distance
     cosine = np.abs(np.einsum("ij,ij->i", turned, hits.normal))
-    # a return is lost the sooner the farther off and the more grazing its surface is
+    # The probability of a loss grows with range and with grazing incidence.
     far = np.minimum(distance / np.float32(sensor.maximum), 1.0)
     held = 1 - 0.5 ** (cosine / (sensor.grazing * far + 1e-6))
     held *= (1 - sensor.loss) * (1 - np.append(caster.mesh.loss, np.float32(0))[hits.face])

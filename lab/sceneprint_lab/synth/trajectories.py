@@ -1,9 +1,9 @@
-"""Where a hand-held camera is and where it looks.
+"""Poses of hand-held cameras in rooms, and of scanners in large premises.
 
     Room, n, rng  --scattered_poses-->  n x T_world_camera (4, 4)
 
-A view is (x, y, z, yaw, pitch, roll): metres and radians; pitch is negative when the
-camera looks down; roll turns it about its optical axis.
+A view is (x, y, z, yaw, pitch, roll), metres and radians. A negative pitch looks down, and roll
+turns the camera about its optical axis.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from sceneprint_lab.synth.mesh import rotation_x, rotation_z
 from sceneprint_lab.synth.rooms import Room, inside
 from sceneprint_lab.synth.sensors import pixel_rays
 
-CLEARANCE = 0.35  #: metres from the camera to the nearest surface, at least
-HEIGHTS = (0.8, 1.9)  #: metres over the floor
-_GOOD_SHARE = 0.75  #: of a view within 0.5 to 5 m
-_COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: what a Kinect sees, in few rays
+CLEARANCE = 0.35  #: smallest distance from the camera to a surface, metres
+HEIGHTS = (0.8, 1.9)  #: range of heights above the floor, metres
+_GOOD_SHARE = 0.75  #: fraction of a view that should lie within 0.5 to 5 m
+_COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: view of a Kinect with few rays
 
 
 def pose(view: Floats) -> Floats:
-    """Return T_world_camera (4, 4) of a view (6,), in the optical frame."""
+    """Return T_world_camera (4, 4) of a view (6,), for the optical frame."""
     x, y, z, yaw, pitch, roll = view
     forward = np.array(
         [math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)]
@@ -44,10 +44,10 @@ def pose(view: Floats) -> Floats:
 
 
 def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np.bool_]:
-    """Return (n,) whether points (n, 3) are in free space, that far from all surfaces.
+    """Return (n,) whether points (n, 3) are in free space at a distance from all surfaces.
 
-    Rays go out in 128 directions. One that meets the back of a face has started inside a
-    solid or outside the room.
+    Rays are cast in 128 directions. A ray that hits the back of a face starts inside a solid or
+    outside the room.
     """
     directions = _directions(128)
     origins = np.repeat(points.astype(np.float32), len(directions), axis=0)
@@ -61,14 +61,14 @@ def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np
 
 
 def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
-    """Return independent views; each sees a good share of the room within 0.5 to 5 m.
+    """Return independent views; each sees a large part of the room within 0.5 to 5 m.
 
-    Half of them look at some object from 0.7 to 3 m, half look about from anywhere.
+    Half of them look at an object from 0.7 to 3 m, the others in a random direction.
 
     Parameters
     ----------
-    room : the scene
-    n : how many views
+    room : scene
+    n : number of views
 
     Returns
     -------
@@ -83,22 +83,22 @@ def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats
             T = pose(view)
             if len(found) < n and worth_seeing(room, T, least):
                 found.append(T)
-        least *= 0.98  # a crowded room offers little: be content with less
+        least *= 0.98  # a crowded room has few good views, so the limit falls
     return found
 
 
 def looking_about(room: Room, n: int, rng: np.random.Generator) -> Floats:
-    """Return (n, 6) views from anywhere, slightly downward."""
+    """Return views (n, 6) from random positions, slightly downward."""
     yaw = rng.uniform(-math.pi, math.pi, n)
     pitch = np.clip(np.radians(rng.normal(-15, 15, n)), -1.3, 0.6)
     return np.column_stack([_positions(room, n, rng), yaw, pitch, _rolls(n, rng)])
 
 
 def looking_at(room: Room, n: int, rng: np.random.Generator) -> Floats:
-    """Return (n, 6) views whose middle is a point on some surface between knee and head."""
+    """Return views (n, 6) centred on a random surface point between knee and head height."""
     a, b, c = (room.mesh.vertices[room.mesh.faces[:, k]] for k in range(3))
     middle = (a + b + c) / 3
-    weight = np.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1))  # small things count too
+    weight = np.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1))  # favours small objects
     weight *= (middle[:, 2] > 0.3) & (middle[:, 2] < 1.6)
     target = middle[rng.choice(len(middle), n, p=weight / weight.sum())]
     candidates = _positions(room, 6 * n, rng).reshape(n, 6, 3)
@@ -130,10 +130,10 @@ def _rolls(n: int, rng: np.random.Generator) -> Floats:
 
 
 def worth_seeing(room: Room, T_world_camera: Floats, least: float) -> bool:
-    """Return whether a share `least` of the view lies within 0.5 to 5 m, on several surfaces.
+    """Return whether a fraction `least` of the view lies within 0.5 to 5 m, on several surfaces.
 
-    Of the neighbours in a coarse grid of rays, a tenth must differ in depth or in normal,
-    and the normals must span more than one direction. Less is asked as `least` falls.
+    In a coarse grid of rays, a tenth of the neighbours must differ in depth or normal, and the
+    normals must span more than one direction. These limits fall with `least`.
     """
     rays = pixel_rays(_COARSE) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
@@ -152,14 +152,14 @@ def worth_seeing(room: Room, T_world_camera: Floats, least: float) -> bool:
 
 
 def _directions(n: int) -> Floats:
-    """Return (n, 3) unit vectors spread evenly: a Fibonacci lattice."""
+    """Return evenly distributed unit vectors (n, 3): a Fibonacci lattice."""
     k = np.arange(n) + 0.5
     z = 1 - 2 * k / n
     r, turn = np.sqrt(1 - z * z), k * math.pi * (1 + math.sqrt(5))
     return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
 
 
-# A circle around something: a camera that keeps looking at it.
+# Circles of views around an object.
 #
 # middle, radius, n, rng  --orbit-->  n x T_world_camera (4, 4), in order
 
@@ -168,17 +168,17 @@ def orbit(
     middle: tuple[float, float, float], radius: float, n: int, rng: np.random.Generator, *,
     first: float | None = None, sweep: float = 2 * math.pi,
 ) -> list[Floats]:  # fmt: skip
-    """Return hand-held views from a circle, slightly downward, each looking at its middle.
+    """Return hand-held views on a circle, slightly downward, towards its centre.
 
-    Distance, height and aim wander slowly, by a tenth of a metre or two.
+    Distance, height and aim vary slowly by one or two tenths of a metre.
 
     Parameters
     ----------
-    middle : what is looked at, metres
-    radius : of the circle, metres
-    n : how many views, evenly spread
-    first : azimuth of the first, rad; default: any
-    sweep : how far round they go, rad
+    middle : centre of the circle, metres
+    radius : radius of the circle, metres
+    n : number of views, evenly spaced
+    first : azimuth of the first view, rad; default: random
+    sweep : angle that the views cover, rad
 
     Returns
     -------
@@ -188,7 +188,7 @@ def orbit(
     azimuth = start + sweep * np.arange(n) / n
     scale = (0.15, 0.15, 0.08, 0.08, 0.08, math.radians(4.0))
     waves = rng.normal(0, 1, (6, 3)) * np.array(scale)[:, None] / math.sqrt(3)
-    phase = np.outer(np.arange(1, 4), 2 * math.pi * np.arange(n) / n)  # closed: 1 to 3 a turn
+    phase = np.outer(np.arange(1, 4), 2 * math.pi * np.arange(n) / n)  # 1 to 3 periods per turn
     away, up, *aim, roll = waves @ np.cos(phase + rng.uniform(0, 2 * math.pi, (3, 1)))
     r, z = radius + away, rng.uniform(1.05, 1.65) + up
     eye = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z])
@@ -198,23 +198,23 @@ def orbit(
     return [pose(view) for view in np.column_stack([eye, yaw, pitch, roll])]
 
 
-# A hand-held path: a camera that looks around and comes back.
+# Hand-held paths that return to places.
 #
 #     Room, n, rng  --trajectory-->  n x T_world_camera (4, 4), in order
 #
-# Viewpoints are joined by straight clear ways to a network; the path wanders over it.
+# Straight clear segments join viewpoints to a network, over which the path wanders.
 
 
 def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
-    """Return a smooth hand-held path that looks around and comes back to places it has seen.
+    """Return a smooth hand-held path that looks around and returns to earlier places.
 
-    The camera wanders between a few viewpoints, 3 to 8 cm or 1 to 3 degrees a frame,
-    whichever takes longer; its hand trembles a little.
+    The camera moves between a few viewpoints by at most 3 to 8 cm and 1 to 3 degrees per frame,
+    with a slight tremor.
 
     Parameters
     ----------
-    room : the scene
-    n : how many frames
+    room : scene
+    n : number of frames
 
     Returns
     -------
@@ -237,7 +237,7 @@ def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
 
 
 def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, list[list[int]]]:
-    """Return viewpoints (k, 6) and, for each, those that a clear straight way leads to."""
+    """Return viewpoints (k, 6) and, for each, the others at the end of a clear straight segment."""
     anchors: list[Floats] = []
     ways: list[list[int]] = []
     for attempt in range(400):
@@ -254,7 +254,7 @@ def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, 
             ways.append(reached)
             if len(anchors) == count:
                 return np.array(anchors), ways
-    for k, near in enumerate(ways):  # a nook: look about on the spot
+    for k, near in enumerate(ways):  # an isolated viewpoint only turns on the spot
         near.append(k)
     return np.array(anchors), ways
 
@@ -266,7 +266,7 @@ def _way(room: Room, a: Floats, b: Floats) -> bool:
 
 
 def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
-    """Return views from a (left out) to b; yaw goes the short way round."""
+    """Return views from a (excluded) to b; yaw takes the shorter direction."""
     change = b - a
     change[3] = (change[3] + math.pi) % (2 * math.pi) - math.pi
     walked = np.linalg.norm(change[:3]) / rng.uniform(0.03, 0.08)
@@ -276,23 +276,23 @@ def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _smoothed(values: Floats, radius: int) -> Floats:
-    """Return columns after a triangular moving mean over 2 radius + 1 rows, the ends held."""
+    """Return columns after a triangular moving mean over 2 radius + 1 rows, with constant ends."""
     kernel = np.bartlett(2 * radius + 3)[1:-1]
     kernel /= kernel.sum()
     padded = np.pad(values, ((radius, radius), (0, 0)), mode="edge")
     return np.column_stack([np.convolve(c, kernel, mode="valid") for c in padded.T])
 
 
-# Where a scanner is carried: poses on a walk through large premises, or here and there.
+# Poses of a scanner in large premises, on a walk or independent.
 #
-# Premises, n, rng  --walk, scattered-->  T_world_sensor (4, 4), n of them
+# Premises, n, rng  --walk, scattered-->  n x T_world_sensor (4, 4)
 
-STEP = 1.5  #: metres from scan to scan on a walk
-COARSE = 3  #: cells of the floor's grid to one of the grid that walks go on
+STEP = 1.5  #: distance between scans on a walk, metres
+COARSE = 3  #: number of cells of the floor's grid in a cell of the grid for walks
 
 
 def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floats]:
-    """Return poses anywhere in the premises, facing anywhere."""
+    """Return n random poses in the premises."""
     spots = premises.floor.points[premises.walkable]
     height = float(rng.uniform(0.5, 1.9))
     chosen = spots[rng.integers(0, len(spots), n)]
@@ -300,13 +300,13 @@ def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floa
 
 
 def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STEP) -> list[Floats]:
-    """Return poses every `step` metres on a walk, facing ahead; it comes back often.
+    """Return poses every `step` metres on a walk that often returns; each faces ahead.
 
     Parameters
     ----------
-    n : how many
-    rng : of places, heights and wobble
-    step : metres
+    n : number of poses
+    rng : generator of places, heights and wobble
+    step : distance between poses, metres
     """
     spots, graph = _ways(premises)
     path = [spots[0][None]]
@@ -322,7 +322,7 @@ def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STE
         length += max(float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()), 1e-3)
         path.append(line)
         at = leg[-1]
-        if len(path) > 50 * n:  # premises of a single spot
+        if len(path) > 50 * n:  # the premises have a single walkable cell
             break
     line = np.concatenate(path[1:])
     line = ndimage.gaussian_filter1d(line, 1.5, axis=0, mode="nearest")
@@ -339,7 +339,7 @@ def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STE
 
 
 def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Generator) -> Floats:
-    """Return T_world_sensor (4, 4) of a scanner that is carried nearly upright."""
+    """Return T_world_sensor (4, 4) of a scanner that is carried almost upright."""
     roll, pitch = rng.normal(0, math.radians(1.5), 2)
     T = np.eye(4)
     across = rotation_z(math.pi / 2) @ rotation_x(float(pitch)) @ rotation_z(-math.pi / 2)
@@ -349,7 +349,7 @@ def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Genera
 
 
 def _ways(premises: Premises) -> tuple[Floats, csr_array]:
-    """Return spots (n, 2) that one can walk on, and the distances of neighbours."""
+    """Return walkable spots (n, 2), and the distances between neighbours."""
     free = premises.walkable[::COARSE, ::COARSE]
     parts, count = ndimage.label(free, np.ones((3, 3)))
     if count:
