@@ -1,1 +1,1 @@
-"""Measurements: accuracy by the protocol of docs/performance.md, speed beside a yardstick."""
+"""Benchmarks of speed and cost beside references that run in the same process."""

@@ -1,4 +1,4 @@
-"""Measure what each part costs beside references in the same run, and print tables.
+"""Measure the cost of each part beside references in the same run, and print tables.
 
 `make bench` measures all parts.
 `python -m benchmarks --only service --map-frames 10000` measures one part.
@@ -28,12 +28,12 @@ from sceneprint_lab.cli.demo import write_building
 from sceneprint_lab.synth import synthesise_room
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Folder of real recordings. Synthetic rooms replace those that are missing.
+#: Folder of real recordings. Synthetic rooms replace missing recordings.
 RECORDINGS = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
 
 
 def thin(frames: list[FrameReference], most: int) -> list[FrameReference]:
-    """Return at most so many frames, evenly spread."""
+    """Return at most `most` frames, evenly spread."""
     return frames[:: max(len(frames) // most, 1)][:most]
 
 
@@ -60,7 +60,7 @@ def frames_to_serve(dataset: Path) -> Iterator[list[FrameReference]]:
 
 
 def parts(options: argparse.Namespace) -> dict[str, Callable[[], list[str]]]:
-    """Return what measures each part. From `signing` on, all run on one processor."""
+    """Return the function that measures each part; from `signing` on, all use one processor."""
 
     def serve(measure: Callable[[list[FrameReference]], list[str]]) -> list[str]:
         with frames_to_serve(options.dataset) as frames:

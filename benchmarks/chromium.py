@@ -1,4 +1,4 @@
-"""Drive a Chromium without a window, as a person would use the dashboard."""
+"""A headless Chromium that uses the dashboard like a person."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-#: Notes when the main part of the page was last ready, by the clock that starts with the page.
+#: Records the time since navigation at which the main part of the page last became ready.
 _WATCH = """new MutationObserver(() => {
   const main = document.getElementById("main");
   window.settledAt = main?.getAttribute("aria-busy") === "false" ? performance.now() : undefined;
@@ -25,14 +25,14 @@ _WATCH = """new MutationObserver(() => {
 
 
 def installed() -> str | None:
-    """Return the path of a Chromium, or None."""
+    """Return the path of a Chromium, or None if none is installed."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 @contextmanager
 def chromium(path: str) -> Iterator[Browser]:
     """Run a browser until the context ends."""
-    from playwright.sync_api import sync_playwright  # of the extra `dev`
+    from playwright.sync_api import sync_playwright  # in the extra `dev`
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
@@ -43,7 +43,7 @@ def chromium(path: str) -> Iterator[Browser]:
 
 
 def watched(page: Page) -> Page:
-    """Let a page note when it has settled, for `settled`."""
+    """Make a page record the time at which it settles, for `settled`."""
     page.add_init_script(_WATCH)
     return page
 
@@ -56,7 +56,7 @@ def settled(page: Page) -> float:
 def until(page: Page, expression: str) -> Any:
     """Return the first value of an expression that is neither null nor false.
 
-    Playwright's own wait evaluates in the page, which the policy of the dashboard forbids.
+    Playwright's own wait evaluates code in the page, which the policy of the dashboard forbids.
     """
 
     def values() -> list[Any]:

@@ -1,4 +1,4 @@
-"""Measure how soon the dashboard shows its content in a real browser with an empty cache."""
+"""Measure how soon the dashboard shows its content in a browser with an empty cache."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 MAP, LARGE = "building", "large"
 RUNS, FRAMES = 5, 100_000
-#: The slow network: bytes a second either way, and milliseconds until an answer begins.
+#: Slow network: bytes per second in either direction, and latency in milliseconds.
 SLOW = {"downloadThroughput": 1.25e6, "uploadThroughput": 1.25e6, "latency": 40}
-#: The canvas whose drawing is timed, CSS pixels, and how often it is drawn.
+#: Size of the canvas whose drawing is timed, CSS pixels, and number of drawings.
 CANVAS, DRAWN = (900, 600), 20
 _DRAW = """async ([width, height, times, of]) => {
   const canvas = document.querySelector(of), viewer = canvas.viewer;
@@ -48,11 +48,11 @@ _CELLS = """document.querySelector("canvas.paths-canvas").viewer.layer("surface"
   .tiles.reduce((sum, one) => sum + one.data.byteLength / 8, 0)"""
 
 
-#: When a mark of the page was set, milliseconds after its beginning.
+#: Time at which the page set a mark, milliseconds after navigation.
 _MARKED = 'performance.getEntriesByName("{}")[0]?.startTime ?? null'
 _PICTURES = """Promise.all([...document.querySelectorAll("canvas.picture")].map((one) =>
   one.ready)).then((all) => [all.filter(Boolean).length, performance.now()])"""
-#: Points of both clouds of an overlay, by what the header of each says.
+#: Number of points of both clouds of an overlay, from their headers.
 _POINTS = """(async () => { const {parsePoints} = await import("/dashboard/viewer/points.js");
   const all = performance.getEntriesByType("resource").map((one) => one.name)
     .filter((name) => new URL(name).pathname.endsWith("/points"));
@@ -63,8 +63,8 @@ _POINTS = """(async () => { const {parsePoints} = await import("/dashboard/viewe
 
 @dataclass(frozen=True)
 class Load:
-    """One load of a page: seconds until it was ready, bytes as sent of its code and of all, and
-    what the page said in the console, with requests to other places.
+    """A page load: seconds until it was ready, transferred bytes of code and in total, and messages
+    of the console with requests to other hosts.
     """
 
     seconds: float
@@ -74,12 +74,12 @@ class Load:
 
 
 def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
-    """Fill a service, look at it, and return the table.
+    """Fill a service, load its dashboard, and return the table.
 
     Parameters
     ----------
-    frames : of the large map
-    runs : loads of each page, of which the table has the medians
+    frames : number of frames of the large map
+    runs : number of loads of each page; the table has their medians
     """
     path, lines = installed(), ["### The dashboard in Chromium", ""]
     if path is None:
@@ -134,7 +134,7 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
 
 
 def _overlay(client: httpx.Client, views: list[Shot]) -> str:
-    """Query a frame with one that is near it; return the address of their overlay."""
+    """Query a frame near a stored one; return the address of their overlay."""
     camera = {"intrinsics": views[3].meta["intrinsics"]}
     files = {"frame": (views[3].name, views[3].data, "image/png")}
     answer = client.post(
@@ -145,7 +145,7 @@ def _overlay(client: httpx.Client, views: list[Shot]) -> str:
     return f"#/queries/{found['query_id']}/matches/{match}?map={MAP}"
 
 
-# When a page is ready: milliseconds after its beginning.
+# Times at which pages are ready, milliseconds after navigation.
 
 
 def _is_usable(page: Page) -> float:
@@ -171,7 +171,7 @@ def _has_pictures(page: Page) -> float:
 def _load(
     browser: Browser, address: str, ready: Callable[[Page], float], *, slow: bool = False
 ) -> Load:
-    """Load a page in a context of its own, whose cache is empty."""
+    """Load a page in a new context, whose cache is empty."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     try:
         page = watched(context.new_page())
@@ -189,7 +189,7 @@ def _load(
         home = urlsplit(address)
         faults += [one.url for one in came if urlsplit(one.url).netloc != home.netloc]
         sizes = [(urlsplit(one.url).path, one.sizes()["responseBodySize"]) for one in list(came)]
-        # not the picture in the tab, which the browser fetches when it likes
+        # The browser fetches the tab's icon at a random time, so it does not count.
         code = sum(n for p, n in sizes if p.startswith(home.path) and not p.endswith(".svg"))
         return Load(seconds, code, sum(n for _, n in sizes), list(faults))
     finally:
@@ -197,7 +197,7 @@ def _load(
 
 
 def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> dict[str, Any]:
-    """Draw a canvas repeatedly; `size` is an expression for the number of points or cells drawn."""
+    """Draw a canvas repeatedly; `size` is an expression for the number of drawn points or cells."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     try:
         page = watched(context.new_page())
@@ -205,16 +205,16 @@ def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> 
         until(page, _MARKED.format(mark))
         settled(page)
         drawn: dict[str, Any] = page.evaluate(_DRAW, [*CANVAS, DRAWN, canvas])
-        # only clouds are antialiased
+        # Only clouds are antialiased.
         if drawn["size"] != list(CANVAS) or drawn["smooth"] != (mark == "overlay"):
-            raise AssertionError(f"another canvas was drawn than the one that is meant: {drawn}")
+            raise AssertionError(f"the wrong canvas was drawn: {drawn}")
         return drawn | {"size": int(page.evaluate(size))}
     finally:
         context.close()
 
 
 def _hear(faults: list[str], message: Any) -> None:
-    # without a graphics card Chromium says of itself that reading what was drawn is slow
+    # Without a graphics card, Chromium itself warns that reading drawn pixels is slow.
     if message.type in ("error", "warning") and "GL Driver Message" not in message.text:
         faults.append(message.text)
 

@@ -1,4 +1,4 @@
-"""Measure signing stage by stage, beside Open3D's FPFH of the same frames in the same run."""
+"""Measure signing by stages, beside Open3D's FPFH of the same frames in the same run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sceneprint_lab.evaluation.pair_run import FEATURES, NORMALS, VOXEL, Clock, 
 
 
 def signing_stages(frame: DepthFrame, signer: Signer) -> dict[str, float]:
-    """Return milliseconds of each stage of `sign`; their sum is the time of `sign` itself."""
+    """Return the milliseconds of each stage of `sign`; their sum is the time of `sign`."""
     model, p, clock = signer.model, signer.model.parameters, Clock()
     q, camera = clock.run("inverse depth", lambda: inverse_depth(frame, p.depth))
     seen = clock.run("points and normals", lambda: fit_surface(q, camera, p.normals))
@@ -52,7 +52,7 @@ def signing_stages(frame: DepthFrame, signer: Signer) -> dict[str, float]:
 
 
 def artifact_stages(frame: DepthFrame, signer: Signer) -> tuple[dict[str, float], int]:
-    """Return milliseconds of each stage of the geometry artifact beside `sign`, and its bytes."""
+    """Return the milliseconds of each stage of the geometry artifact, and its size in bytes."""
     clock, model = Clock(), signer.model
     seen = see(frame, model.parameters)
     geometry = clock.run("patches and descriptors", lambda: geometry_of(seen, model))
@@ -62,7 +62,7 @@ def artifact_stages(frame: DepthFrame, signer: Signer) -> tuple[dict[str, float]
 
 
 def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
-    """Return milliseconds of each stage of FPFH."""
+    """Return the milliseconds of each stage of FPFH."""
     clock, search = Clock(), o3d.geometry.KDTreeSearchParamHybrid
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     thin = clock.run("FPFH voxel grid", lambda: cloud.voxel_down_sample(VOXEL))
@@ -75,13 +75,13 @@ def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
 
 
 def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list[str]:
-    """Sign every frame and, in turn, compute its FPFH; return the table.
+    """Sign every frame and compute its FPFH, in turn; return the table.
 
     Parameters
     ----------
-    frames : of a depth camera
-    preset : of the model
-    warm_up : frames that are also signed before the clock runs
+    frames : frames of a depth camera
+    preset : preset of the model
+    warm_up : number of frames that are signed first without timing
     """
     signer, o3d, note = open_signer(preset), *open3d_or_note()
     p = signer.model.parameters.depth
@@ -129,7 +129,7 @@ def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list
 
 
 def open3d_or_note() -> tuple[Any, str]:
-    """Return Open3D, or None and the reason why it is missing."""
+    """Return Open3D, or None and the reason why it cannot be imported."""
     try:
         return open3d("FPFH"), ""
     except MissingDependency as error:
@@ -137,6 +137,6 @@ def open3d_or_note() -> tuple[Any, str]:
 
 
 def stage_rows(rows: Sequence[Mapping[str, float]], prefix: str = "") -> Iterable[str]:
-    """Yield a row of a table for each stage: its median."""
+    """Yield a table row with the median of each stage."""
     for stage in rows[0] if rows else ():
         yield f"| {prefix}{stage} | {np.median([row[stage] for row in rows]):.1f} |"

@@ -1,4 +1,4 @@
-"""Fill maps with many frames at once: rows as workers write them, of given signatures."""
+"""Fill maps with many frames at once, with the rows that workers would write."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sceneprint.store.tables import frames, maps, signatures
 from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState
 
-#: Frames of one commit.
+#: Number of frames in one commit.
 BLOCK = 2_000
 
 
@@ -26,17 +26,17 @@ def fill(
     database: Database, name: str, model: Model, vectors: Bytes, *, blob: str = "0" * 64,
     columns: Sequence[Mapping[str, Any]] | None = None, signed: Mapping[str, Any] | None = None,
 ) -> None:  # fmt: skip
-    """Put indexed frames into a map, which is created if it does not exist.
+    """Add indexed frames to a map, which is created if it does not exist.
 
     Parameters
     ----------
-    database : of the store
-    name : of the map
-    model : of its signatures
-    vectors : (n, D) the signatures
+    database : database of the store
+    name : name of the map
+    model : model of its signatures
+    vectors : (n, D) signatures
     blob : digest of the upload and the artifact of each frame
-    columns : of each frame, what differs from that
-    signed : of all signatures, what differs from that
+    columns : other values of the columns of each frame
+    signed : other values of the columns of all signatures
     """
     for start in range(0, len(vectors), BLOCK):
         block = slice(start, start + BLOCK)
@@ -79,7 +79,7 @@ def fill(
 
 
 def _map_number(connection: Connection, name: str, model: Model) -> int:
-    """Return the number of a map, which is created if need be."""
+    """Return the number of a map, which is created if it does not exist."""
     number = connection.execute(select(maps.c.number).where(maps.c.name == name)).scalar()
     if number is None:
         store_model(connection, model.id, model.name, write_model(model))

@@ -1,4 +1,4 @@
-"""Answer queries by the library alone, for comparison with the service."""
+"""Answers of the library alone, for comparison with the service."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from sceneprint.types import Floats, Geometry
 from sceneprint_client.api import Answer
 from sceneprint_lab.evaluation.pair_run import Clock
 
-#: Matches for comparison: place in the database, and transform row by row.
+#: Matches for comparison: index in the database, and transform row by row.
 Matches = list[tuple[int, list[list[float]]]]
 
 
 class Library:
-    """A database in memory that is queried stage by stage.
+    """A database in memory with timed stages of a query.
 
     Parameters
     ----------
-    frames : of the database
+    frames : frames of the database
     """
 
     def __init__(self, frames: Sequence[FrameReference]) -> None:
@@ -50,7 +50,7 @@ class Library:
             self._poses.append(frame.pose)
 
     def ask(self, query: FrameReference) -> tuple[dict[str, float], Matches]:
-        """Return milliseconds of each stage, and the accepted matches."""
+        """Return the milliseconds of each stage, and the accepted matches."""
         clock = Clock()
         frame = clock.run("decode", query.read)
         signature, seen = clock.run("sign, with geometry", lambda: prepare(frame, self._signer))
@@ -58,12 +58,12 @@ class Library:
             "retrieve", lambda: retrieve(signature, self._signatures, self._signer.model)
         )
         selection = clock.run("diversify", lambda: diversify(ranking, self._signatures))
-        geometry = read_geometry(write_geometry(seen))  # as both have it
+        geometry = read_geometry(write_geometry(seen))  # the service uses decoded artifacts too
         validate = partial(associate, geometry, ranking, selection.indices.tolist(), self._geometry)
         matches = clock.run("validate", lambda: validate(pose_of=self._pose))
         estimate = clock.run("locate", lambda: self._locate(geometry, matches))
         before = unguided_validations(matches)
-        # as a service does
+        # The service does the same.
         if before is not None and estimate is not None and estimate.status != "found":
             matches = validate(known=before)
         return clock.stages, [
@@ -88,7 +88,7 @@ class Library:
 
 
 def accepted(answer: Answer, names: Mapping[str, int]) -> Matches:
-    """Return the accepted matches of a service's answer, in the terms of `Library.ask`."""
+    """Return the accepted matches of a service's answer in the format of `Library.ask`."""
     return [
         (names[match.frame_id], match.transform.matrix)
         for match in answer.matches
@@ -97,10 +97,10 @@ def accepted(answer: Answer, names: Mapping[str, int]) -> Matches:
 
 
 def are_same(some: Matches, others: Matches) -> bool:
-    """Return whether matches are the same to 0.01 mm.
+    """Return whether matches are equal to 0.01 mm.
 
-    A service stores poses in other last bits. Where one lets a point more or less into the last
-    step of a refinement, the transform moves by some micrometres.
+    A service rounds stored poses differently. If this adds or removes a point in the last step of a
+    refinement, the transform changes by some micrometres.
     """
     return [i for i, _ in some] == [i for i, _ in others] and all(
         np.allclose(one, other, rtol=0, atol=1e-5)

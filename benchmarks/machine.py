@@ -1,4 +1,4 @@
-"""Describe the machine of a measurement, and read from /proc what processes cost there."""
+"""Description of the machine, and resource use of processes from /proc."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def version_of(package: str) -> str:
 
 
 def measured_on(command: str) -> str:
-    """Return a sentence that says when, where and by which command figures were measured."""
+    """Return a sentence with the time, machine and command of a measurement."""
     names = [
         line.partition(":")[2].strip()
         for line in Path("/proc/cpuinfo").read_text().splitlines()
@@ -60,7 +60,7 @@ def peak_megabytes_of_signing(folder: Path, preset: str) -> float:
         "import sys\n"
         "from sceneprint.cli import main\n"
         f"main(['sign', sys.argv[1], '--preset', {preset!r}])\n"
-        # ru_maxrss survives exec, and would be the peak of the parent
+        # ru_maxrss survives exec and would include the parent.
         "status = open('/proc/self/status').read()\n"
         "print(status.split('VmHWM:')[1].split()[0], file=sys.stderr)\n"
     )
@@ -78,7 +78,7 @@ def read_process(pid: int, name: str) -> bytes:
 
 
 def running_processes() -> Iterator[tuple[int, int, int]]:
-    """Yield the number, group and parent of each process that runs."""
+    """Yield number, group and parent of each running process."""
     for path in Path("/proc").glob("[0-9]*"):
         fields = read_process(int(path.name), "stat").rpartition(b")")[2].split()
         if fields and fields[0] != b"Z":
@@ -86,33 +86,33 @@ def running_processes() -> Iterator[tuple[int, int, int]]:
 
 
 def peak_bytes(pid: int) -> int:
-    """Return the most memory that a process ever had."""
+    """Return the peak memory of a process, bytes."""
     found = re.search(rb"^VmHWM:\s+(\d+) kB", read_process(pid, "status"), re.MULTILINE)
     return 1024 * int(found[1]) if found else 0
 
 
 def own_bytes(process: Path) -> int:
-    """Return the memory that a process, by its folder under /proc, shares with no other."""
+    """Return the memory, bytes, that a process (a folder under /proc) does not share."""
     lines = (process / "smaps_rollup").read_text().splitlines()
     return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))
 
 
 def processor_ns(process: Path) -> int:
-    """Return the processor time that a process and its running children have used."""
+    """Return the processor time of a process and its running children, nanoseconds."""
     total = 0
     for task in process.glob("task/*"):
         total += int((task / "schedstat").read_text().split()[0])
         for child in (task / "children").read_text().split():
-            with suppress(OSError):  # it has ended
+            with suppress(OSError):  # the child has ended
                 total += processor_ns(Path("/proc") / child)
     return total
 
 
 def sum_over_processes(figure: Callable[[Path], int], data: Path, command: str) -> int:
-    """Return add up a figure of all processes that run a command on a data folder."""
+    """Return the sum of a figure over all processes that run a command on a data folder."""
     total = 0
     for path in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # the process has ended
             words = path.read_bytes().split(b"\0")
             if str(data).encode() in words and command.encode() in words:
                 total += figure(path.parent)

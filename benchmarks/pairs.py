@@ -1,4 +1,4 @@
-"""Choose pairs of frames that see much of each other, with their true transforms."""
+"""Pairs of overlapping frames with their true transforms."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from sceneprint.types import DepthFrame, Floats
 from sceneprint_lab.evaluation.protocol import overlap, view_of
 from sceneprint_lab.synth import synthesise_room
 
-#: A pair counts where the smaller share of either frame seen by the other is at least this.
+#: Smallest overlap of a pair, in the direction with less overlap.
 LEAST_OVERLAP = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames of one parent frame, and how one lies to the other.
+    """Two frames of one parent frame, and their relative pose.
 
     Parameters
     ----------
-    query, match : with poses
-    overlap : the smaller direction, in [0, 1]
-    T_match_query : (4, 4), from the poses
+    query, match : frames with poses
+    overlap : smaller overlap of the two directions, [0, 1]
+    T_match_query : (4, 4) true transform from the poses
     """
 
     query: DepthFrame
@@ -36,7 +36,7 @@ class FramePair:
 
 
 def pairs_among(frames: Sequence[DepthFrame], apart: int = 1) -> list[FramePair]:
-    """Return all pairs of frames that overlap enough, and are `apart` places or more apart."""
+    """Return all pairs that overlap enough and are at least `apart` frames apart."""
     views, found = [view_of(frame) for frame in frames], []
     for i, query in enumerate(frames):
         for j, match in enumerate(frames[: max(i + 1 - apart, 0)]):
@@ -50,7 +50,7 @@ def pairs_among(frames: Sequence[DepthFrame], apart: int = 1) -> list[FramePair]
 
 
 def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
-    """Return `n` pairs of the first 7-Scenes sequence, two steps or more apart, or none."""
+    """Return `n` pairs of the first 7-Scenes sequence, at least two steps apart, or none."""
     scenes = recordings / "7scenes"
     if not scenes.is_dir():
         return []
@@ -59,7 +59,7 @@ def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
 
 
 def synthetic_pairs(n: int) -> list[FramePair]:
-    """Return `n` pairs of views of synthetic rooms, a few of each room."""
+    """Return `n` pairs of views of synthetic rooms, a few per room."""
     found: list[FramePair] = []
     number = 0
     while len(found) < n:

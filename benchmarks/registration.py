@@ -1,7 +1,7 @@
 """Measure the validation of two frames beside Open3D's FPFH + RANSAC + ICP.
 
-Ours works in both directions, accepts or rejects the result, and looks for rivals. Open3D's works
-in one direction and always answers. The features of both frames count, for both.
+Our validation works in both directions, accepts or rejects the result, and searches for rivals.
+Open3D works in one direction and never rejects. Both timings include the features of both frames.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_lab.evaluation.pair_run import METHODS, Clock, points_of, register
 
-#: The one of Open3D's methods that is timed here; `sceneprint evaluate-pairs` has the others.
+#: The timed method of Open3D; `sceneprint evaluate-pairs` measures the others.
 METHOD = METHODS[0]
-#: A transform is right within this, metres and radians.
+#: Greatest errors of a correct transform, metres and radians.
 RIGHT = (0.10, float(np.radians(10.0)))
 
 
 def register_by_us(
     query: DepthFrame, match: DepthFrame, model: Model, clock: Clock
 ) -> Floats | None:
-    """Validate two frames; return T_match_query (4, 4) if it is accepted."""
+    """Validate two frames; return T_match_query (4, 4) of an accepted match, else None."""
     of_query, of_match = clock.run(
         "geometry of both frames",
         lambda: [geometry_of(see(frame, model.parameters), model) for frame in (query, match)],
@@ -47,13 +47,13 @@ def is_right(T_match_query: Floats | None, truth: Floats) -> bool:
 
 
 def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> list[str]:
-    """Validate every pair and, in turn, register it by Open3D; return the table.
+    """Validate every pair and register it with Open3D, in turn; return the table.
 
     Parameters
     ----------
-    pairs : at least one
-    model : with the parameters of our validation
-    warm_up : pairs that are also validated before the clock runs
+    pairs : at least one pair
+    model : model with the parameters of our validation
+    warm_up : number of pairs that are validated first without timing
     """
     p, (o3d, note) = model.parameters.depth, open3d_or_note()
     for pair in pairs[:warm_up]:

@@ -1,4 +1,4 @@
-"""Put synthetic rooms into a running service, for the dashboard to show."""
+"""Synthetic rooms in a running service, for the dashboard."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SEED = 21
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image of a room or a scan of a hall, and the fields of its upload."""
+    """A depth image or a scan, and the fields of its upload."""
 
     data: bytes
     meta: dict[str, Any]
@@ -46,24 +46,24 @@ class Shot:
 
 
 def camera_of(k: Intrinsics) -> dict[str, float]:
-    """Return the intrinsics of an upload."""
+    """Return the intrinsics for an upload."""
     return {name: getattr(k, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 
 def pose_in(parent: str, T: Floats | None) -> dict[str, Any]:
-    """Return the pose of an upload."""
+    """Return the pose for an upload."""
     assert T is not None  # synthetic frames have poses
     return {"parent_frame": parent, "matrix": T.tolist()}
 
 
 def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
-    """Return views along a path through each room, by two robots in turn, a second apart.
+    """Return views along a path through each room, taken by two robots in turn every second.
 
     Parameters
     ----------
-    rooms : their numbers
-    views : of each room
-    step : use every so many views of the path, which are some 5 cm or 2 degrees apart
+    rooms : numbers of the rooms
+    views : number of views of each room
+    step : interval of views along the path, in steps of about 5 cm or 2 degrees
     """
     found = []
     with TemporaryDirectory() as folder:
@@ -85,7 +85,7 @@ def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
 
 
 def scans(views: int) -> list[Shot]:
-    """Return scans of a spinning LiDAR on one walk through a hall."""
+    """Return scans of a spinning LiDAR on a walk through a hall."""
     clouds = synthesise_survey(SEED, 0, views, along_path=True, kind="hall").clouds
     found = []
     for view, cloud in enumerate(clouds):
@@ -98,7 +98,7 @@ def scans(views: int) -> list[Shot]:
 
 
 def box(ahead: float) -> Shot:
-    """Return a view of a bare room, `ahead` metres nearer its end; it is the same upside down."""
+    """Return a view of an empty room, moved by `ahead` metres; upside down it looks the same."""
     v, u = np.mgrid[:240, :320].astype(float)
     x, y = abs(u - 159.5) / 292.5, abs(v - 119.5) / 292.5
     depth = np.minimum.reduce([1.5 / np.maximum(x, 1e-6), 1.1 / y, np.full(x.shape, 3.2 - ahead)])
@@ -109,11 +109,11 @@ def box(ahead: float) -> Shot:
 
 
 def circled(azimuths: Sequence[float]) -> list[Shot]:
-    """Return views of a cube in an empty hall, 1.8 m away: its four sides look the same.
+    """Return views of a cube in an empty hall, 1.8 m away; its four sides look the same.
 
     Parameters
     ----------
-    azimuths : of the camera as seen from the cube, degrees
+    azimuths : azimuths of the camera seen from the cube, degrees
     """
     room, rng, found = symmetric_box(), np.random.default_rng(SEED), []
     for view, azimuth in enumerate(azimuths):
@@ -143,7 +143,7 @@ def send(client: httpx.Client, name: str, of: list[Shot]) -> list[str]:
 
 
 def wait(client: httpx.Client, path: str, states: set[str]) -> None:
-    """Wait until all frames of a map are in one of these states."""
+    """Wait until all frames of a map are in one of the given states."""
     until(lambda: not set(client.get(path).raise_for_status().json()["frames"]) - states)
 
 
@@ -155,16 +155,16 @@ def fuse(client: httpx.Client, name: str) -> None:
 
 
 def multiply(data: Path, source: str, name: str, count: int) -> None:
-    """Create a map of many frames that are all like the first of another map, for lists to show.
+    """Create a map with many copies of one frame of another map, as content for lists.
 
-    They share its blobs; their signatures are a byte long, since no query searches this map.
+    They share its blobs. Their signatures have one byte, since no query searches this map.
 
     Parameters
     ----------
-    data : folder of the store
+    data : data folder of the store
     source : name of a map with an indexed frame
-    name : of the new map
-    count : of its frames
+    name : name of the new map
+    count : number of frames
     """
     rng = np.random.default_rng(SEED)
     settings = Settings(data_dir=data)

@@ -1,4 +1,4 @@
-"""Run a server of the S3 protocol as a process: moto's, which keeps objects in memory."""
+"""A server of the S3 protocol in its own process: moto, which stores objects in memory."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _MAIN = "import sys; from moto.server import main; main(sys.argv[1:])"
 
 
 class ObjectServer:
-    """A server on this machine, which starts when it is entered; it checks no signatures.
+    """An S3 server that starts when the context is entered; it checks no signatures.
 
     Parameters
     ----------
-    port : to listen on; 0 for a free one
-    log : file that gets a line for each request, which `requests` counts
+    port : port to listen on; 0 for a free one
+    log : file that receives a line per request, which `requests` counts
     """
 
     def __init__(self, port: int = 0, log: Path | None = None) -> None:
@@ -34,14 +34,14 @@ class ObjectServer:
 
     @property
     def env(self) -> dict[str, str]:
-        """Return the environment variables of a process that uses the server."""
+        """Return the environment variables for a process that uses the server."""
         return {
             "AWS_ENDPOINT_URL": self.endpoint, "AWS_ALLOW_HTTP": "true", "AWS_REGION": "us-east-1",
             "AWS_ACCESS_KEY_ID": "fleet", "AWS_SECRET_ACCESS_KEY": "no-secret",
         }  # fmt: skip
 
     def start(self) -> None:
-        """Start the server, and wait until it answers."""
+        """Start the server and wait until it answers."""
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _MAIN, "-H", "127.0.0.1", "-p", str(self.port)],
@@ -55,7 +55,7 @@ class ObjectServer:
         return f"s3://{name}"
 
     def requests(self) -> Counter[str]:
-        """Count the requests so far by method."""
+        """Return the number of requests by method."""
         text = self._log.read_text(errors="replace")
         return Counter(re.findall(r'"(GET|HEAD|PUT|POST|DELETE) ', text))
 

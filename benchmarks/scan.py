@@ -9,20 +9,20 @@ import numpy as np
 from sceneprint.geometry.retrieval.ranking import cross_distances, distances
 from sceneprint_lab.evaluation.pair_run import Clock
 
-#: Queries that share one pass over the database.
+#: Number of queries that share a pass over the database.
 TOGETHER = 8
-#: Signatures, bytes of each and runs: far more than caches hold, whitened and of psi.
+#: Numbers of signatures, their bytes, and runs; far larger than caches, whitened and psi.
 SCANNED = ((1_000_000, 448, 9), (4096, 125_000, 9))
 
 
 def measure(signatures: int, length: int, runs: int) -> list[str]:
-    """Scan random signatures, and read them, in turn; return the table.
+    """Scan and read random signatures in turn; return the table.
 
     Parameters
     ----------
-    signatures : in the database
-    length : of each, bytes; a multiple of 8
-    runs : of every row
+    signatures : number of signatures in the database
+    length : bytes per signature, a multiple of 8
+    runs : number of runs of every row
     """
     rng = np.random.default_rng(0)
     database = rng.integers(0, 256, (signatures, length), np.uint8)
@@ -40,9 +40,9 @@ def measure(signatures: int, length: int, runs: int) -> list[str]:
     }  # fmt: skip
     reads: list[float] = []
     times: dict[str, list[float]] = {name: [] for name in scans}
-    for run in range(-1, runs):  # the first compiles and warms up
+    for run in range(-1, runs):  # the first run compiles and warms up
         clock = Clock()
-        # the sum of eight bytes at a time costs less than fetching them
+        # Summing words of eight bytes costs less than fetching them.
         clock.run("read", words.sum)
         for name, (_, scan) in scans.items():
             clock.run(name, scan)

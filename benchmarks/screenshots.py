@@ -1,4 +1,4 @@
-"""Take a picture of every page of the dashboard, light and dark: `make screenshots`.
+"""Take screenshots of every page of the dashboard, light and dark: `make screenshots`.
 
 The service shows synthetic rooms and a hall of `sceneprint_lab.synth`.
 """
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
     from playwright.sync_api import FilePayload
 
 MAP, HALL, BOXES, SIDES = "building", "hall-3", "boxes", "four-sides"
-#: Rooms, views of each, and the number of steps of the path from one view to the next.
+#: Rooms, number of views of each, and number of steps of the path between two views.
 ROOMS, VIEWS, STEP = (3, 0), 12, 4
-#: Width, and least and greatest height of a picture.
+#: Width, and smallest and greatest height of a screenshot.
 WIDTH, LOW, HIGH = 1280, 800, 2400
-#: Width and height of an upright tablet, and of a phone.
+#: Width and height of a tablet in portrait orientation, and of a phone.
 TABLET, PHONE = (768, 1024), (390, 844)
-#: Seconds that a page may go on drawing after its main part is ready.
+#: Seconds for drawing after the main part of a page is ready.
 LINGER_S = 2.0
-#: Bytes a second of uploads, so slow that a picture shows them.
+#: Upload speed, bytes per second, low enough for a screenshot of the progress.
 SLOW_UPLOADS = 20_000
-#: Waits until all pictures of a page are drawn.
+#: Expression that waits until all pictures of a page are drawn.
 _PICTURES = """Promise.all([...document.querySelectorAll("canvas.picture")].map((one) =>
   one.ready)).then(() => true)"""
-#: The address that a proxy would send, for which the service requires a key.
+#: Header that makes the request look remote, so that the service requires a key.
 ELSEWHERE = {"X-Forwarded-For": "192.0.2.7"}
 
 
@@ -49,12 +49,12 @@ class View:
 
     Parameters
     ----------
-    name, address : of the picture, and after that of the dashboard
-    tall : whether the picture is as high as the page
-    size : of the window
-    headers, key : sent with every request, and stored in the tab
-    files, press : files to choose, and texts of buttons to press then
-    gone : whether the service cannot be reached when the page is opened
+    name, address : name of the screenshot, and address within the dashboard
+    tall : whether the screenshot shows the whole height of the page
+    size : size of the window
+    headers, key : headers of every request, and key in the tab's storage
+    files, press : files to select, and labels of buttons to press afterwards
+    gone : whether the service is unreachable when the page opens
     """
 
     name: str
@@ -69,7 +69,7 @@ class View:
 
 
 def take_all(path: str, out: Path) -> int:
-    """Fill a service, take all pages with a Chromium, and return the number of pictures."""
+    """Fill a service, take screenshots of all pages, and return their number."""
     out.mkdir(parents=True, exist_ok=True)
     frames, number = shots(ROOMS, VIEWS, STEP), 0
     with TemporaryDirectory() as folder:
@@ -88,7 +88,7 @@ def take_all(path: str, out: Path) -> int:
 
 
 def fill(client: httpx.Client, data: Path, frames: list[Shot]) -> None:
-    """Upload all frames while no worker runs, and damage one of them on the disk."""
+    """Upload all frames while no worker runs, and damage one of them on disk."""
     for name, title, model in (
         (MAP, "Two rooms, two robots", "depth"), (HALL, "Hall 3", "lidar"),
         (BOXES, "Rooms without furniture", "depth"), (SIDES, "A cube in a hall", "depth"),
@@ -135,7 +135,7 @@ def views(client: httpx.Client, frames: list[Shot]) -> Iterator[View]:
     yield View("key-too-little", "#/operations?tab=keys", headers=ELSEWHERE, key=key["secret"])
     yield View("nowhere", "#/nowhere")
     yield View("gone", f"#/maps/{MAP}", gone=True)
-    # several poses, and none
+    # Answers with several poses, and without a pose.
     for view in (
         View("answer-ambiguous", f"#/queries/{sides}"),
         View("place-ambiguous", f"#/maps/{SIDES}/place?query={sides}", tall=True),
@@ -143,7 +143,7 @@ def views(client: httpx.Client, frames: list[Shot]) -> Iterator[View]:
         View("coverage", f"#/maps/{SIDES}/coverage?cell=6,-4", tall=True),
     ):
         yield from (view, replace(view, name=f"{view.name}-phone", size=PHONE))
-    # the last: it fills the empty map
+    # This page comes last, since it fills the empty map.
     sent = [(f"frame-{i:06d}.depth.png", one.data) for i, one in enumerate(frames[:6])]
     lens = json.dumps({**frames[0].meta["intrinsics"], "depth_scale": 1000}).encode()
     files = (("torn.ply", b"ply\nformat ascii 1.0\n"), *sent, ("intrinsics.json", lens))
@@ -194,7 +194,7 @@ def _post(client: httpx.Client, path: str, body: dict[str, Any]) -> dict[str, An
 
 
 def _frame_ids(client: httpx.Client, name: str, **params: str) -> list[str]:
-    """Return the ids of the frames of a map in the order of capture."""
+    """Return the ids of the frames of a map in order of capture."""
     answer = client.get(f"/v1/maps/{name}/frames", params={"limit": "100", **params})
     items = answer.raise_for_status().json()["items"]
     return [one["frame_id"] for one in sorted(items, key=lambda one: str(one["captured_at"]))]
@@ -215,7 +215,7 @@ def _query(client: httpx.Client, name: str, shot: Shot) -> dict[str, Any]:
 
 
 def _farthest(answer: dict[str, Any]) -> str:
-    """Return the strong match whose sensor is farthest from the query's."""
+    """Return the strong match with the greatest distance from the query."""
     strong = [one for one in answer["matches"] if one["validation"]["strength"] == "strong"]
 
     def distance(one: dict[str, Any]) -> float:
@@ -225,15 +225,15 @@ def _farthest(answer: dict[str, Any]) -> str:
 
 
 def take_picture(browser: Any, url: str, view: View, theme: str, path: Path) -> None:
-    """Take a picture of one page.
+    """Take a screenshot of a page.
 
     Parameters
     ----------
     browser : see `benchmarks.chromium.chromium`
-    url : of the service
-    view : the page
+    url : address of the service
+    view : page
     theme : "light" or "dark"
-    path : of the picture
+    path : path of the screenshot
     """
     width, low = view.size
     context = browser.new_context(
@@ -274,7 +274,7 @@ def take_picture(browser: Any, url: str, view: View, theme: str, path: Path) -> 
 
 
 def main() -> int:
-    """Take all pictures."""
+    """Take all screenshots."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/screenshots"))
     options = parser.parse_args()

@@ -1,7 +1,7 @@
-"""Measure the time of a search by the number of frames in a map, exhaustive and by sketches.
+"""Measure searches by the number of frames in a map, exhaustively and with sketches.
 
-Frames are clustered as a building is: places at random, and some fifty frames about each. Times are
-of one thread, warm. Memory is of a process of its own that opens the index and searches.
+Signatures are clustered like those of a building: random places, with fifty frames each. Times are
+of one thread, warm. Memory is that of a separate process that opens the index and searches.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from sceneprint.models import PRESETS, read_model
 from sceneprint.types import Bytes
 from sceneprint_lab.evaluation.pair_run import Clock
 
-#: Hits of a search: the longest ranking.
+#: Number of hits of a search, the length of the longest ranking.
 SIZE = 200
-#: Frames of a place, and of a block.
+#: Number of frames of a place, and of a block.
 PLACE, BLOCK = 50, 1 << 16
-#: Frames of the maps.
+#: Numbers of frames of the maps.
 FRAMES = (10_000, 100_000, 1_000_000)
-#: Bytes of a map from which sketches are made: never, and always.
+#: Sizes in bytes from which sketches are built: never, and always.
 FLAT, SKETCHES = 1 << 62, 0
 
-#: Opens an index in a process of its own, searches, and prints milliseconds and bytes.
+#: Script that opens an index, searches, and prints milliseconds and bytes.
 _PROBE = """
 import sys, time
 from pathlib import Path
@@ -54,7 +54,7 @@ print(1e3 * opened, *(held() - before))
 
 
 def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
-    """Return signatures (n, length) of frames by their numbers: fifty about each place."""
+    """Return the signatures (n, length) of frames with the given numbers, fifty per place."""
     places, frame = np.divmod(keys, PLACE)
     rows = np.empty((len(keys), length))
     for place in np.unique(places):
@@ -68,17 +68,17 @@ def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
 
 
 def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
-    """Search a map as a service does and by comparing every frame, in turn; return a table row.
+    """Search a map like a service and exhaustively, in turn; return a table row.
 
     Parameters
     ----------
-    frames : of the map
+    frames : number of frames of the map
     flat_bytes : see `publish`; FLAT or SKETCHES
-    runs : queries, of which none is in the map
+    runs : number of queries, none of which is in the map
     """
     length = read_model(PRESETS[0]).signature_bytes
     tail = Tail.empty(length)
-    # of mapped places, but of frames that are not in the map
+    # The queries show mapped places, but are not in the map.
     seen = (np.arange(runs + 1) * max(frames // (runs + 1), 1)) // PLACE * PLACE
     queries = signatures(seen, length)
 
@@ -97,7 +97,7 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
             flat_bytes=flat_bytes,
         )  # fmt: skip
         if version is None:
-            raise RuntimeError(f"another process publishes in {folder}")
+            raise RuntimeError(f"Another process is publishing in {folder}.")
         return version
 
     whole = Clock()
@@ -113,7 +113,7 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
             "exact": lambda query: search(query, version, tail, SIZE, metric="l2", exact=True),
         }
         times: dict[str, list[float]] = {one: [] for one in rows}
-        for run, query in enumerate(queries, -1):  # the first warms up
+        for run, query in enumerate(queries, -1):  # the first query warms up
             clock = Clock()
             for one, call in rows.items():
                 clock.run(one, partial(call, query))
@@ -131,7 +131,7 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
 
 
 def table() -> list[str]:
-    """Return the table of all sizes of maps."""
+    """Return the table of all map sizes."""
     return [
         f"### Search for the {SIZE} nearest frames: one thread, warm", "",
         "| frames | bytes | compared | search, ms | all, ms | search / all | recall@10 "

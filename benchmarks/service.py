@@ -1,4 +1,4 @@
-"""Measure the time that HTTP and the store add to a query, and many queries at once."""
+"""Measure the overhead of HTTP and the store in a query, and concurrent queries."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client
 from sceneprint_lab.cli.demo import serving
 
-#: Processes that query at once, for their throughput beside that of one; seconds of each load.
+#: Number of concurrent clients for the throughput, and duration of each load, seconds.
 CROWD, SECONDS = 8, 20.0
-#: Processes that query at once while a worker signs; requests a second to /healthz.
+#: Number of concurrent clients while a worker signs, and requests per second to /healthz.
 CLIENTS, RATE = 4, 50.0
 
 
 def measure(
     frames: Sequence[FrameReference], map_frames: int = 0, n_queries: int = 20
 ) -> list[str]:
-    """Look up some frames among the others over HTTP and with the library; return the tables.
+    """Query frames over HTTP and with the library; return the tables.
 
     Parameters
     ----------
-    frames : of a data set
-    map_frames : of the map, if `frames` are fewer: the rest is random. As R grows with the map,
-        answers are then not compared with the library's
-    n_queries : how many are looked up
+    frames : frames of a data set
+    map_frames : number of frames of the map; random frames are added if `frames` are fewer, and
+        the answers are then not compared with the library's, since R grows with the map
+    n_queries : number of queries
 
     Raises
     ------
-    AssertionError : service and library answer differently, and so do not do the same work.
+    AssertionError : If the answers of service and library differ, so the times are not comparable.
     """
     places = {int(i) for i in np.linspace(1, len(frames) - 2, n_queries)}
     database = [frame for i, frame in enumerate(frames) if i not in places]
@@ -59,10 +59,10 @@ def measure(
         library = Library(database)
         client.wait([one.job_id for one in added])
         names = {one.frame_id: i for i, one in enumerate(added)}
-        client.query(MAP, queries[0])  # warm
+        client.query(MAP, queries[0])  # warm-up
         library.ask(queries[0])
         http, cpu, stages = [], [], []
-        for frame in queries:  # in turn, so that both meet the same machine
+        for frame in queries:  # alternating, so that both run under the same load
             start, used = time.perf_counter(), sum_over_processes(processor_ns, folder, "serve")
             answer = client.query(MAP, frame)
             http.append(1e3 * (time.perf_counter() - start))
@@ -110,12 +110,12 @@ def _spread(values: Sequence[float]) -> str:
 def _load(
     url: str, frames: Sequence[FrameReference], clients: int, *, uploads: bool
 ) -> tuple[list[list[float]], tuple[float, float]]:
-    """Let clients query at once, and a worker sign if `uploads`.
+    """Let clients query concurrently, and a worker sign if `uploads`.
 
     Returns
     -------
-    answers : milliseconds of each, by client
-    healthz : p50 and p99 of /healthz meanwhile
+    answers : milliseconds of each answer, by client
+    healthz : p50 and p99 of /healthz during the load
     """
     context = get_context("spawn")
     n = clients + uploads
@@ -132,7 +132,7 @@ def _load(
     return answers, healthz
 
 
-#: Of a process of the load: passed when all of them have loaded their code.
+#: Barrier of a client process, which all pass once they have loaded their code.
 _barriers: list[Barrier] = []
 
 
@@ -141,7 +141,7 @@ def _join(barrier: Barrier) -> None:
 
 
 def _time_queries(url: str, frames: Sequence[FrameReference], place: int) -> list[float]:
-    """Query frames in turn, each after the answer to the last; return milliseconds of each."""
+    """Query frames one after the other; return the milliseconds of each query."""
     taken: list[float] = []
     with Client(url) as client:
         client.query(MAP, frames[place % len(frames)])
@@ -154,7 +154,7 @@ def _time_queries(url: str, frames: Sequence[FrameReference], place: int) -> lis
 
 
 def _upload(url: str, frames: Sequence[FrameReference]) -> None:
-    """Keep the worker busy: the same frames in one map after another."""
+    """Keep the worker busy with the same frames in one map after another."""
     with Client(url) as client:
         _barriers[0].wait(PATIENCE_S)
         until, number = time.perf_counter() + SECONDS, 0
@@ -165,7 +165,7 @@ def _upload(url: str, frames: Sequence[FrameReference]) -> None:
 
 
 def _healthz(url: str, seconds: float) -> tuple[float, float]:
-    """Return p50 and p99 of /healthz at a steady rate, milliseconds."""
+    """Return p50 and p99 of /healthz at a constant rate, milliseconds."""
     taken = []
     with httpx.Client(base_url=url) as client:
         until = time.perf_counter() + seconds

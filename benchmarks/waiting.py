@@ -1,4 +1,4 @@
-"""Wait for conditions until a deadline that a crowded machine does not reach."""
+"""Waits for conditions, with a deadline that a busy machine does not reach."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import httpx
 
 T = TypeVar("T")
 
-#: Seconds until a wait counts as a failure. Only a wait in vain lasts this long: with 20 busy
-#: processes on two cores, what takes 2 s alone takes 30 s.
+#: Seconds until a wait counts as a failure. With 20 busy processes on two cores, an operation of
+#: 2 s takes 30 s.
 PATIENCE_S = 240.0
 
 
 def until(condition: Callable[[], T], seconds: float = PATIENCE_S, pause_s: float = 0.02) -> T:
-    """Return the first true value of a condition; raise AssertionError if none comes in time."""
+    """Return the first true value of a condition; raise AssertionError after the deadline."""
     end = time.monotonic() + seconds
     while not (value := condition()):
         if time.monotonic() > end:
-            raise AssertionError(f"{condition} did not come true within {seconds:g} s")
+            raise AssertionError(f"{condition} did not become true within {seconds:g} s")
         time.sleep(pause_s)
     return value
 
@@ -35,7 +35,7 @@ def answers(url: str) -> bool:
 
 
 def free_port() -> int:
-    """Return a port of 127.0.0.1 on which nobody listens."""
+    """Return a port of 127.0.0.1 without a listener."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -1,1 +1,1 @@
-"""Robots that use a disturbed service, and a count of all that it lost: `make soak|fleet|siege`."""
+"""Robots that use a disturbed service, with a count of lost data: `make soak|fleet|siege`."""

@@ -1,7 +1,7 @@
 """Disturb a service while robots use it, and count the frames that it loses.
 
-`python -m benchmarks.soak soak --page docs/fault_injection.md` runs a plan and puts its figures
-into the page. `--store`, `--faults` and the other options change the plan:
+`python -m benchmarks.soak soak --page docs/fault_injection.md` runs a plan and writes its figures
+to the page. Options such as `--store` and `--faults` change the plan:
 `python -m benchmarks.soak fleet --faults kill=50 failover=5 --seconds 300`.
 """
 
@@ -29,7 +29,7 @@ _TIMES = {1: "once", 2: "twice"}
 
 
 def title(plan: Plan) -> str:
-    """Return what a plan runs, in a few words."""
+    """Return a short description of a plan."""
     standby = "an asynchronous" if plan.asynchronous else "a synchronous"
     store = "SQLite" if plan.store == "sqlite" else f"PostgreSQL with {standby} standby"
     return f"{plan.robots:,} robots for {plan.seconds:.0f} s, {store}"
@@ -67,7 +67,7 @@ def description(figures: SoakFigures) -> Iterator[str]:
         )
 
 
-#: Faults that end no process, as sentences.
+#: Sentences for faults that end no process.
 _UNKILLED = {
     FROZEN: f"The primary was frozen {{}} for {FROZEN_S:g} s (SIGSTOP).",
     CUT_OFF: f"A host was cut off {{}} from its servers for {CUT_OFF_S:g} s.",
@@ -150,7 +150,7 @@ def table(figures: SoakFigures) -> list[str]:
 
 
 def parse_fault(text: str) -> tuple[str, int]:
-    """Return a fault of the command line, and its number."""
+    """Return the name and the number of a fault on the command line."""
     name, _, count = text.partition("=")
     if name not in FAULTS or not count.isdigit():
         raise argparse.ArgumentTypeError(f"{text}: write FAULT=N; faults: {', '.join(FAULTS)}")
@@ -158,7 +158,7 @@ def parse_fault(text: str) -> tuple[str, int]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run plans; return 1 if anything was lost, doubled, half stored or wrong."""
+    """Run plans; return 1 if a frame was lost, duplicated or damaged, or a bound is exceeded."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -175,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.add_argument(f"--{name}", action="store_true", default=None)
     parser.add_argument("--data", type=Path, help="folder of recordings; default: synthetic rooms")
     parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
-    parser.add_argument("--keep", type=Path, help="new folder for data and logs, which stay")
+    parser.add_argument("--keep", type=Path, help="new folder for data and logs, which is kept")
     options = parser.parse_args(arguments)
     changed = {one.name: getattr(options, one.name) for one in fields(Plan)
                if getattr(options, one.name, None) is not None}  # fmt: skip
@@ -190,7 +190,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(name: str, plan: Plan, page: Path | None, keep: Path | None) -> int:
     """Run a plan, print its figures, and return the exit code."""
     if plan.count("full-disk") and os.geteuid() != 0:
-        print("the disk is not filled: only root may mount one")
+        print("the disk is not filled: mounting a file system requires root")
         plan = replace(plan, faults={**plan.faults, "full-disk": 0})
     with (
         ended_by_signals(),

@@ -1,7 +1,7 @@
-"""Attack a service as one tenant, and measure how long others wait meanwhile.
+"""Attacks by one tenant, and the delays of other tenants during them.
 
-Attacks run in a process of their own, which stands for other machines: in the process of the other
-clients they would compete for its interpreter.
+The attacks run in their own process, as if from other machines, so they do not compete with the
+other clients for an interpreter.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ import numpy as np
 from benchmarks.soak.failover_client import LATER, Exchange, RequestLog, bearer
 from benchmarks.soak.recordings import Shot
 
-#: Seconds that a request may take.
+#: Timeout of a request, seconds.
 PATIENCE_S = 60.0
-#: Session of the frames of `noisy` that have poses.
+#: Session of the posed frames of `noisy`.
 SESSION = "run"
-#: Connections of an attack, whatever the number of its keys.
+#: Number of connections of an attack, independent of the number of its keys.
 _CONNECTIONS = 40
-#: The attacker's own work must not delay its victims, as all share the processors of one machine.
+#: Niceness of the attacking process; its own work must not slow other clients on this machine.
 _NICENESS = 5
 _PNG = {"Content-Type": "image/png"}
 _FRAMES, _MAP = "/v1/maps/noisy/frames", "/v1/maps/noisy"
@@ -41,13 +41,13 @@ _FRAMES, _MAP = "/v1/maps/noisy/frames", "/v1/maps/noisy"
 
 @dataclass
 class Attack:
-    """An attack of one tenant.
+    """An attack by one tenant.
 
     Parameters
     ----------
-    name, url : of the attack, and of the service
+    name, url : name of the attack, and address of the service
     secrets : keys of the attacker, all of one tenant
-    shots : frames to upload to the map `noisy`, which has some
+    shots : frames to upload to the map `noisy`, which already has some
     """
 
     name: str
@@ -58,7 +58,7 @@ class Attack:
     refused: int = 0
 
     def count(self, status: int) -> None:
-        """Count an answer."""
+        """Record the status of an answer."""
         self.sent += 1
         self.refused += status in LATER
 
@@ -69,14 +69,14 @@ class Attack:
 
 @dataclass(frozen=True)
 class AttackFigures:
-    """The waits of the other tenants just before an attack, and during it.
+    """Delays of other tenants before and during an attack.
 
     Parameters
     ----------
-    name : of the attack
-    calm_s, under_s : 99th percentiles of requests, and of frames until they are signed, seconds
-    victim_refused : requests of the other tenants that had to be repeated
-    sent, refused : requests of the attacker, and those that were refused
+    name : name of the attack
+    calm_s, under_s : 99th percentiles, seconds, of requests and of the time until frames are signed
+    victim_refused : number of requests of other tenants that had to be repeated
+    sent, refused : number of requests of the attacker, and of those that were rejected
     """
 
     name: str
@@ -87,7 +87,7 @@ class AttackFigures:
     refused: int
 
 
-#: Set when the attack is to end.
+#: Event that ends the attack.
 _stop: list[Event] = []
 
 
@@ -97,7 +97,7 @@ def _prepare(stop: Event) -> None:
 
 
 def _attack(attack: Attack) -> tuple[int, int]:
-    """Return attack until the event is set; return the requests sent and refused."""
+    """Attack until the event is set; return the numbers of sent and rejected requests."""
     ATTACKS[attack.name](attack)
     return attack.sent, attack.refused
 
@@ -106,48 +106,48 @@ def run_attacks(
     url: str, secrets: Sequence[str], shots: list[Shot], seconds: float, log: RequestLog,
     drain: Callable[[], None],
 ) -> Iterator[AttackFigures]:  # fmt: skip
-    """Run every attack while others work, after as long a time without it.
+    """Run every attack while others work, each after an equal period without an attack.
 
     Parameters
     ----------
     url, secrets, shots : see Attack
-    seconds : of each attack
-    log : of the other tenants
-    drain : removes what an attack leaves in the queue
+    seconds : duration of each attack
+    log : requests of the other tenants
+    drain : function that removes the jobs of an attack from the queue
     """
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     with ProcessPoolExecutor(1, spawn, _prepare, (stop,)) as pool:
-        pool.submit(os.getpid).result()  # the process has started
+        pool.submit(os.getpid).result()  # waits until the process has started
         for name in ATTACKS:
             stop.clear()
             begun = time.monotonic()
             time.sleep(seconds)
             running = pool.submit(_attack, Attack(name, url, secrets, shots))
-            time.sleep(min(seconds / 4, 1.0))  # until the attack has begun
+            time.sleep(min(seconds / 4, 1.0))  # waits until the attack has started
             middle = time.monotonic()
             time.sleep(seconds)
             stop.set()
             sent, refused = running.result()
-            drain()  # the requests of others are answered then
+            drain()  # requests of others are answered during this
             calm, under = (_percentiles(log, one, one + seconds) for one in (begun, middle))
             repeated = sum(one.tries - 1 for one in _between(log, middle, middle + seconds))
             yield AttackFigures(name, calm, under, repeated, sent, refused)
 
 
 def _between(log: RequestLog, first: float, last: float) -> list[Exchange]:
-    """Return the requests that were open at some time of an interval."""
+    """Return the requests that were open at any time in an interval."""
     with log.lock:
         return [one for one in log.exchanges if one.begun <= last and one.answered >= first]
 
 
 def _percentiles(log: RequestLog, first: float, last: float) -> tuple[float, float]:
-    """Return 99th percentiles of requests, and of uploads until their frames were signed."""
+    """Return 99th percentiles of requests, and of the time from upload to signing."""
     own = _between(log, first, last)
     signed = [one.answered - one.begun for one in own if one.kind == "upload"]
     other = [one.answered - one.begun for one in own if one.kind != "upload"]
     if not signed or not other:
-        raise RuntimeError("no other tenant was answered")
+        raise RuntimeError("No other tenant received an answer.")
     return float(np.percentile(other, 99)), float(np.percentile(signed, 99))
 
 
@@ -173,7 +173,7 @@ Send = Callable[[Attack, httpx.Client, int], httpx.Response]
 
 
 def _frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """Upload a new frame at the highest priority."""
+    """Upload a new frame with the highest priority."""
     shot = attack.shot(number)
     return client.put(
         f"{_FRAMES}/noise-{time.monotonic_ns()}-{number}", content=shot.png, headers=_PNG,
@@ -182,7 +182,7 @@ def _frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
 
 
 def _same_frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """Upload a stored frame, each time with another Idempotency-Key."""
+    """Upload a stored frame, each time with a different Idempotency-Key."""
     shot = attack.shot(0)
     key = {"Idempotency-Key": f"{time.monotonic_ns()}-{number}"}
     meta = {"meta": shot.meta.model_dump_json()}
@@ -190,7 +190,7 @@ def _same_frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Resp
 
 
 def _archive(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """Import an archive of all frames, each time of other bytes."""
+    """Import an archive of all frames, each time with different bytes."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         camera = attack.shot(0).meta.intrinsics
@@ -210,7 +210,7 @@ def _query(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
 
 
 def _session(attack: Attack, client: httpx.Client, _number: int) -> httpx.Response:
-    """Delete a whole session, and restore it."""
+    """Delete a whole session and restore it."""
     answer = client.delete(f"{_MAP}/sessions", params={"session": SESSION})
     attack.count(answer.status_code)
     if answer.status_code != 200:
@@ -228,14 +228,14 @@ def _rename(_attack: Attack, client: httpx.Client, _number: int) -> httpx.Respon
 
 
 def _surface(_attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """Build the surface, and three of four times render a plan of it."""
+    """Build the surface; in three of four calls, render a plan of it."""
     if number % 4 == 0:
         return client.post(f"{_MAP}/surface", json={})
     return client.get(f"{_MAP}/surface/plan.png?width={256 + number % 1000}")
 
 
 def _gets(*paths: str) -> Send:
-    """Get some paths in turn; `FRAME` in them is an indexed frame of the map."""
+    """Return an attack by GET of several paths in turn; `FRAME` stands for an indexed frame."""
     indexed: list[str] = []
 
     def send(_attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
@@ -254,7 +254,7 @@ def _posts(path: str, body: dict[str, Any]) -> Send:
 
 
 def _repeated(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack], None]:
-    """Return an attack by requests on some connections, each after the answer to the last."""
+    """Return an attack by consecutive requests on several connections."""
 
     def work(attack: Attack, first: int) -> None:
         number = first
@@ -279,12 +279,12 @@ def _repeated(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack],
 def _held(
     line: str, head: str, *, body: bytes = b"", two: bool = False, count: int = _CONNECTIONS
 ) -> Callable[[Attack], None]:
-    """Return an attack by requests that are begun and held, again and again if they are closed.
+    """Return an attack by incomplete requests on open connections, which are reopened when closed.
 
     Parameters
     ----------
-    line, head, body : of each request
-    two : whether each has a second, made-up Authorization header
+    line, head, body : parts of each request
+    two : whether each request has a second, invalid Authorization header
     count : number of connections
     """
 
@@ -298,7 +298,7 @@ def _held(
             wire.sendall(f"{text}\r\n{again}{head}\r\n".encode() + body)
             attack.count(int(wire.recv(12)[9:12] or b"0"))
         except TimeoutError:
-            attack.count(0)  # it is held
+            attack.count(0)  # the connection stays open
         except OSError:
             attack.count(503)
 
@@ -315,14 +315,14 @@ def _held(
     return hold
 
 
-#: By their names in the table.
+#: Attacks by their names in the table.
 ATTACKS: dict[str, Callable[[Attack], None]] = {
-    # bodies that never end
+    # Bodies without an end.
     "held queries, two headers": _held(
         f"POST {_MAP}/queries", "Content-Length: 5000\r\n", two=True
     ),
     "event streams": _held("GET /v1/events", "Accept: text/event-stream\r\n", count=80),
-    # bodies of which most comes, and the rest never does
+    # Bodies whose last part never arrives.
     "large slow bodies": _held(
         f"POST {_FRAMES}",
         "Content-Type: application/octet-stream\r\nContent-Length: 70000000\r\n",

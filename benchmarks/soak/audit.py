@@ -1,4 +1,4 @@
-"""Compare the content and the answers of a store with what it acknowledged to clients."""
+"""Comparison of a store's content and answers with the acknowledgements that clients received."""
 
 from __future__ import annotations
 
@@ -28,33 +28,33 @@ from sceneprint.store.tables import audit, events
 from sceneprint_client import Client
 from sceneprint_client.api import Frame, FrameState
 
-#: Seconds for the workers to finish the queue, and for events to arrive.
+#: Time limits of the workers to finish the queue, and of events to arrive, seconds.
 PATIENCE_S, EVENTS_S = 600.0, 20.0
-#: Frames whose neighbours every service lists; most that are looked up by a query.
+#: Number of frames whose neighbours every service lists, and greatest number that is queried.
 COMPARED, LOOKED_UP = 20, 1_000
-#: States in which a frame is stored, is not searched, and says why.
+#: States in which a frame is stored but not searched, with a reason.
 STATED = (FrameState.REJECTED, FrameState.FAILED, FrameState.REDUNDANT)
-#: Changes that clients make, each of which has an event and a line of the audit log.
+#: Changes by clients, each of which has an event and an entry in the audit log.
 CHANGES = ("map.created", "frame.received")
 
 
 @dataclass
 class Found:
-    """The state of the store in the end, by numbers of frames.
+    """Final state of the store, by numbers of frames.
 
     Parameters
     ----------
-    acknowledged : without those that were deleted
-    indexed, stated : those that queries find, and those whose state says why they do not
-    aged : those that retention deleted when it was due, with an event
-    looked_up, found : indexed frames that a query searched, and those that it found at distance 0
+    acknowledged : frames without those that were deleted
+    indexed, stated : frames that queries find, and frames with a state that explains their absence
+    aged : frames that retention deleted on time, with an event
+    looked_up, found : indexed frames that were queried, and those found at distance 0
     missing : ids of acknowledged frames that are not stored
-    returned, stuck : deleted frames that are stored, and frames that wait to be signed
-    doubled, strangers : frames with the content of another, and those that were not acknowledged
-    unheard, heard_twice : events of acknowledged frames that came never, or more than once
+    returned, stuck : deleted frames that are stored, and frames that are still queued
+    doubled, strangers : frames with the same content as another, and frames without acknowledgement
+    unheard, heard_twice : events of acknowledged frames that were not received, or repeatedly
     disagreeing : answers and lists that differ between addresses
-    separated : changes whose event or line of the audit log is missing
-    searches, wrong : number of searches by readers and by this check, and their faults
+    separated : changes without their event or their entry in the audit log
+    searches, wrong : number of searches by readers and by this check, and their errors
     """
 
     acknowledged: int = 0
@@ -77,7 +77,7 @@ class Found:
 
 
 def await_idle(client: Client) -> None:
-    """Return once a service answers, and no job waits or runs."""
+    """Wait until a service answers and no job waits or runs."""
 
     def is_idle() -> bool:
         with suppress(SceneprintError):
@@ -92,15 +92,15 @@ def check(
     ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
     listeners: Sequence[Listener], aging: Mapping[str, float] = MappingProxyType({}),
 ) -> Found:  # fmt: skip
-    """Look up every acknowledged frame at every address.
+    """Check every acknowledged frame at every address.
 
     Parameters
     ----------
-    ledger : everything that was acknowledged
+    ledger : all acknowledgements
     stable : ids of the frames that readers searched
-    clients : one for each service
-    listeners : one for each map
-    aging : seconds for which some maps keep a frame
+    clients : a client for each service
+    listeners : a listener for each map
+    aging : retention of some maps, seconds
     """
     expected = {one.frame_id: one for one in ledger.frames if one.frame_id not in ledger.deleted}
     maps = sorted({one.map_name for one in ledger.frames})
@@ -110,7 +110,7 @@ def check(
     indexed = {name for name, one in present.items() if one.state == FrameState.INDEXED}
     stated = sum(one.state in STATED for one in present.values())
     contents = Counter((one.map, one.content_id) for one in stored.values())
-    # frames of maps that age may go while they are looked up
+    # Frames of maps with retention may be deleted during the queries.
     lasting = [
         one for one in expected.values() if one.frame_id in indexed and one.map_name not in aging
     ]
@@ -156,7 +156,7 @@ def _search(client: Client, one: Acknowledged, k: int) -> list[tuple[str, int]]:
 
 
 def _count_found(client: Client, frames: Sequence[Acknowledged]) -> int:
-    """Return how many frames a query of their own content finds at distance 0."""
+    """Return the number of frames that a query with the same content finds at distance 0."""
     return sum((one.frame_id, 0) in _search(client, one, 2) for one in frames)
 
 
@@ -164,7 +164,7 @@ def _compare_searches(
     result: Found, ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
     some: Sequence[Acknowledged],
 ) -> None:  # fmt: skip
-    """Compare searches with each other, and with signatures that the library alone computes."""
+    """Compare searches with each other, and with signatures that only the library computes."""
     frames = {one.frame_id: one for one in ledger.frames}
     searches = list(ledger.searches)
     for one in some:
@@ -183,7 +183,7 @@ def _compare_searches(
 
 @cache
 def signature(shot: Shot) -> NDArray[np.int64]:
-    """Return the signature of a frame, as the library alone computes it."""
+    """Return the signature of a frame according to the library."""
     signer, decoders = _signer()
     vector = sign(read_upload(shot.png, shot.meta, decoders).frame, signer).vector
     return vector.astype(np.int64)
@@ -198,14 +198,14 @@ def wrong_matches(
     search: Search, deleted: Mapping[str, tuple[float, float]], stable: Sequence[str],
     vectors: Mapping[str, NDArray[np.int64]],
 ) -> list[str]:  # fmt: skip
-    """Return what is wrong with the matches of an exact search.
+    """Return the errors in the matches of an exact search.
 
     Parameters
     ----------
-    search : for frames near a stored one
-    deleted : when the deletion of a frame was sent and acknowledged
-    stable : ids of frames that are in the map all the time
-    vectors : signatures by frame; the matches may have frames that are not known
+    search : search for the neighbours of a stored frame
+    deleted : times at which the deletion of a frame was sent and acknowledged
+    stable : ids of frames that are always in the map
+    vectors : signatures by frame; matches may include other frames
     """
 
     def distance(name: str) -> int:
@@ -214,18 +214,18 @@ def wrong_matches(
     wrong = []
     for name, far in search.matches:
         if name in vectors and far != distance(name):
-            wrong.append(f"{name} at {far}, which is not its distance")
+            wrong.append(f"{name} has the wrong distance {far}")
         if name in deleted and deleted[name][1] < search.begun:
-            wrong.append(f"{name} is found, and was deleted before")
+            wrong.append(f"{name} was deleted before the search")
     names, distances = {name for name, _ in search.matches}, [far for _, far in search.matches]
     if distances != sorted(distances) or len(names) != len(distances):
-        wrong.append("the matches are not in their order, or one is there twice")
-    # a frame that is deleted during the search is left out, and none takes its place
+        wrong.append("the matches are not in order, or one is repeated")
+    # A frame that is deleted during the search is dropped without a replacement.
     meanwhile = sum(
         begun <= search.answered and done >= search.begun for begun, done in deleted.values()
     )
     if stable and len(names) + meanwhile < min(K, len(stable) - 1):
-        wrong.append(f"{len(names)} matches, where {meanwhile} can have been deleted meanwhile")
+        wrong.append(f"{len(names)} matches, with at most {meanwhile} deletions during the search")
     return wrong + [
         f"{name} at {distance(name)} is missing"
         for name in stable
@@ -234,7 +234,7 @@ def wrong_matches(
 
 
 def count_separated(connection: Connection, map_names: Sequence[str]) -> int:
-    """Return how many changes to some maps lack their event or their line of the audit log."""
+    """Return the number of changes to maps without their event or their entry in the audit log."""
     by_event, by_line = (
         Counter(tuple(row) for row in connection.execute(
             select(kind, name, target).where(kind.in_(CHANGES), name.in_(map_names))
@@ -250,7 +250,7 @@ def count_separated(connection: Connection, map_names: Sequence[str]) -> int:
 def _compare_events(
     result: Found, stored: Sequence[Acknowledged], listeners: Sequence[Listener]
 ) -> None:
-    """Count the events of stored frames that were not heard, and those that were heard twice."""
+    """Count events of stored frames that were not received, or received repeatedly."""
     heard = {one.map_name: one.heard for one in listeners}
     wanted = [(one.map_name, ("frame.received", one.frame_id)) for one in stored]
     end = time.monotonic() + EVENTS_S

@@ -1,4 +1,4 @@
-"""Send broken uploads: none may crash a process, fail with 5xx, or cost much memory."""
+"""Broken uploads, which must not crash a process, cause 5xx, or use much memory."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ _TEXTS = (
     "null", "-1", "1e999", "NaN", "[]", "{}", '""', '"\\ud800"', "18446744073709551616", "true",
     "[" * 500, '{"a":' * 200, '"' + "x" * 5000 + '"',
 )  # fmt: skip
-#: Points of a cloud: few, so that the bytes of headers are often hit.
+#: Points of a cloud; they are few, so that many changes hit the headers.
 _POINTS = np.random.default_rng(0).uniform(-3, 3, (200, 3)).astype(np.float32)
 
 
 def _npy(shot: Shot) -> bytes:
     k = shot.meta.intrinsics
-    assert k is not None  # these are depth images
+    assert k is not None  # all frames are depth images
     return encode_npy(np.linspace(1, 3, k.width * k.height, dtype=np.float32).reshape(k.height, -1))
 
 
@@ -61,7 +61,7 @@ def _zip(shot: Shot) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, data in _members(shot).items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # without the present time
+            archive.writestr(zipfile.ZipInfo(name), data)  # a fixed time stamp
     return out.getvalue()
 
 
@@ -75,7 +75,7 @@ def _tar(shot: Shot) -> bytes:
     return out.getvalue()
 
 
-#: Sound files by kind; the tests of the formats break files of all other kinds.
+#: Valid files by kind; the tests of the formats damage files of all other kinds.
 CLOUDS: dict[str, Callable[[Shot], bytes]] = {
     "ply": lambda _: write_ply(_POINTS),
     "kitti": lambda _: np.column_stack([_POINTS, np.ones(200, np.float32)]).tobytes(),
@@ -95,7 +95,7 @@ _WEIGHTS = {**dict.fromkeys(FILES, 2.0), "json": 5.0, "png": 5.0}
 
 @dataclass(frozen=True)
 class BrokenUpload:
-    """A file and its metadata; of the kind "json" the metadata are broken, else the file."""
+    """A file and its metadata; for the kind "json" the metadata are damaged, else the file."""
 
     kind: str
     data: bytes
@@ -104,16 +104,16 @@ class BrokenUpload:
 
 @dataclass(frozen=True)
 class BrokenFigures:
-    """The answers to broken uploads.
+    """Answers to broken uploads.
 
     Parameters
     ----------
-    sent : by kind of file
-    statuses : answers by status
+    sent : number of uploads by kind of file
+    statuses : number of answers by status
     failed : answers with 5xx other than 503, and requests without an answer
-    crashed : processes of services and workers that ended
-    peak_bytes : most memory that a process took, decoders too
-    seconds : in all
+    crashed : number of services and workers that ended
+    peak_bytes : peak memory of a process, including decoders
+    seconds : total duration
     """
 
     sent: dict[str, int]
@@ -125,7 +125,7 @@ class BrokenFigures:
 
 
 def mutated(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
-    """Return a sound upload that is broken in one to four places; the same for a number."""
+    """Return an upload with one to four damaged places, which depend only on the numbers."""
     rng = random.Random(f"{seed} {number}")
     shot = rng.choice(shots)
     kind = rng.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0]
@@ -143,7 +143,7 @@ def mutated(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
 
 
 def _sealed(data: bytes) -> bytes:
-    """Return a broken PNG with right checksums, so that parsers read beyond them."""
+    """Return a damaged PNG with correct checksums, so that parsers read on."""
     at = data.find(b"\x89PNG") + 8
     out = bytearray(data)
     while 8 <= at <= len(data) - 12:
@@ -157,7 +157,7 @@ def _sealed(data: bytes) -> bytes:
 
 
 def _broken(data: bytes, rng: random.Random) -> bytes:
-    """Return the bytes with one change."""
+    """Return the bytes with one random change."""
     if not data:
         return rng.choice(_WORDS)
     at = rng.randrange(len(data)) if rng.random() < 0.5 else rng.randrange(min(len(data), 64))
@@ -180,7 +180,7 @@ def _broken(data: bytes, rng: random.Random) -> bytes:
 
 
 def _broken_text(text: str, rng: random.Random) -> str:
-    """Return JSON with an unexpected value or character."""
+    """Return JSON with an invalid value or character."""
     if rng.random() < 0.5:
         known: dict[str, Any] = json.loads(text)
         place = known if rng.random() < 0.5 else known["intrinsics"]
@@ -195,16 +195,16 @@ def send_broken(
     url: str, key: str, parts: Sequence[Part], shots: list[Shot], n: int, seed: int,
     threads: int = 4,
 ) -> BrokenFigures:  # fmt: skip
-    """Send broken uploads to a service with the map `siege`, and watch the processes.
+    """Send broken uploads to a service with the map `siege`, and monitor the processes.
 
     Parameters
     ----------
-    url, key : of the service
+    url, key : address of the service, and key
     parts : services and workers
-    shots : to break
-    n : how many are sent
-    seed : of the breaking
-    threads : that send
+    shots : frames to damage
+    n : number of uploads
+    seed : seed of the damage
+    threads : number of sending threads
     """
     before = {pid for part in parts for pid in [part.pid, *part.children()]}
     statuses: Counter[int] = Counter()
@@ -227,7 +227,7 @@ def send_broken(
 
     bar = tqdm(total=n, desc="broken uploads", disable=None, leave=False)
     client = httpx.Client(base_url=url, timeout=60, trust_env=False, headers=bearer(key))
-    with bar, client, ThreadPoolExecutor(threads) as pool:  # all threads may use the client
+    with bar, client, ThreadPoolExecutor(threads) as pool:  # the client is safe to share
         list(pool.map(send, range(n)))
     ended = before - {pid for pid, _, _ in running_processes()}
     return BrokenFigures(
@@ -243,7 +243,7 @@ def _send(client: httpx.Client, upload: BrokenUpload, number: int) -> tuple[int,
             "/v1/maps/siege/imports", content=upload.data, headers={"Content-Type": kind}
         )
         return answer.status_code, answer.text
-    # both uploads and queries read the file
+    # Uploads and queries both read the file.
     answer = client.post(
         f"/v1/maps/siege/{'frames' if number % 2 else 'queries'}",
         files={"frame": ("frame", upload.data, "application/octet-stream")},

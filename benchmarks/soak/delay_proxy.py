@@ -1,4 +1,4 @@
-"""Delay the messages between two programs of one machine, as a network does."""
+"""A proxy that delays messages between two programs of one machine, like a network."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from multiprocessing.connection import Connection as Pipe
 
 
 class DelayProxy:
-    """A process that forwards connections to a port, and delays each message.
+    """A process that forwards connections to a port and delays each message.
 
     Parameters
     ----------
-    port : of this machine, to which connections are forwarded
-    delay_s : of each message, in either direction
+    port : local port to which connections are forwarded
+    delay_s : delay of each message in either direction, seconds
     """
 
     def __init__(self, port: int, delay_s: float) -> None:
@@ -31,11 +31,11 @@ class DelayProxy:
         self.port: int = receiver.recv()
 
     def freeze(self) -> None:
-        """Let nothing through, and close nothing, as a network that loses everything."""
+        """Forward nothing, but keep connections open, like a network that loses all packets."""
         self._send(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let messages through again, with all that have arrived meanwhile."""
+        """Forward messages again, with all that have arrived meanwhile."""
         self._send(signal.SIGCONT)
 
     def _send(self, number: signal.Signals) -> None:
@@ -43,7 +43,7 @@ class DelayProxy:
         os.kill(self._process.pid, number)
 
     def end(self) -> None:
-        """End the process, which closes the connections."""
+        """End the process, which closes its connections."""
         self._process.kill()
         self._process.join()
 
@@ -55,7 +55,7 @@ def _serve(sender: Pipe, port: int, delay_s: float) -> None:
             near, _ = listener.accept()
             try:
                 far = socket.create_connection(("127.0.0.1", port))
-            except OSError:  # nobody listens now
+            except OSError:  # the port has no listener now
                 near.close()
                 continue
             for one in (near, far):
@@ -64,7 +64,7 @@ def _serve(sender: Pipe, port: int, delay_s: float) -> None:
 
 
 def _join(near: socket.socket, far: socket.socket, delay_s: float) -> None:
-    """Forward in both directions, until both have ended."""
+    """Forward in both directions until both ends are closed."""
     with near, far:
         back = threading.Thread(target=_pump, args=(far, near, delay_s), daemon=True)
         back.start()
@@ -73,12 +73,12 @@ def _join(near: socket.socket, far: socket.socket, delay_s: float) -> None:
 
 
 def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
-    """Forward each message with its own delay."""
+    """Forward each message after its delay."""
     coming, is_open = deque[tuple[float, bytes]](), True
     with suppress(OSError):
         while is_open or coming:
             wait_s = max(coming[0][0] - time.monotonic(), 0.0) if coming else None
-            # only `select` counts its time in less than milliseconds
+            # Only `select` has a timeout with a resolution below a millisecond.
             if is_open and select.select([source], [], [], wait_s)[0]:
                 data = source.recv(1 << 16)
                 is_open = bool(data)

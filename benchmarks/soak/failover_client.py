@@ -1,4 +1,4 @@
-"""Send requests to several addresses of a service, of which one answers unless all are down."""
+"""A client that sends requests to several addresses of a service."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ import httpx
 
 from sceneprint_client.http import retry_after_s
 
-#: Seconds before the addresses are tried again, once each has refused.
+#: Delay before the next round of addresses after all have refused, seconds.
 PAUSE_S = 0.25
-#: Seconds after which a silent address counts as dead, and after which a request is given up.
+#: Timeout of an address, and of a request at all addresses, seconds.
 SILENCE_S, PATIENCE_S = 20.0, 180.0
-#: Statuses after which a client tries again.
+#: Statuses after which a client retries.
 LATER = (429, 503, 507)
 
 
 class NoAnswer(Exception):
-    """No address answered, for very long."""
+    """No address has answered for too long."""
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """A request that was answered, how often it was sent, and when, by `time.monotonic`."""
+    """An answered request, its number of attempts, and its times by `time.monotonic`."""
 
     kind: str
     begun: float
@@ -38,7 +38,7 @@ class Exchange:
 
 @dataclass
 class RequestLog:
-    """Requests that were answered, and descriptions of faults; shared by all clients."""
+    """Answered requests, and descriptions of failures; shared by all clients."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     exchanges: list[Exchange] = field(default_factory=list)
@@ -46,18 +46,18 @@ class RequestLog:
 
 
 def bearer(key: str) -> dict[str, str]:
-    """Return the headers of a request with a key."""
+    """Return the headers for a request with a key."""
     return {"Authorization": f"Bearer {key}"}
 
 
 class FailoverClient(ExitStack):
-    """A client that turns to the next address if one is silent or refuses.
+    """A client that tries the next address if one is silent or refuses.
 
     Parameters
     ----------
-    urls : of the service processes
-    log : shared with others
-    first : number of the address that is tried first
+    urls : addresses of the services
+    log : log that clients share
+    first : index of the first address to try
     """
 
     def __init__(self, urls: Sequence[str], log: RequestLog, first: int = 0) -> None:
@@ -71,16 +71,16 @@ class FailoverClient(ExitStack):
         self._current = next(self._order)
 
     def send(self, kind: str, method: str, path: str, **request: Any) -> httpx.Response:
-        """Send a request that may be repeated, until any address answers it.
+        """Send an idempotent request until any address answers it.
 
         Parameters
         ----------
-        kind : of the request, for the log
-        method, path, request : as for httpx
+        kind : kind of the request, for the log
+        method, path, request : arguments of httpx
 
         Raises
         ------
-        NoAnswer : no address answered, for very long.
+        NoAnswer : If no address has answered for too long.
         """
         begun, tries = time.monotonic(), 0
         while time.monotonic() < begun + PATIENCE_S:
@@ -89,12 +89,12 @@ class FailoverClient(ExitStack):
             try:
                 response = self._current.request(method, path, **request)
             except httpx.TransportError:
-                pass  # it was killed, or has not started yet
+                pass  # the service was killed, or has not started yet
             else:
                 if response.status_code not in LATER:
                     with self._log.lock:
                         self._log.exchanges.append(Exchange(kind, begun, time.monotonic(), tries))
-                    # 404 answers a deletion whose first answer was lost
+                    # 404 answers a deletion whose first answer was lost.
                     if not response.is_success and (kind, response.status_code) != ("delete", 404):
                         fault = f"{kind}: {response.status_code} {response.text:.300}"
                         self._log.faults.append(fault)

@@ -1,4 +1,4 @@
-"""Inject faults at random moments: kill, freeze or cut off processes, and fill the disk."""
+"""Fault injection at random times: processes are killed, frozen or cut off, and the disk fills."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ import httpx
 from benchmarks.soak.plan import Plan
 from benchmarks.soak.processes import Fleet, await_service
 
-#: How often a kill hits each, in proportion: the process that signs, and its supervisor.
+#: Relative frequencies of killed processes: the signing process and its supervisor are separate.
 VICTIMS = {"service": 3, "worker": 2, "signing process": 2}
 PRIMARY, FROZEN, CUT_OFF = "primary", "frozen primary", "network of a host"
 FULL = "full disk"
-#: The faults of a plan that come at random moments, by the name that a schedule gives them.
+#: Faults at random times, by their names in a schedule.
 AT_RANDOM = {"freeze": FROZEN, "partition": CUT_OFF, "full-disk": FULL}
-#: Seconds for which a primary is frozen: less than a connection is believed to live.
+#: Duration for which a primary is frozen, seconds, shorter than the timeout of a connection.
 FROZEN_S = 5.0
-#: Seconds for which a host does not reach the servers: longer than a worker has a job for.
+#: Duration for which a host is cut off, seconds, longer than the lease of a job.
 CUT_OFF_S = 12.0
-#: Seconds for which the disk is full.
+#: Duration for which the disk is full, seconds.
 FULL_S = 6.0
-#: Part of the time before the first and after the last fault.
+#: Fraction of the run before the first fault, and after the last one.
 CALM = 0.1
-#: Seconds until a killed part starts again, and until the standby is promoted.
+#: Seconds until a killed part restarts, and until the standby is promoted.
 AWAY_S, UNNOTICED_S = (0.0, 3.0), 1.0
-#: Seconds for which an asynchronous standby receives nothing before its primary dies.
+#: Seconds for which an asynchronous standby receives nothing before its primary is killed.
 STALL_S = 2.0
 
 
 @dataclass(frozen=True)
 class Kill:
-    """A fault; its time is of `time.monotonic`."""
+    """A fault, with times by `time.monotonic`."""
 
     victim: str
     at: float
@@ -46,13 +46,13 @@ class Kill:
 
 @dataclass(frozen=True)
 class Promotion:
-    """A standby took the place of its primary.
+    """Promotion of a standby to primary.
 
     Parameters
     ----------
-    killed, promoted : when
-    resumed : by address of a service, seconds until it answered a query again
-    unreceived : ids of the frames that the standby had not received
+    killed, promoted : times of the kill and the promotion
+    resumed : seconds until each service, by address, answered a query again
+    unreceived : ids of frames that the standby had not received
     """
 
     killed: float
@@ -64,7 +64,7 @@ class Promotion:
 def schedule(
     seconds: float, faults: Mapping[str, int], rng: random.Random
 ) -> list[tuple[float, str]]:
-    """Return the seconds from the beginning, and what is hit then."""
+    """Return the times of the faults, in seconds from the start, with their kinds."""
     first, last = CALM * seconds, (1 - CALM) * seconds
     victims = rng.choices(list(VICTIMS), list(VICTIMS.values()), k=faults.get("kill", 0))
     due = [(rng.uniform(first, last), victim) for victim in victims]
@@ -78,13 +78,13 @@ def schedule(
 
 @dataclass
 class FaultInjector:
-    """Works through a schedule.
+    """Injector of a schedule of faults.
 
     Parameters
     ----------
-    fleet, plan : whose parts are hit
-    answers : whether a service answers a query
-    rng : of the victims
+    fleet, plan : processes and plan of the run
+    answers : function that returns whether a service answers a query
+    rng : generator that selects the victims
     """
 
     fleet: Fleet
@@ -95,7 +95,7 @@ class FaultInjector:
     promotions: list[Promotion] = field(default_factory=list)
 
     def run(self, due: list[tuple[float, str]], show: Callable[[str], None]) -> None:
-        """Inject each fault when it is due, or as soon as the one before it is over."""
+        """Inject each fault when it is due, or once the fault before it is over."""
         begun = time.monotonic()
         inject = {
             PRIMARY: self._promote, FROZEN: self._freeze, CUT_OFF: self._cut_off,
@@ -132,17 +132,17 @@ class FaultInjector:
             time.sleep(CUT_OFF_S)
 
     def _fill_disk(self) -> None:
-        """Fill the disk once all services are ready: none can start while it is full."""
+        """Fill the disk once all services are ready, since none can start on a full disk."""
         for url in self.fleet.urls:
             await_service(url)
         with self.fleet.full_disk():
             time.sleep(FULL_S)
         for part in (*self.fleet.services, *self.fleet.workers):
-            if not part.is_running:  # a worker that was about to start
+            if not part.is_running:  # a killed worker whose restart is due
                 part.start()
 
     def _promote(self) -> None:
-        """Kill the primary, promote its standby, and note how soon queries are answered."""
+        """Kill the primary, promote its standby, and measure the time until queries succeed."""
         pair, urls = self.fleet.pair, self.fleet.urls
         assert pair is not None
         for url in urls:
@@ -165,7 +165,7 @@ class FaultInjector:
         pair.renew()
 
     def _watch(self, url: str, promoted: float, resumed: dict[str, float]) -> None:
-        """Note when a service answers a query again."""
+        """Record when a service answers a query again."""
         resumed[url] = float("inf")
         while time.monotonic() < promoted + 120:
             with suppress(httpx.TransportError):

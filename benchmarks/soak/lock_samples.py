@@ -1,4 +1,4 @@
-"""Sample from the server's locks for how long writers of a fleet exclude each other."""
+"""Samples of the database locks that show how long writers of a fleet exclude each other."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import psycopg
 
 from sceneprint.store.postgres.connection import LOCKS, MAP_LOCKS, TURN
 
-#: Seconds between two samples, and until a server that does not answer is tried again.
+#: Seconds between two samples, and before the next attempt at a server that does not answer.
 EVERY_S, AGAIN_S = 0.02, 0.25
-#: Seconds for the last answer.
+#: Timeout of the last sample, seconds.
 PATIENCE_S = 10.0
 _QUERY = (
     "SELECT count(*) FILTER (WHERE classid = %s AND objid = %s AND mode = 'ExclusiveLock'),"
@@ -24,14 +24,14 @@ _QUERY = (
 
 @dataclass
 class LockShares:
-    """The sums over all samples.
+    """Totals over all samples.
 
     Parameters
     ----------
-    samples : their number
-    seconds : that they stand for; a server that does not answer is not sampled
-    everybody, one_map : seconds in which all writers of the fleet had to wait for one, and those of
-        a map for one of that map, maps added up
+    samples : number of samples
+    seconds : duration that they represent; a server that does not answer is not sampled
+    everybody, one_map : total time, seconds, in which one writer blocked all others of the fleet,
+        or those of its map (summed over maps)
     """
 
     samples: int = 0
@@ -41,11 +41,11 @@ class LockShares:
 
 
 class LockSampler(threading.Thread):
-    """A thread that samples the locks of whichever server is the primary.
+    """A thread that samples the locks of the current primary.
 
     Parameters
     ----------
-    url : returns the address of the primary
+    url : function that returns the address of the primary
     """
 
     def __init__(self, url: Callable[[], str]) -> None:
@@ -56,10 +56,10 @@ class LockSampler(threading.Thread):
     def stop(self) -> None:
         """Stop sampling."""
         self._ending.set()
-        self.join(PATIENCE_S)  # a frozen server never answers
+        self.join(PATIENCE_S)  # a frozen server does not answer
 
     def run(self) -> None:
-        """Sample until `stop`."""
+        """Sample until `stop` is called."""
         while not self._ending.wait(AGAIN_S):
             try:
                 with psycopg.connect(self._url(), autocommit=True, connect_timeout=3) as connection:
@@ -72,7 +72,7 @@ class LockSampler(threading.Thread):
         while not self._ending.wait(EVERY_S):
             row = connection.execute(_QUERY, (LOCKS, TURN, MAP_LOCKS)).fetchone()
             now = time.monotonic()
-            # after a pause of the machine, or of the server, a sample stands for itself alone
+            # After a pause of the machine or the server, a sample represents a short interval.
             spent, last = min(now - last, 2 * EVERY_S), now
             if row is not None:
                 self.shares.samples += 1

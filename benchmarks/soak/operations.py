@@ -1,6 +1,6 @@
-"""Call every operation of the OpenAPI document, in allowed and in forbidden ways.
+"""Calls of every operation of the OpenAPI document, with and without permission.
 
-schemathesis generates the requests. No answer may be 5xx, or other than the document declares.
+schemathesis generates the requests. Answers must not be 5xx and must conform to the document.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ CHECKS = (
     "not_a_server_error", "status_code_conformance", "content_type_conformance",
     "response_schema_conformance", "response_headers_conformance",
 )  # fmt: skip
-#: Of schemathesis.
+#: Phases of schemathesis.
 PHASES = "examples,coverage,fuzzing,stateful"
-#: Events that are read from a stream, which has no end.
+#: Number of events to read from an endless stream.
 _EVENTS = 2
 _COUNTED = re.compile(r"(\d+) generated(?:, (\d+) found \d+ unique failures?)?(?:, (\d+) passed)?")
 
 
 @dataclass(frozen=True)
 class OperationFigures:
-    """The answers to generated requests.
+    """Answers to generated requests.
 
     Parameters
     ----------
-    caller : whose key was sent, and what the requests named
-    operations : number that were called
-    requests, passed : number sent, and answered as the document says
-    report : of schemathesis
+    caller : description of the key and of the requested objects
+    operations : number of operations
+    requests, passed : number of requests, and of those with an answer as declared
+    report : report of schemathesis
     """
 
     caller: str
@@ -49,7 +49,7 @@ class OperationFigures:
 
     @property
     def sound(self) -> bool:
-        """Return whether requests were sent, and none failed."""
+        """Return whether requests were sent and all passed."""
         return self.requests > 0 and self.requests == self.passed
 
 
@@ -60,11 +60,11 @@ def call_operations(
 
     Parameters
     ----------
-    caller, url : see OperationFigures, and of the service
-    folder : for the configuration
-    options : more options of schemathesis
-    path_values : parameters of paths by name, such as path.map_name, of objects that exist, so that
-        not every answer is 404. Nothing is deleted then
+    caller, url : see OperationFigures, and address of the service
+    folder : folder for the configuration
+    options : further options of schemathesis
+    path_values : values of path parameters, such as path.map_name, of existing objects, so that not
+        every answer is 404; deletions are then excluded
     """
     lines = [f"max-stream-events = {_EVENTS}", "request-timeout = 30.0"]
     if path_values:
@@ -86,7 +86,7 @@ def call_operations(
 
 
 def read_report(caller: str, report: str, code: int) -> OperationFigures:
-    """Return the counts of schemathesis; an exit code that it does not explain is a failure."""
+    """Return the counts of schemathesis; an unexplained exit code counts as a failure."""
     counted, tested = _COUNTED.search(report), re.search(r"Tested: (\d+)", report)
     if counted is None or tested is None:
         return OperationFigures(caller, 0, 0, 0, report)
@@ -101,14 +101,14 @@ def read_report(caller: str, report: str, code: int) -> OperationFigures:
 def call_as_everybody(
     folder: Path, frames: Sequence[Shot], examples: int, phases: str = PHASES
 ) -> list[OperationFigures]:
-    """Call every operation with all rights, with those of one map, and without a key.
+    """Call every operation with all permissions, with those of one map, and without a key.
 
     Parameters
     ----------
-    folder : empty; of data and configuration
-    frames : that each map holds
-    examples : requests of each operation, besides those of the edges of its schema
-    phases : of schemathesis
+    folder : empty folder for data and configuration
+    frames : frames of each map
+    examples : number of requests per operation, in addition to the edge cases of its schema
+    phases : phases of schemathesis
     """
     found = []
     plan = Plan("sqlite", services=1, workers=1)
@@ -137,7 +137,7 @@ def call_as_everybody(
             named = {} if caller == "an operator" else known
             found.append(call_operations(caller, url, own, options, named))
             if caller == "another map":
-                # all are refused, and the edges of schemas would take hours
+                # All requests are rejected, and edge cases of the schemas would take hours.
                 options = ["--phases", "fuzzing", "--max-examples", str(max(examples // 5, 1))]
                 found.append(call_operations("nothing, without a key", url, own, options, {}))
     return found

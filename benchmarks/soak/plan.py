@@ -1,4 +1,4 @@
-"""Define the plans of a soak: a store, robots, and the faults that are injected."""
+"""Plans of a soak: a store, robots, and faults to inject."""
 
 from __future__ import annotations
 
@@ -9,38 +9,38 @@ from typing import Literal
 
 from benchmarks.soak.failover_client import SILENCE_S
 
-#: Faults by their names on the command line. A kill hits a service, a worker or a process that
-#: signs. The number of `operation` counts requests of each, that of `attack` seconds of each.
+#: Faults by their names on the command line. A kill hits a service, a worker or a signing process.
+#: The number of `operation` is the requests per operation, that of `attack` the seconds per attack.
 FAULTS = (
     "kill", "failover", "freeze", "partition", "full-disk", "offline-hour",
     "broken-upload", "attack", "operation",
 )  # fmt: skip
-#: The map that most robots share. Every fourth robot has a map of its own, of 19.
+#: Name and model of the map that most robots share. Every fourth robot uses one of 19 other maps.
 MAP, MODEL, OWN, OWN_MAPS = "fleet", "depth", 4, 19
-#: No surfaces are built for the maps of so many robots.
+#: Number of robots from which no surfaces are built.
 CROWD = 100
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The settings of a run.
+    """Settings of a run.
 
     Parameters
     ----------
-    store : of the rows
-    faults : number of each; for the offline hour, the number of frames that a robot spools
-    seconds : duration of the walks; attacks may end sooner
-    robots, rate : number of robots, and frames a second of each
+    store : store of the rows
+    faults : number of each fault; for the offline hour, the number of frames that a robot spools
+    seconds : duration of the walks; attacks may end earlier
+    robots, rate : number of robots, and frames per second of each
     signed : whether robots wait until their frame is signed
     readers : number of clients that repeat exact searches
     services, workers : number of processes
     asynchronous : whether the standby may lack acknowledged rows
     objects, delays : whether blobs are in an object store, and whether messages are delayed
-    retention_s : seconds for which the maps of single robots keep a frame; the shared map keeps all
-    most_turn_ms : most time for which a frame may make all writers wait, beside the time for
-        which hosts are cut off
+    retention_s : retention of the maps of single robots, seconds; the shared map has none
+    most_turn_ms : longest time for which a frame may block all writers, without the time of hosts
+        that are cut off
     most_query_ms, most_bytes : bounds of the 99th percentile of queries, and of a process's memory
-    seed : of victims and moments
+    seed : seed of victims and times
     data : folder of recordings; default: synthetic rooms
     """
 
@@ -64,29 +64,29 @@ class Plan:
     data: Path | None = None
 
     def count(self, fault: str) -> int:
-        """Return how often a fault is injected."""
+        """Return the number of injections of a fault."""
         return self.faults.get(fault, 0)
 
     @property
     def is_crowd(self) -> bool:
-        """Return whether there are too many robots for their maps to have surfaces."""
+        """Return whether there are too many robots to build surfaces."""
         return self.robots >= CROWD
 
     @property
     def frames(self) -> int:
-        """Return the most frames that a robot sends."""
+        """Return the greatest number of frames that a robot sends."""
         return int(self.seconds * self.rate) + 1
 
     def map_of(self, robot: int) -> str:
-        """Return the map that a robot sends to."""
+        """Return the name of the map of a robot."""
         own = robot % OWN == OWN - 1
-        if self.retention_s is not None:  # so that most frames are deleted again
+        if self.retention_s is not None:  # most frames are to be deleted
             own = not own
         return f"{MAP}-{robot % (OWN * OWN_MAPS)}" if own else MAP
 
 
 _FLEET = {"kill": 20, "failover": 2}
-#: By the marks of their tables in docs/fault_injection.md.
+#: Plans by the marks of their tables in docs/fault_injection.md.
 PLANS = {
     "soak": Plan("sqlite", {"kill": 100, "full-disk": 3}, seconds=400, workers=2, rate=0.5),
     "soak-crowd": Plan("sqlite", workers=2, rate=2.0, readers=8),

@@ -1,4 +1,4 @@
-"""Two PostgreSQL servers, of which one follows the other and takes its place.
+"""Two PostgreSQL servers, of which the standby replicates the primary and can replace it.
 
 primary, standby  --kill_primary-->  standby  --promote-->  primary  --renew-->  primary, standby
 """
@@ -20,11 +20,11 @@ DATABASE = "fleet"
 
 
 class Pair:
-    """A primary and its standby, which change their roles.
+    """A primary and its standby, which exchange their roles.
 
     Parameters
     ----------
-    folder : of their data
+    folder : folder of their data
     synchronous : whether a commit waits for the standby
     """
 
@@ -36,25 +36,25 @@ class Pair:
         self._dead: Server | None = None
 
     def start(self) -> None:
-        """Start the primary with its database, and a standby that follows it."""
+        """Start the primary with its database, and a standby that replicates it."""
         self.primary.start()
         self.primary.create(DATABASE)
         self._standby = self.primary.standby(next(self._folders), synchronous=self._synchronous)
         self.ports = (self.primary.port, self._standby.port)
 
     def url(self, ports: Sequence[int] | None = None) -> str:
-        """Return the URL of whichever server takes writes, if the servers have these ports."""
+        """Return the URL of the server that accepts writes; default ports: those of the servers."""
         hosts = "&".join(f"host=127.0.0.1:{port}" for port in ports or self.ports)
         return f"postgresql+psycopg://postgres@/{DATABASE}?{hosts}&target_session_attrs=read-write"
 
     def stall(self) -> None:
-        """Send nothing more to the standby, as if the link had failed."""
+        """Send no more data to the standby, as if the link had failed."""
         for (pid,) in self.primary.execute("SELECT pid FROM pg_stat_replication"):
             os.kill(cast(int, pid), signal.SIGSTOP)
 
     @contextmanager
     def frozen(self) -> Iterator[None]:
-        """Stop the primary meanwhile, as if its disk hung."""
+        """Stop the primary within the context, as if its disk hung."""
         self.primary.signal(signal.SIGSTOP)
         try:
             yield
@@ -62,13 +62,13 @@ class Pair:
             self.primary.signal(signal.SIGCONT)
 
     def promote(self) -> None:
-        """Make the standby the primary, and return when it takes writes."""
+        """Promote the standby, and return when it accepts writes."""
         assert self._standby is not None
         self._standby.promote()
         self._dead, self.primary, self._standby = self.primary, self._standby, None
 
     def unreceived(self) -> set[str]:
-        """Return the ids of frames that only the dead primary has, which is started for that."""
+        """Start the dead primary, and return the ids of frames that only it has."""
         assert self._dead is not None
         alone = Server(self._dead.folder, durable=True, options={"synchronous_standby_names": ""})
         alone.start()
@@ -78,7 +78,7 @@ class Pair:
             alone.stop()
 
     def renew(self) -> None:
-        """Let a new standby follow the new primary, at the address of the dead server."""
+        """Start a new standby of the new primary, at the address of the dead server."""
         assert self._dead is not None
         shutil.rmtree(self._dead.folder)
         self._standby = self.primary.standby(

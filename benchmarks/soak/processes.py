@@ -1,4 +1,4 @@
-"""Run the processes of a plan on one machine: services, workers, and servers of their data."""
+"""Processes of a plan on one machine: services, workers, and servers of their data."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 from sceneprint.store import Store, open_store
 
-#: Settings of every process. Another worker soon takes what a killed one held, and indexes are
-#: published early.
+#: Settings of every process. Short leases let another worker soon take over after a kill, and
+#: indexes are published early.
 SETTINGS = {
     "SCENEPRINT_REQUIRE_KEYS": "1", "SCENEPRINT_JOB_LEASE_S": "5",
     "SCENEPRINT_UNINDEXED_FRAMES": "100", "SCENEPRINT_TENANT_REQUESTS_PER_S": "0",
 }  # fmt: skip
-#: Seconds that a message to the database takes, and one to the object store, in a slow network.
+#: Delay of a message to the database, and of one to the object store, in a slow network, seconds.
 DATABASE_S, STORE_S = 0.0005, 0.01
-#: Bytes of the disk that is filled, a file system in memory.
+#: Size of the disk that is filled, a file system in memory, bytes.
 DISK_BYTES = 384 << 20
-#: Creates a key that may do everything.
+#: Script that creates a key with all permissions.
 _CREATE_KEY = """
 import sys
 from contextlib import closing
@@ -49,13 +49,13 @@ with closing(open_store(settings.database, settings.blobs)) as store:
 
 
 class Part:
-    """A command of ours in a process group of its own.
+    """A command of sceneprint in its own process group.
 
     Parameters
     ----------
-    arguments : of `sceneprint`
-    log : file that its standard error is appended to
-    environment : of the process
+    arguments : arguments of `sceneprint`
+    log : file to which its standard error is appended
+    environment : environment of the process
     """
 
     def __init__(self, arguments: list[str], log: Path, environment: Mapping[str, str]) -> None:
@@ -72,7 +72,7 @@ class Part:
 
     @property
     def pid(self) -> int:
-        """Return the process that leads the group."""
+        """Return the id of the process that leads the group."""
         assert self._process is not None
         return self._process.pid
 
@@ -82,25 +82,25 @@ class Part:
         return self._process is not None and self._process.poll() is None
 
     def peak_bytes(self) -> int:
-        """Return the most memory that a process of the group ever had."""
+        """Return the peak memory of a process of the group, bytes."""
         return max(peak_bytes(pid) for pid, group, _ in running_processes() if group == self.pid)
 
     def children(self) -> list[int]:
-        """Return the workers that the command has started."""
+        """Return the ids of the workers that the command has started."""
         return [
             pid for pid, _, parent in running_processes()
             if parent == self.pid and b"spawn_main" in read_process(pid, "cmdline")
         ]  # fmt: skip
 
     def kill(self) -> None:
-        """Kill the whole group at once, as a power cut would."""
+        """Kill the whole group at once, like a power failure."""
         if self._process is not None:
             os.killpg(self.pid, signal.SIGKILL)
             self._process.wait()
             self._process = None
 
     def end(self) -> None:
-        """Ask the command to end, and kill it if it does not."""
+        """Terminate the command, and kill it if it does not end."""
         if self._process is not None:
             self._process.terminate()
             try:
@@ -111,15 +111,15 @@ class Part:
 
 
 class Fleet:
-    """All processes of a plan, from `start` until the context ends.
+    """All processes of a plan, from `start` to the end of the context.
 
-    On PostgreSQL each service is a host of its own, and workers are spread over the hosts. On
-    SQLite they share a data folder.
+    On PostgreSQL, each service has its own host, and the workers are distributed over the hosts. On
+    SQLite, all share a data folder.
 
     Parameters
     ----------
-    folder : of data and logs
-    plan : of the run
+    folder : folder of data and logs
+    plan : plan of the run
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
@@ -128,9 +128,9 @@ class Fleet:
         self.workers: list[Part] = []
         self.urls: list[str] = []
         self.pair: Pair | None = None
-        #: The disk of uploads, if it is a file system of its own.
+        #: The disk of uploads, if it is a separate file system.
         self._disk: Path | None = None
-        #: The delayed connections of each host to the servers.
+        #: The delayed connections from each host to the servers.
         self._networks: list[list[DelayProxy]] = []
         self._objects = ObjectServer() if plan.objects else None
         self._shared = dict(SETTINGS)
@@ -147,7 +147,7 @@ class Fleet:
         self._opened.close()
 
     def start(self) -> str:
-        """Start all processes, and return a key that may do everything."""
+        """Start all processes, and return a key with all permissions."""
         plan = self._plan
         if plan.count("full-disk"):
             disk = self.folder / ("host-1" if plan.store == "sqlite" else "blobs")
@@ -198,7 +198,7 @@ class Fleet:
         return Part([*command, "--data", str(data)], log, os.environ | hosts[host])
 
     def _host_environment(self) -> dict[str, str]:
-        """Return the environment of a host, with a network of its own where the plan needs one."""
+        """Return the environment of a host, with its own network if the plan requires it."""
         self._networks.append([])
         if self.pair is None or not (self._plan.delays or self._plan.count("partition")):
             return self._shared
@@ -210,7 +210,7 @@ class Fleet:
         return own
 
     def _reached(self, port: int, delay_s: float) -> int:
-        """Return the port at which the newest host reaches a server."""
+        """Return the port at which the last created host reaches a server."""
         proxy = DelayProxy(port, delay_s if self._plan.delays else 0.0)
         self._opened.callback(proxy.end)
         self._networks[-1].append(proxy)
@@ -229,7 +229,7 @@ class Fleet:
 
     @contextmanager
     def full_disk(self) -> Iterator[None]:
-        """Leave no room on the disk of uploads for a while."""
+        """Fill the disk of uploads within the context."""
         assert self._disk is not None
         ballast = self._disk / "ballast"
         with ballast.open("wb", buffering=0) as file:
@@ -243,7 +243,7 @@ class Fleet:
             ballast.unlink()
 
     def memory(self) -> tuple[int, int]:
-        """Return the most bytes that a process of services, and one of workers, ever had."""
+        """Return the peak memory of a service process and of a worker process, bytes."""
         found = [
             max(part.peak_bytes() for part in parts) for parts in (self.services, self.workers)
         ]
@@ -255,7 +255,7 @@ class Fleet:
         return [line for log in logs for line in log.read_text(errors="replace").splitlines()]
 
     def fsck(self) -> tuple[int, int]:
-        """Return how many files nothing refers to, and how many damages `sceneprint fsck` finds."""
+        """Return the number of unreferenced files, and of damages that `sceneprint fsck` finds."""
         with self.settings() as settings:
             found = Counter(one.severity for one in fsck(settings, grace_s=0.0))
         return found["leftover"], found["damage"]
@@ -270,13 +270,13 @@ class Fleet:
             yield store
 
     def stop(self) -> None:
-        """Ask services and workers to end."""
+        """Terminate services and workers."""
         for part in (*self.workers, *self.services):
             part.end()
 
     @contextmanager
     def settings(self) -> Iterator[Settings]:
-        """Let this process be one of the first host for a while."""
+        """Give this process the environment of the first host within the context."""
         before = dict(os.environ)
         os.environ.update(self._shared)
         try:
@@ -287,5 +287,5 @@ class Fleet:
 
 
 def await_service(url: str) -> None:
-    """Return once a service is ready."""
+    """Wait until a service is ready."""
     until(partial(answers, f"{url}/readyz"), pause_s=0.1)

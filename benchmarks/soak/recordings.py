@@ -1,4 +1,4 @@
-"""Return the walks that robots replay: frames of recordings, thinned by different grids."""
+"""Walks that robots replay: frames of recordings, thinned by different grids."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.frame_files import meta_of
 from sceneprint_lab.cli.demo import write_building
 
-#: A grid has every fourth sample of a frame, so that signing is cheap. The frames of different
-#: grids of a recording have different content.
+#: A grid has every fourth sample of a frame, which makes signing cheap. Frames of different grids
+#: have different content.
 STRIDE = 4
 GRIDS = STRIDE**2
-#: Frames of a synthetic room.
+#: Number of frames of a synthetic room.
 ROOM_FRAMES = 30
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame as a robot sends it: its file, and its camera and pose."""
+    """A frame as a robot sends it: its file, camera and pose."""
 
     png: bytes
     meta: FrameMeta
@@ -36,7 +36,7 @@ class Shot:
 
 @contextmanager
 def recordings(data: Path | None, frames: int) -> Iterator[Path]:
-    """Yield a folder of recordings, or of synthetic rooms that have so many frames."""
+    """Yield a folder of recordings, or of synthetic rooms with `frames` frames."""
     if data is not None:
         yield data
         return
@@ -47,7 +47,7 @@ def recordings(data: Path | None, frames: int) -> Iterator[Path]:
 
 
 def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
-    """Return `n` walks of `frames` frames each; the same ones each time.
+    """Return `n` walks of `frames` frames each, the same in each call.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
 
     Raises
     ------
-    DatasetError : there are not so many frames.
+    DatasetError : If the sequence has fewer frames.
     """
     recorded = [
         [one for one in sequence.frames if one.kind == "depth"] for sequence in find_sequences(data)
     ]
-    # every robot begins elsewhere; those of one recording see it through different grids
+    # Every robot starts elsewhere; those of one recording have different grids.
     places = [(sequence, grid) for grid in range(GRIDS) for sequence in recorded if sequence]
     found: list[list[tuple[FrameReference, int]]] = [[] for _ in range(n)]
     while any(len(one) < frames for one in found):
@@ -70,13 +70,13 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
                 continue
             if not places:
                 raise DatasetError(
-                    f"{data} has fewer than {n * frames} frames in {GRIDS} grids. Send fewer "
-                    "robots, for a shorter time, or give more recordings."
+                    f"{data} has fewer than {n * frames} frames in {GRIDS} grids. Use fewer "
+                    "robots, a shorter time or more recordings."
                 )
             sequence, grid = places.pop(0)
             room = frames - len(walk)
             walk += [(one, grid) for one in sequence[:room]]
-            if len(sequence) > room:  # another robot continues there, once all have begun
+            if len(sequence) > room:  # another robot continues there after all others have started
                 places.append((sequence[room:], grid))
     return [[thinned(*one) for one in walk] for walk in found]
 
@@ -98,6 +98,6 @@ def thinned(frame: FrameReference, grid: int) -> Shot:
         return Shot(path.read_bytes(), meta.model_copy(update=lens))
 
 
-@lru_cache(maxsize=128)  # robots of one recording use the same frames, one after the other
+@lru_cache(maxsize=128)  # robots of one recording use the same frames consecutively
 def _read(frame: FrameReference) -> DepthFrame:
     return frame.read_depth()

@@ -1,4 +1,4 @@
-"""Run the clients of a soak: robots that replay walks, readers that search, and listeners."""
+"""Clients of a soak: robots that replay walks, readers that search, and event listeners."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from sceneprint_client import Client, Spool, errors
 from sceneprint_client.api import Added
 from sceneprint_client.http import StreamPosition, frame_form, read_events
 
-#: Of so many uploads one is followed by a query, and one by the deletion of its frame.
+#: Intervals of uploads that are followed by a query, and by the deletion of the frame.
 QUERY_EVERY, DELETE_EVERY = 5, 10
-#: Matches that an exact search lists, and seconds between two searches of a reader.
+#: Number of matches of an exact search, and pause between two searches of a reader, seconds.
 K, SEARCH_S = 20, 0.1
-#: Seconds that a robot that was offline may take to send everything.
+#: Time limit of a robot that was offline to send all its frames, seconds.
 OFFLINE_PATIENCE_S = 600.0
 _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited)
 
 
 @dataclass(frozen=True)
 class Acknowledged:
-    """A frame whose upload was acknowledged, and when it was sent first, by `time.monotonic`."""
+    """An acknowledged frame, and the time of its first upload by `time.monotonic`."""
 
     frame_id: str
     map_name: str
@@ -47,9 +47,9 @@ class Search:
 
     Parameters
     ----------
-    frame_id : of that frame
-    matches : ids and distances, in the order of the answer
-    begun, answered : by `time.monotonic`
+    frame_id : id of the stored frame
+    matches : ids and distances in the order of the answer
+    begun, answered : times by `time.monotonic`
     """
 
     frame_id: str
@@ -60,13 +60,13 @@ class Search:
 
 @dataclass
 class Ledger:
-    """What the service acknowledged and answered; shared by all clients.
+    """Acknowledgements and answers of the service; shared by all clients.
 
     Parameters
     ----------
     frames : acknowledged uploads
-    deleted : when the deletion of a frame was sent and acknowledged
-    searches : of the readers
+    deleted : times at which the deletion of a frame was sent and acknowledged
+    searches : searches of the readers
     queries : number of answered queries
     """
 
@@ -79,7 +79,7 @@ class Ledger:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot that uploads a walk with its key, from `begins_s` seconds after the start on."""
+    """A robot that uploads a walk with its key, starting `begins_s` seconds after the run."""
 
     number: int
     name: str
@@ -90,7 +90,7 @@ class Robot:
 
 
 class SoakThread(threading.Thread):
-    """A client in a thread of its own, whose failure is a fault of the run."""
+    """A client in its own thread, whose failure is a fault of the run."""
 
     def __init__(self, name: str, log: RequestLog) -> None:
         super().__init__(name=name, daemon=True)
@@ -100,37 +100,37 @@ class SoakThread(threading.Thread):
         """Work until the run ends."""
         try:
             self.work()
-        except Exception as error:  # any failure ends the work of this client
+        except Exception as error:  # the failure of a client does not stop the others
             self._log.faults.append(f"{self.name}: {type(error).__name__}: {error}")
 
     def work(self) -> None:
-        """Do what the client is for."""
+        """Do the work of the client."""
         raise NotImplementedError
 
     def finish(self, seconds: float) -> None:
-        """Wait for the end; one that takes longer is a fault."""
+        """Wait for the end of the thread; a timeout is a fault."""
         self.join(max(seconds, 0.0))
         if self.is_alive():
             self._log.faults.append(f"{self.name} does not end")
 
 
 def image_query(shot: Shot, **options: str) -> dict[str, Any]:
-    """Return the arguments of a request that queries where a frame was taken."""
+    """Return the arguments of a request that queries the place of a frame."""
     sent = frame_form(shot.png, shot.meta.model_copy(update={"pose": None}))
     sent["data"].update(options)
     return sent
 
 
 class Driver(SoakThread):
-    """A thread that drives some robots, whose turns come one after the other.
+    """A thread that drives several robots in turn.
 
     Parameters
     ----------
-    robots : in the order in which they begin
-    rate : frames a second of each
-    client : of the service
-    ledger, log : shared with others
-    stop : ends the walks; a request that was sent is repeated until it is answered
+    robots : robots in the order in which they start
+    rate : frames per second of each robot
+    client : client of the service
+    ledger, log : records that clients share
+    stop : event that ends the walks; a sent request is repeated until it is answered
     deletes, signed : whether robots delete frames, and wait until frames are signed
     """
 
@@ -144,20 +144,20 @@ class Driver(SoakThread):
         self._wait = {"Prefer": "wait=50"} if signed else {}
 
     def work(self) -> None:
-        """Send each frame when its turn has come."""
+        """Send each frame at its time."""
         begun = time.monotonic()
         with self._client:
             for number in range(max(len(one.walk) for one in self._robots)):
                 for robot in self._robots:
                     after, now = robot.begins_s + number / self._rate, time.monotonic()
-                    begun = max(begun, now - after)  # late robots go on at their rate
+                    begun = max(begun, now - after)  # late robots keep their rate
                     if self._stop_walks.wait(begun + after - now):
                         return
                     if number < len(robot.walk):
                         self._visit(robot, number)
 
     def _visit(self, robot: Robot, number: int) -> None:
-        """Upload a frame, and now and then query or delete it."""
+        """Upload a frame, and at intervals query or delete it."""
         client, ledger = self._client, self._ledger
         shot, key, begun = robot.walk[number], bearer(robot.key), time.monotonic()
         meta = shot.meta.model_copy(update={"robot": robot.name, "session": robot.name})
@@ -183,15 +183,15 @@ class Driver(SoakThread):
 
 
 class OfflineRobot(SoakThread):
-    """A robot that spools its frames while it has no network, and then sends all of them.
+    """A robot that spools its frames while it is offline, and then sends all of them.
 
     Parameters
     ----------
-    robot : whose walk is spooled at once, as if its time had passed
-    file : of the spool
-    offline_s : seconds without network
-    urls : of the services
-    ledger, log : shared with others
+    robot : robot whose whole walk is spooled at the start
+    file : path of the spool
+    offline_s : duration without a network, seconds
+    urls : addresses of the services
+    ledger, log : records that clients share
     """
 
     def __init__(
@@ -201,11 +201,11 @@ class OfflineRobot(SoakThread):
         super().__init__(robot.name, log)
         self._robot, self._file, self._offline_s, self._urls = robot, file, offline_s, urls
         self._ledger = ledger
-        #: Frames that were sent twice, as an answer did not come.
+        #: Number of frames that were sent again because no answer arrived.
         self.repeated = 0
 
     def work(self) -> None:
-        """Spool, wait, send, and note under which ids the frames are stored."""
+        """Spool, wait, send, and record the ids of the stored frames."""
         begun = time.monotonic()
         with Spool(self._file) as spool:
             for number, shot in enumerate(self._robot.walk):
@@ -219,7 +219,7 @@ class OfflineRobot(SoakThread):
         self._try_each(self._note_ids)
 
     def _try_each(self, do: Callable[[Client], bool]) -> None:
-        """Do something at one address after the other, until it is done."""
+        """Try an action at one address after the other until it succeeds."""
         end = time.monotonic() + OFFLINE_PATIENCE_S
         for url in cycle(self._urls):
             with Client(url, self._robot.key, timeout_s=SILENCE_S) as client, suppress(*_AWAY):
@@ -232,7 +232,7 @@ class OfflineRobot(SoakThread):
         return not spool.status().waiting
 
     def _note_ids(self, client: Client) -> bool:
-        """Note what is stored; a frame that was spooled and is not stored is missing for good."""
+        """Record stored frames; a spooled frame that is not stored is lost."""
         robot = self._robot
         ids = {one.name: one.frame_id for one in client.frames(robot.map_name)}
         for number, shot in enumerate(robot.walk):
@@ -243,15 +243,15 @@ class OfflineRobot(SoakThread):
 
 
 class Reader(SoakThread):
-    """A client that repeats exact searches for the neighbours of frames that stay.
+    """A client that repeats exact searches for the neighbours of permanent frames.
 
     Parameters
     ----------
-    key, map_name : of the reader
-    stable : ids of the frames that stay
-    client : of the service
-    ledger, log, stop : shared with others
-    seed : of the choice of frames
+    key, map_name : key of the reader, and name of the map
+    stable : ids of the permanent frames
+    client : client of the service
+    ledger, log, stop : records that clients share, and event that ends the searches
+    seed : seed of the selection of frames
     """
 
     def __init__(
@@ -279,14 +279,14 @@ class Reader(SoakThread):
 
 
 class Listener(SoakThread):
-    """A listener to all events of a map, which continues elsewhere when its stream breaks.
+    """A listener to all events of a map; after a broken stream it continues at another address.
 
     Parameters
     ----------
-    map_name : whose events
-    key : of the listener
-    client : of the service
-    log : shared with others
+    map_name : name of the map
+    key : key of the listener
+    client : client of the service
+    log : log that clients share
     """
 
     def __init__(self, map_name: str, key: str, client: FailoverClient, log: RequestLog) -> None:
@@ -294,9 +294,9 @@ class Listener(SoakThread):
         self.map_name = map_name
         self._key, self._client = key, client
         self._ending = threading.Event()
-        #: How often each event was heard, by kind and frame.
+        #: Number of times that each event was received, by kind and frame.
         self.heard: Counter[tuple[str, str | None]] = Counter()
-        #: When retention was heard to have deleted a frame, by `time.monotonic`.
+        #: Time by `time.monotonic` at which the event of a deletion by retention was received.
         self.retired: dict[str | None, float] = {}
 
     def stop(self) -> None:
@@ -304,11 +304,11 @@ class Listener(SoakThread):
         self._ending.set()
 
     def work(self) -> None:
-        """Listen until `stop`."""
-        place = StreamPosition("0")  # all that is stored
+        """Listen until `stop` is called."""
+        place = StreamPosition("0")  # starts with the oldest stored event
         with self._client:
             for client in cycle(self._client.clients):
-                with suppress(httpx.TransportError):  # it was killed, or is not ready yet
+                with suppress(httpx.TransportError):  # the service was killed, or is not ready yet
                     self._listen(client, place)
                 if self._ending.wait(PAUSE_S):
                     return

@@ -1,4 +1,4 @@
-"""Run a plan: start the processes and clients, inject the faults, and collect the figures."""
+"""The run of a plan: start processes and clients, inject faults, and collect the figures."""
 
 from __future__ import annotations
 
@@ -44,42 +44,42 @@ from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.admin import Scope
 from sceneprint_client.errors import JobOver, UnknownJob
 
-#: Map of the robot that is offline at first, and the part of the time for which it is.
+#: Map of the robot that starts offline, and fraction of the run for which it is offline.
 OFFLINE_MAP, OFFLINE = "fleet-offline", 0.4
-#: Frames that are in the shared map all the time.
+#: Number of permanent frames in the shared map.
 STABLE = 24
-#: Seconds until the last frame of a robot has to be acknowledged.
+#: Time limit for the acknowledgement of the last frame of a robot, seconds.
 PATIENCE_S = 240.0
-#: Least part of the time for which locks have to be sampled.
+#: Smallest fraction of the run in which locks must be sampled.
 SAMPLED = 0.5
-#: Threads that drive the robots; keys of an attacker, frames of its map, and those with poses.
+#: Number of driver threads, of keys of an attacker, of frames of its map, and of those with poses.
 DRIVERS, KEYS, ROWS, POSED = 32, 10, 1_000, 16
-#: Messages of SQLite, and ours, when a writer gives up waiting.
+#: Messages of SQLite and sceneprint when a writer gives up waiting.
 LOCKED = ("database is locked", "have waited for long", "has been writing for long")
 
 
 @dataclass
 class SoakFigures:
-    """The figures of a run.
+    """Figures of a run.
 
     Parameters
     ----------
-    plan, found : that was run, and the state of the store in the end
-    kills : by victim
+    plan, found : plan of the run, and final state of the store
+    kills : kills by victim
     outages : see `outages`
-    promotions : of the standby
+    promotions : promotions of the standby
     waits_ms : median and 99th percentile of each kind of request
-    memory : most bytes of a service's process, and of a worker's
-    deleted, queries, repeated : numbers of frames that robots deleted, of answered queries, and of
-        requests that were sent again
+    memory : peak memory of a service process and of a worker process, bytes
+    deleted, queries, repeated : number of frames that robots deleted, of answered queries, and of
+        repeated requests
     faults : descriptions of wrong answers and failed clients
-    locked : lines of logs in which a writer gave up waiting
-    damaged, leftovers : findings of `sceneprint fsck`
-    lost : acknowledged frames that are missing, beyond those that a standby had not received
+    locked : number of log lines in which a writer gave up waiting
+    damaged, leftovers : damages and unreferenced files that `sceneprint fsck` found
+    lost : acknowledged frames that are missing, except those that a standby had not received
     window : acknowledged frames that the standbys had not received
-    spooled, spooled_twice : frames of the robot that was offline, and those that were sent again
-    locks, attacks, broken, operations : see the classes
-    seconds : of all
+    spooled, spooled_twice : frames of the offline robot, and those that were sent again
+    locks, attacks, broken, operations : see their classes
+    seconds : total duration
     """
 
     plan: Plan
@@ -108,15 +108,15 @@ class SoakFigures:
 
     @property
     def turn_ms(self) -> tuple[float, float]:
-        """Return for how long all writers, and those of its map, wait for a frame; milliseconds."""
+        """Return the time for which a frame blocks all writers, and those of its map, ms."""
         each = 1e3 / max(self.found.acknowledged, 1)
         return self.locks.everybody * each, self.locks.one_map * each
 
     @property
     def exceeded(self) -> list[str]:
-        """Return the bounds of the plan that do not hold."""
+        """Return the bounds of the plan that are exceeded."""
         plan, (_, query_ms) = self.plan, self.waits_ms.get("query", (0.0, 0.0))
-        # a host that is cut off may have the turn for as long
+        # A host that is cut off may hold the lock for that long.
         cut_off_s = plan.count("partition") * CUT_OFF_S
         most_turn_ms = plan.most_turn_ms + 1e3 * cut_off_s / max(self.found.acknowledged, 1)
         bounds = {
@@ -132,7 +132,7 @@ class SoakFigures:
 
     @property
     def sound(self) -> bool:
-        """Return whether nothing was lost, doubled, half stored or wrong, and the bounds hold."""
+        """Return whether no data was lost, duplicated or damaged, and all bounds hold."""
         found, plan = self.found, self.plan
         stored = found.acknowledged - len(found.missing) - found.aged
         wrong = (
@@ -153,7 +153,7 @@ class SoakFigures:
 def drive(folder: Path, plan: Plan) -> SoakFigures:
     """Run a plan in an empty folder, and end all its processes."""
     begun = time.monotonic()
-    # besides the robots' walks, those of the offline robot and of the frames that stay
+    # Walks of the robots, of the offline robot, and of the permanent frames.
     n = plan.robots + -(-plan.count("offline-hour") // plan.frames) + -(-STABLE // plan.frames)
     with recordings(plan.data, n * plan.frames) as data:
         walked = walks(data, n, plan.frames)
@@ -179,14 +179,14 @@ class _Run:
         self._ledger, self._log, self._stop = Ledger(), RequestLog(), threading.Event()
         self._rng = random.Random(plan.seed)
         self._figures = SoakFigures(plan, Found(), faults=self._log.faults)
-        #: Seconds for which some maps keep a frame; the others keep all.
+        #: Retention of some maps, seconds; the others keep all frames.
         self._aging: dict[str, float] = {}
         if plan.retention_s is not None:
             own = {plan.map_of(i) for i in range(plan.robots)} - {MAP}
             self._aging = dict.fromkeys(own, plan.retention_s)
 
     def figures(self) -> SoakFigures:
-        """Run the plan to its end."""
+        """Run the whole plan, and return its figures."""
         fleet, plan, figures = self._fleet, self._plan, self._figures
         key = fleet.start()
         locks = LockSampler(self._primary)
@@ -222,7 +222,7 @@ class _Run:
         return figures
 
     def _count(self, injector: FaultInjector) -> None:
-        """Add up the faults, the requests and the acknowledged frames."""
+        """Count the faults, the requests and the acknowledged frames."""
         figures, log, ledger = self._figures, self._log, self._ledger
         unreceived = {name for one in injector.promotions for name in one.unreceived}
         window = {one.frame_id for one in ledger.frames} & unreceived
@@ -256,7 +256,7 @@ class _Run:
         return names
 
     def _upload_stable(self, client: Client) -> list[str]:
-        """Upload the frames that stay, and return their ids."""
+        """Upload the permanent frames, and return their ids."""
         begun = time.monotonic()
         added = [client.upload(MAP, one.png, one.meta) for one in self._stable]
         client.wait([one.job_id for one in added])
@@ -269,7 +269,7 @@ class _Run:
     def _walk(
         self, client: Client, key: str, others: Sequence[threading.Thread], injector: FaultInjector
     ) -> None:
-        """Start all clients, inject the faults, and stop the robots when it is time."""
+        """Start all clients, inject the faults, and stop the robots at the end."""
         plan, stop = self._plan, self._stop
         drivers = self._drivers(client)
         noisy = self._noisy(client) if plan.count("attack") else []
@@ -282,7 +282,7 @@ class _Run:
                 due = schedule(plan.seconds, plan.faults, self._rng)
                 injector.run(due, bar.set_postfix_str)
                 self._besiege(client, key, noisy)
-                if not noisy:  # else the run ends with the attacks
+                if not noisy:  # otherwise the run ends with the attacks
                     stop.wait(max(begun + plan.seconds - time.monotonic(), 0.0))
             finally:
                 stop.set()
@@ -328,7 +328,7 @@ class _Run:
         return keys
 
     def _empty_queue(self, client: Client) -> None:
-        """Cancel the jobs of the attacker that wait, and wait for the rest."""
+        """Cancel the queued jobs of the attacker, and wait for the others."""
         for job in list(client.jobs(JobState.QUEUED)):
             if job.map == "noisy":
                 with suppress(JobOver, UnknownJob):
@@ -336,7 +336,7 @@ class _Run:
         await_idle(client)
 
     def _drivers(self, client: Client) -> list[Driver]:
-        """Return the threads of the robots, each with a key of its own; they start in turn."""
+        """Return the threads of the robots, which have separate keys and start in turn."""
         plan, robots = self._plan, []
         for i, walk in enumerate(self._walked):
             name, map_name = f"robot-{i}", plan.map_of(i)
@@ -371,7 +371,7 @@ class _Run:
         ]  # fmt: skip
 
     def _offline_robot(self, client: Client) -> list[OfflineRobot]:
-        """Return the robot that is offline, if there is one."""
+        """Return the offline robot, if the plan has one."""
         if not self._spooled:
             return []
         name = "robot-offline"
@@ -396,10 +396,10 @@ def _show(bar: tqdm[None], ledger: Ledger, stop: threading.Event) -> None:
 
 
 def outages(kills: Sequence[Kill], exchanges: Sequence[Exchange]) -> dict[str, list[float]]:
-    """Return the longest that a robot had no answer because of each kill, by victim, in seconds.
+    """Return the longest time without an answer after each kill, by victim, in seconds.
 
-    A wait counts for the first kill within it, or else for the last one before: its victim was not
-    back yet.
+    A gap counts for the first kill within it, or else for the last kill before it, whose victim
+    was not back yet.
     """
     longest = [0.0] * len(kills)
     for wait in exchanges:
