@@ -1,10 +1,10 @@
-"""The maps of two robots become one: two recordings of one place, neither knows the other's origin.
+"""Join the recordings of two robots with unknown relative origins into one map.
 
     python examples/join_robots.py drives/mapping drives/later
 
-Both go into one map, a session each. Each frame of the second is looked up among those of the
-first, and what is found votes on how the second's parent frame lies in the first's. `--url` takes a
-service; without it all happens in this process, and nothing is kept.
+Both recordings go into one map as two sessions. Each frame of the second session is queried among
+those of the first, and the matches vote for the transform between the parent frames. `--url` uses a
+service; without it everything runs in this process, and nothing is stored.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ MAP = "two-robots"
 
 
 def upload(client: Client, bag: Path) -> str:
-    """Upload the keyframes of a recording, and wait until they are signed; their session."""
+    """Upload the keyframes of a recording, wait until they are signed, and return their session."""
     sequence, *others = find_sequences(bag)
     if others:
-        raise SystemExit(f"{bag}: its stamps go back. Cut it there, and name one of the parts.")
+        raise SystemExit(f"{bag}: Its stamps go back. Split it there, and specify a part.")
     print(f"{bag}: {sequence.note}")
     named = {"session": sequence.name, "parent_frame": sequence.parent_frame}
     added = [client.upload(MAP, one, meta_of(one, **named)) for one in sequence.frames]
@@ -38,28 +38,28 @@ def upload(client: Client, bag: Path) -> str:
 
 
 def join(client: Client, bags: tuple[Path, Path]) -> Floats | None:
-    """Upload both, and associate them: T_first_second (4, 4), None where they do not agree."""
+    """Upload both recordings and associate them; return T_first_second (4, 4) or None."""
     try:
         client.create_map(MAP, "Example: two robots in one room", model="depth")
     except MapExists:
-        print(f"map {MAP} is there already, and is used")
+        print(f"using the existing map {MAP}")
     first, second = (upload(client, bag) for bag in bags)
     found = client.compute(Association, MAP, sessions=[second, first])
     if found.result is None:
         print(f"the association is {found.state}: {found.error}")
         return None
-    told = found.result
-    print(f"{told.edges} pairs of frames are of one place; {told.inconsistent} were outvoted")
-    for one in told.joins:  # one for each pair of parent frames
+    result = found.result
+    print(f"{result.edges} pairs of frames show one place; {result.inconsistent} were outvoted")
+    for one in result.joins:  # a join for each pair of parent frames
         T_first_second = tell(one)
         if T_first_second is not None:
             return T_first_second
-    print("the recordings do not share enough: drive the second robot where the first has been")
+    print("not enough overlap: drive the second robot along the path of the first")
     return None
 
 
 def tell(one: Join) -> Floats | None:
-    """Print how one parent frame lies in the other, and how sure that is."""
+    """Print the transform between two parent frames and its uncertainty."""
     if one.transform is None:
         print(f"{one.from_parent} is not joined to {one.to_parent}: {one.reason}")
         return None
@@ -71,17 +71,17 @@ def tell(one: Join) -> Floats | None:
     spread = f"{100 * (one.spread_m or 0.0):.1f} cm, {one.spread_deg:.1f} deg"
     print(f"  {one.strength}: {one.support} of {one.votes} pairs agree, to {spread}")
     if one.strength == "weak":
-        print("  look at it before you rely on it: few pairs, or of one place alone")
+        print("  check it before you rely on it: the pairs are few, or all from one place")
     return T
 
 
 def main() -> None:
-    """The example as a command."""
+    """Run the example."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("bags", type=Path, nargs=2, help="recording of each robot")
-    parser.add_argument("--url", help="of a service")
-    parser.add_argument("--key", help="where it asks for one")
-    parser.add_argument("--data", help="folder to keep the map in, without a service")
+    parser.add_argument("--url", help="address of a service")
+    parser.add_argument("--key", help="key of the service, if it requires one")
+    parser.add_argument("--data", help="folder to store the map in, without a service")
     options = parser.parse_args()
     with (
         tempfile.TemporaryDirectory() as scratch,

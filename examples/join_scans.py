@@ -1,9 +1,9 @@
-"""One cloud of scans with poses, as the SLAM system of a robot writes its map.
+"""Join scans with poses to one cloud, like the SLAM system of a robot.
 
     python examples/join_scans.py site/site-000 hall.pcd --every 2
 
-Reads the scans `NAME.ply` with their `NAME.pose.txt`, and writes one point for each voxel of 10 cm
-as a PCD file. With `--every 2` each second scan is left out: a robot that comes later has those.
+The program reads scans `NAME.ply` with their `NAME.pose.txt`, and writes one point per voxel of
+10 cm to a PCD file. `--every 2` uses every second scan, so that the others remain for queries.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from sceneprint.formats.points import decode_cloud
 
-#: Edge of the voxels of which one point is kept each, metres.
+#: Edge length of a voxel, metres.
 VOXEL_M = 0.1
 
 

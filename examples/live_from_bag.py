@@ -1,10 +1,10 @@
-"""Live poses out of a recording: each frame with its odometry goes to a `Tracker`, in order.
+"""Send the frames and odometry of a recording to a `Tracker`, like a live robot.
 
     python examples/live_from_bag.py office drives/later --truth drives/later.tum
 
-The map has frames with poses, such as those of `sceneprint upload office drives/mapping`. What is
-printed is what a robot would publish: T_map_odom, while it is tracking. `--url` takes a service
-(default: http://127.0.0.1:8008), `--data` a data folder without one.
+The map has frames with poses, such as those of `sceneprint upload office drives/mapping`. The
+program prints T_map_odom while it is tracked, as a robot would publish it. `--url` uses a service
+(default: http://127.0.0.1:8008), `--data` a data folder without a service.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ from sceneprint_client.tracker import State
 
 
 def frames_of(bag: Path) -> tuple[FrameReference, ...]:
-    """Every frame of a recording, its pose in the frame of the odometry."""
+    """Return all frames of a recording, with poses from odometry."""
     sequence, *others = find_sequences(bag, RecordingOptions(pose_frame="odom", keyframe_m=0))
     if others:
-        raise SystemExit(f"{bag}: its stamps go back. Cut it there, and name one of the parts.")
+        raise SystemExit(f"{bag}: Its stamps go back. Split it there, and specify a part.")
     print(sequence.note)
     return sequence.frames
 
 
 def line_of(state: State, elapsed: float, truth: Floats | None) -> str:
-    """A state for people; how far off the camera is, where the truth is known."""
-    told = f"{elapsed:5.1f} s  {state.status:9}"
+    """Return a state as text, with the error of the camera's position if the truth is known."""
+    text = f"{elapsed:5.1f} s  {state.status:9}"
     if state.T_map_odom is None or state.T_map_sensor is None or state.covariance is None:
-        return f"{told} {state.reason}"
+        return f"{text} {state.reason}"
     x, y, z = state.T_map_odom[:3, 3]
     yaw = np.degrees(np.arctan2(state.T_map_odom[1, 0], state.T_map_odom[0, 0]))
     sure = 100 * np.sqrt(np.trace(state.covariance[:3, :3]))
-    told += f" {state.parent_frame} <- odom: {x:6.2f} {y:6.2f} {z:6.2f} m, yaw {yaw:6.1f} deg"
-    told += f", +-{sure:.0f} cm"
-    return told if truth is None else f"{told}, off by {100 * error_of(state, truth):.1f} cm"
+    text += f" {state.parent_frame} <- odom: {x:6.2f} {y:6.2f} {z:6.2f} m, yaw {yaw:6.1f} deg"
+    text += f", +-{sure:.0f} cm"
+    return text if truth is None else f"{text}, off by {100 * error_of(state, truth):.1f} cm"
 
 
 def error_of(state: State, truth: Floats) -> float:
-    """How far the camera is from (x, y, z), metres."""
+    """Return the distance of the camera from the true position (x, y, z), metres."""
     assert state.T_map_sensor is not None
     return float(np.linalg.norm(state.T_map_sensor[:3, 3] - truth))
 
 
 def live(client: Client, map_name: str, bag: Path, truth: Path | None = None) -> list[float]:
-    """Play a recording to a tracker; how far off each tracked pose was, metres."""
+    """Play a recording to a tracker; return the error of each tracked position, metres."""
     frames = frames_of(bag)
     rows = np.loadtxt(truth, ndmin=2) if truth is not None else np.empty((0, 8))
     tracker = Tracker(client, map_name)
@@ -61,7 +61,7 @@ def live(client: Client, map_name: str, bag: Path, truth: Path | None = None) ->
     errors, first = [], None
     begin = frames[0].timestamp or 0.0
     for frame in frames:
-        if frame.pose is None or frame.timestamp is None:  # no odometry at its time
+        if frame.pose is None or frame.timestamp is None:  # no odometry at this time
             continue
         up = None if frame.camera is None else frame.camera.up
         state = tracker.update(frame, frame.pose, up=up, stamp=frame.timestamp)
@@ -74,22 +74,22 @@ def live(client: Client, map_name: str, bag: Path, truth: Path | None = None) ->
             first = elapsed if first is None else first
             if place is not None:
                 errors.append(error_of(state, place))
-    when = "never fixed" if first is None else f"first fix after {first:g} s"
+    when = "no fix" if first is None else f"first fix after {first:g} s"
     print(f"tracking on {seen['tracking']} of {seen.total()} frames, {when}")
     if errors:
-        print(f"off the truth by {100 * np.median(errors):.1f} cm, at most {100 * max(errors):.1f}")
+        print(f"position error: {100 * np.median(errors):.1f} cm, at most {100 * max(errors):.1f}")
     return errors
 
 
 def main() -> None:
-    """The example as a command."""
+    """Run the example."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("map", help="name of the map")
     parser.add_argument("bag", type=Path, help=".mcap, .db3 or .bag file, or rosbag2 folder")
-    parser.add_argument("--truth", type=Path, help="TUM trajectory of the camera, to compare with")
+    parser.add_argument("--truth", type=Path, help="true TUM trajectory of the camera")
     url = os.environ.get("SCENEPRINT_URL") or DEFAULT_URL
-    parser.add_argument("--url", default=url, help=f"of a service (default: {url})")
-    parser.add_argument("--key", help="where it asks for one")
+    parser.add_argument("--url", default=url, help=f"address of a service (default: {url})")
+    parser.add_argument("--key", help="key of the service, if it requires one")
     parser.add_argument("--data", help="data folder, without a service")
     options = parser.parse_args()
     embedded = options.data is not None

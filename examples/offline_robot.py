@@ -1,13 +1,13 @@
-"""A robot out of reach of its service spools its frames, and uploads them when it is back.
+"""Spool the frames of a robot without a connection, and upload them when it is back.
 
     python examples/offline_robot.py drives/mapping office --spool office.spool
     python examples/offline_robot.py drives/mapping office --spool office.spool --copy copy
 
 With `--copy FOLDER`, a copy of the map by `sceneprint pull`, it also localises without the service.
 
-`frames_of` stands for a camera: put your own there. While the service cannot be reached the
-program goes on; each frame is on disk before the next is taken, so a crash or an empty battery
-loses none. Run it again: frames that the map or the spool has are not taken twice.
+Replace `frames_of` by your camera. The program continues while the service is unreachable. Each
+frame is on disk before the next one is taken, so a crash or an empty battery loses none. Run it
+again at any time: frames that the map or the spool already has are not duplicated.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from sceneprint_client.api import FrameMeta
 from sceneprint_client.errors import SceneprintError
 from sceneprint_client.http import DEFAULT_URL
 
-#: Frames between two tries to upload.
+#: Number of frames between two attempts to upload.
 TRY_EVERY = 50
 
 
 def frames_of(folder: Path) -> Iterator[tuple[FrameReference, FrameMeta]]:
-    """Frames with what is known of them, one by one."""
+    """Yield frames with their metadata."""
     for sequence in find_sequences(folder):
         for frame in sequence.frames:
             yield frame, meta_of(frame, parent_frame=sequence.parent_frame)
 
 
 def upload_waiting(client: Client, spool: Spool, map_name: str) -> bool:
-    """Upload what waits, as far as there is a connection; whether all went."""
+    """Upload the waiting frames; return whether all were uploaded."""
     try:
         report = spool.sync(client, map_name, patience_s=30)
-    except SceneprintError as error:  # out of reach, busy, or a key or map that somebody mends
+    except SceneprintError as error:  # unreachable, busy, or a wrong key or map
         print(f"offline, {spool.status().waiting} frames wait: {error}")
         return False
     print(f"uploaded {report.received}, already there {report.there}, refused {report.refused}")
@@ -47,19 +47,19 @@ def upload_waiting(client: Client, spool: Spool, map_name: str) -> bool:
 
 
 def localise(robot: Client, map_name: str, frame: FrameReference, meta: FrameMeta) -> None:
-    """Say where a frame was taken, by the robot's own copy of the map."""
+    """Print the pose of a frame in the robot's own copy of the map."""
     place = robot.localize(map_name, frame, meta.model_copy(update={"pose": None}))
     print(f"{frame.path.name}: {place.status}")
 
 
 def main() -> None:
-    """Drive: spool every frame, localise and upload now and then."""
+    """Spool every frame, and localise and upload at intervals."""
     parser = argparse.ArgumentParser(description="Spool frames, and upload them when online.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("map")
     parser.add_argument("--spool", type=Path, default=Path("offline.spool"))
     parser.add_argument("--most-bytes", type=int, default=1 << 30)
-    parser.add_argument("--copy", type=Path, help="folder of `sceneprint pull`, to localise by")
+    parser.add_argument("--copy", type=Path, help="copy of the map by `sceneprint pull`, for poses")
     parser.add_argument("--url", default=os.environ.get("SCENEPRINT_URL") or DEFAULT_URL)
     options = parser.parse_args()
     with ExitStack() as stack:

@@ -1,10 +1,10 @@
-"""Two small recordings of ROS 2, as two robots with a depth camera would make them in one room.
+"""Write two small ROS 2 recordings of two robots with depth cameras in one room.
 
     python examples/record_drives.py drives
 
-`drives/mapping` has poses in `map`, as a SLAM system publishes them. `drives/later` has odometry
-alone, which began elsewhere, and drifts by 1 %. `drives/later.tum` says where that camera truly
-was in `map`, to compare with. Needs `pip install rosbags`; the room is synthetic.
+`drives/mapping` has poses in `map`, as a SLAM system publishes them. `drives/later` has only
+odometry with another origin and a drift of 1 %. `drives/later.tum` holds the true poses of
+its camera in `map` for comparison. The room is synthetic. Needs `pip install rosbags`.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from sceneprint_lab.synth import take, trajectory
 from sceneprint_lab.synth.dataset import room_and_rng
 
 CAMERA = Intrinsics(320, 240, 292.5, 292.5, 159.5, 119.5)
-#: The camera sits above the base, and looks ahead and 10 degrees down: x right, y down, z forward.
+#: The camera sits above the base and looks ahead, 10 degrees down: x right, y down, z forward.
 _C, _S = np.cos(np.radians(10)), np.sin(np.radians(10))
 T_BASE_CAMERA = np.array([[0, -_S, _C, 0.1], [-1, 0, 0, 0], [0, -_C, -_S, 1.2], [0, 0, 0, 1]])
-#: When each recording begins, seconds since 1970; and seconds between two frames.
+#: Start of each recording, seconds since 1970, and interval of frames, seconds.
 BEGIN = {"mapping": 1_763_280_000, "later": 1_763_366_400}
 STEP_S = 0.5
 
 
 class Recorder:
-    """A rosbag2 with an MCAP file that messages are written to."""
+    """Writer of messages to a rosbag2 with an MCAP file."""
 
     def __init__(self, folder: Path) -> None:
         self.types = get_typestore(Stores.ROS2_HUMBLE)
@@ -53,11 +53,11 @@ class Recorder:
         self.writer.close()
 
     def make(self, name: str, **fields: Any) -> Any:
-        """A message, such as `make("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0)`."""
+        """Return a message, such as `make("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0)`."""
         return self.types.types[name](**fields)
 
     def write(self, topic: str, t: float, message: Any) -> None:
-        """Record a message at a time."""
+        """Record a message with a time stamp."""
         name = message.__msgtype__
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
@@ -65,12 +65,12 @@ class Recorder:
         self.writer.write(self.connections[topic], round(t * 1e9), data)
 
     def header(self, t: float, frame: str) -> Any:
-        """When, and in which frame."""
+        """Return a header with a stamp and a frame."""
         stamp = self.make("builtin_interfaces/msg/Time", sec=int(t), nanosec=round(t % 1 * 1e9))
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
     def depth(self, t: float, depth: Floats) -> None:
-        """`/camera/depth/image_raw`, in millimetres, and its camera_info."""
+        """Record `/camera/depth/image_raw`, in millimetres, and its camera_info."""
         k, header = CAMERA, self.header(t, "camera")
         samples = np.round(1000 * depth).astype("<u2")
         image = self.make(
@@ -89,7 +89,7 @@ class Recorder:
         self.write("/camera/depth/camera_info", t, info)
 
     def transform(self, topic: str, t: float, parent: str, child: str, T: Floats) -> None:
-        """`/tf` or `/tf_static`: T_parent_child."""
+        """Record T_parent_child on `/tf` or `/tf_static`."""
         pose = self.make(
             "geometry_msgs/msg/Transform", translation=self._xyz("Vector3", T),
             rotation=self._rotation(T),
@@ -126,7 +126,7 @@ class Recorder:
 
 
 def base_at(T_map_camera: Floats) -> Floats:
-    """T_map_base of a robot on the floor where somebody holds a camera, and looks as they do."""
+    """Return T_map_base of a robot on the floor below a hand-held camera, with its heading."""
     x, y = T_map_camera[:2, 3]
     forward = T_map_camera[:2, 2] / np.linalg.norm(T_map_camera[:2, 2])
     T = np.eye(4)
@@ -135,7 +135,7 @@ def base_at(T_map_camera: Floats) -> Floats:
 
 
 def odometry_of(T_map_base: list[Floats]) -> list[Floats]:
-    """T_odom_base of a drive: it begins at the identity, and each step is 1 % too long."""
+    """Return T_odom_base of a drive from the identity, with steps that are 1 % too long."""
     found = [np.eye(4)]
     for before, after in pairwise(T_map_base):
         step = np.linalg.inv(before) @ after
@@ -145,7 +145,7 @@ def odometry_of(T_map_base: list[Floats]) -> list[Floats]:
 
 
 def record(folder: Path, frames: int) -> None:
-    """Drive twice along one path; the second time between the places of the first."""
+    """Record two drives along one path; frames of the second lie between those of the first."""
     room, rng = room_and_rng(5, 1)
     path = [base_at(T_map_camera) for T_map_camera in trajectory(room, 12 * frames, rng)]
     for name, drive in (("mapping", path[::12]), ("later", path[6::12])):
@@ -154,7 +154,7 @@ def record(folder: Path, frames: int) -> None:
             recorder.transform("/tf_static", stamps[0], "base_link", "camera", T_BASE_CAMERA)
             for t, T_map_base, T_odom_base in zip(stamps, drive, odometry_of(drive), strict=True):
                 recorder.odometry(t, T_odom_base)
-                if name == "mapping":  # what SLAM makes of it
+                if name == "mapping":  # poses of SLAM
                     T_map_odom = T_map_base @ np.linalg.inv(T_odom_base)
                     recorder.transform("/tf", t, "map", "odom", T_map_odom)
                 recorder.depth(t, take(room, T_map_base @ T_BASE_CAMERA, CAMERA, rng))
@@ -164,10 +164,10 @@ def record(folder: Path, frames: int) -> None:
 
 
 def main() -> None:
-    """The example as a command."""
+    """Run the example."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
-    parser.add_argument("folder", type=Path, help="new folder of the recordings")
-    parser.add_argument("--frames", type=int, default=24, help="of each drive (default: 24)")
+    parser.add_argument("folder", type=Path, help="new folder for the recordings")
+    parser.add_argument("--frames", type=int, default=24, help="frames of each drive (default: 24)")
     options = parser.parse_args()
     options.folder.mkdir(parents=True)
     record(options.folder, options.frames)

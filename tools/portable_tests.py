@@ -1,12 +1,12 @@
-"""Run the tests whose values depend on floating point as other processors would compute them.
+"""Run the tests that depend on floating point as on other processors.
 
     python tools/portable_tests.py [--list] [TARGET ...]
 
-Sums of other lengths of vectors, products that are fused or not, and functions of another branch of
-the C library differ in the last bits. A target takes features from this processor where libraries
-choose by them: numba's machine code, numpy's loops, the BLAS of numpy, SciPy and FAISS, and glibc's
-exp, sin and so on. Embree chooses its code by itself, so the target `rays` moves what it finds by a
-unit in the last place, as a plugin of pytest. A bound that only one target meets is too tight.
+Vector lengths, fused products and branches of the C library change the last bits of results. Each
+target selects other code paths where libraries depend on the processor: numba's machine code,
+numpy's loops, the BLAS of numpy, SciPy and FAISS, and glibc's exp, sin and so on. Embree has no
+such option, so the target `rays`, a plugin of pytest, changes its results by a last bit.
+A bound that holds on only one target is too tight.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FILES = (
     "guided", "localization", "lookalikes", "pipeline", "points", "quality", "retrieve",
     "same_as_evaluate", "training", "training_lidar", "vistas",
 )  # fmt: skip
-#: Loops that numpy chooses by this processor: all but those of its oldest x86-64.
+#: Code that prints numpy's loops for this processor beyond those of the oldest x86-64.
 NUMPY_LOOPS = (
     "from numpy._core._multiarray_umath import __cpu_dispatch__ as d, __cpu_features__ as has; "
     "print(*(name for name in d if has[name]))"
@@ -56,16 +56,16 @@ def generic() -> dict[str, str]:
 
 
 def targets() -> dict[str, dict[str, str]]:
-    """Return the environment of each target by its name."""
+    """Return the environments of the targets by name."""
     cores = ["Haswell", "Zen", "Prescott"]
-    if "avx512dq" in Path("/proc/cpuinfo").read_text():  # OpenBLAS takes our word for it
+    if "avx512dq" in Path("/proc/cpuinfo").read_text():  # OpenBLAS does not check the processor
         cores.append("SkylakeX")
     blas = {f"OpenBLAS-{core}": {"OPENBLAS_CORETYPE": core} for core in cores}
     return {"as-is": {}, "generic": generic(), "rays": {}, **blas, "one-core": {}}
 
 
 def run(name: str, environment: dict[str, str]) -> bool:
-    """Run the tests of one target; returns whether all passed."""
+    """Run the tests of a target; return whether all passed."""
     paths = [f"tests/{one}" for one in FOLDERS] + [f"tests/test_{one}.py" for one in FILES]
     every = os.sched_getaffinity(0)
     processes = 2 if name == "one-core" else 2 * len(every)
@@ -84,7 +84,7 @@ def run(name: str, environment: dict[str, str]) -> bool:
 
 
 def pytest_configure() -> None:
-    """Move what each ray meets by up to a unit in the last place of its distance."""
+    """Change the distance of each ray hit by at most a unit in the last place."""
     import numpy as np
 
     from sceneprint_lab.synth import sensors
@@ -100,7 +100,7 @@ def pytest_configure() -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the targets that are named, or all; 1 where a test of one failed."""
+    """Run the given targets or all; return 1 if a test failed."""
     known = targets()
     if "--list" in arguments or set(arguments) - set(known):
         print(*known, sep="\n")

@@ -1,6 +1,6 @@
-"""docs/settings.md: a table of all settings, written from the fields of `Settings`.
+"""Generator of docs/settings.md, a table of all settings, from the fields of `Settings`.
 
-python -m tools.settings_page        # rewrites the page
+python -m tools.settings_page        # writes the page
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sceneprint.settings import Settings
 from tools.site.markup import cell, code, page, table
 
 PAGE = Path(__file__).resolve().parents[1] / "docs/settings.md"
-#: Titles of the sections, by the first setting of each.
+#: Titles of the sections, by the first setting in each.
 SECTIONS = {
     "data_dir": "Places",
     "host": "Service",
@@ -29,7 +29,7 @@ _BOUNDS = {Ge: ("ge", "at least {:,}"), Gt: ("gt", "above {:,}"), Le: ("le", "at
 
 
 def settings_page() -> str:
-    """Return the Markdown of the page."""
+    """Return the page as Markdown."""
     fields = Settings.model_fields
     names, starts = list(fields), [*(list(fields).index(name) for name in SECTIONS), len(fields)]
     parts = [

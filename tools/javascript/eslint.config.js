@@ -1,4 +1,4 @@
-// What is likely a mistake; how code looks is left to whoever writes it.
+// Rules against likely mistakes; there are none for formatting.
 import js from "@eslint/js";
 import globals from "globals";
 

@@ -1,13 +1,13 @@
-// What the dashboard adds to the browser's own objects.
+// Additions of the dashboard to the browser's objects.
 
 interface HTMLCanvasElement {
-  /** The view that draws here; the tests and benchmarks read it. */
+  /** Viewer that draws on the canvas; tests and benchmarks read it. */
   viewer?: import("../../service/dashboard/pages/viewer/viewer.js").Viewer;
-  /** The overlay or the place that is drawn here; likewise. */
+  /** Overlay or place on the canvas; tests and benchmarks read it. */
   scene?:
     | import("../../service/dashboard/pages/overlay/scene.js").Scene
     | import("../../service/dashboard/pages/paths/scene.js").Scene;
-  /** Whether the picture was drawn, once that is known. */
+  /** Resolves to whether the picture was drawn. */
   ready?: Promise<boolean>;
 }
 
@@ -18,17 +18,17 @@ interface WindowEventMap {
 }
 
 interface Document {
-  /** Elements of index.html, which are always there. */
+  /** Elements of index.html, which always exist. */
   getElementById(id: "actions" | "banner" | "crumbs" | "main" | "nav" | "rail-foot" | "tabs" | "title" | "toasts"): HTMLElement;
-  /** Nothing has no id. */
+  /** An undefined id finds no element. */
   getElementById(id: string | undefined): HTMLElement | null;
   querySelector(selectors: ".skip"): HTMLElement;
 }
 
-/** What went wrong: a Problem of lib/http.js, or a fault of ours. */
+/** An error: a Problem of lib/http.js, or a defect of the dashboard. */
 type Fault = Error & Partial<import("../../service/dashboard/pages/lib/http.js").Problem>;
 
-/** What setTimeout gave; null where nothing is waited for. */
+/** Result of setTimeout; null without a timer. */
 type Timer = number | null;
 
 interface HTMLDialogElement {
@@ -37,5 +37,5 @@ interface HTMLDialogElement {
   querySelector(selectors: string): HTMLElement | null;
 }
 
-/** A timer that was never set is cleared as well. */
+/** Clearing a missing timer has no effect. */
 declare function clearTimeout(id: number | null | undefined): void;

@@ -1,1 +1,1 @@
-"""The documentation site: where its pages come from, what the build makes of the code, diagrams."""
+"""The documentation site: sources of its pages, pages generated from the code, and diagrams."""

@@ -1,4 +1,4 @@
-"""The page of the Python client: signatures and docstrings of what the package offers."""
+"""The page of the Python client, from its signatures and docstrings."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _WIDTH = 88
 
 
 def public_names() -> list[str]:
-    """What the package offers, without its version."""
+    """Return the public names of the package without its version."""
     return [name for name in sceneprint_client.__all__ if not name.startswith("_")]
 
 
 def public_methods(kind: type) -> dict[str, Callable[..., object]]:
-    """Public methods of a class, its bases' as well, in the order in which they are defined."""
+    """Return the public methods of a class and its bases, in order of definition."""
     found: dict[str, Callable[..., object]] = {}
     for base in reversed(kind.__mro__):
         if not base.__module__.startswith("sceneprint_client"):
@@ -33,7 +33,7 @@ def public_methods(kind: type) -> dict[str, Callable[..., object]]:
 
 
 def public_properties(kind: type) -> dict[str, str]:
-    """Properties of a class with what they are."""
+    """Return the properties of a class with their descriptions."""
     return {
         name: inspect.getdoc(one) or ""
         for base in reversed(kind.__mro__)
@@ -43,7 +43,7 @@ def public_properties(kind: type) -> dict[str, str]:
 
 
 def client_page() -> str:
-    """Markdown that describes everything that `sceneprint_client` offers."""
+    """Return a Markdown description of the public names of `sceneprint_client`."""
     return page(
         "# Python client",
         plain("Everything that `sceneprint_client` offers. Bodies and answers are the "
@@ -84,19 +84,19 @@ def _method(owner: str, name: str, function: Callable[..., object]) -> str:
 
 
 def signature(name: str, function: Callable[..., object]) -> str:
-    """A function's signature as one would write it, a parameter a line where it is long."""
-    told = inspect.signature(function)
+    """Return a function's signature, with one parameter per line if it is long."""
+    found = inspect.signature(function)
     parts: list[str] = []
     before: inspect._ParameterKind | None = None
-    for one in told.parameters.values():
+    for one in found.parameters.values():
         if one.name in ("self", "cls"):
             continue
         if one.kind is one.KEYWORD_ONLY and before not in (one.VAR_POSITIONAL, one.KEYWORD_ONLY):
             parts.append("*")
         before = one.kind
         parts.append(_parameter(one))
-    # of a class there is no need to say what it returns
-    returned = "" if name[:1].isupper() else f" -> {_annotation(told.return_annotation)}"
+    # The signature of a class omits its return type.
+    returned = "" if name[:1].isupper() else f" -> {_annotation(found.return_annotation)}"
     line = f"{name}({', '.join(parts)}){returned}"
     if len(line) <= _WIDTH:
         return line
@@ -113,13 +113,13 @@ def _parameter(one: inspect.Parameter) -> str:
     return f"{text} = {one.default!r}" if ":" in text else f"{text}={one.default!r}"
 
 
-def _annotation(given: Any) -> str:
-    """An annotation as the source has it; modules that put off evaluating it keep its text."""
-    return given if isinstance(given, str) else inspect.formatannotation(given)
+def _annotation(annotation: Any) -> str:
+    """Return an annotation as in the source, including postponed ones."""
+    return annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
 
 
 def documented(one: object) -> str:
-    """A docstring as Markdown: its text, and a table for each section of NumPy's style."""
+    """Return a docstring as Markdown, with a table for each section of NumPy's style."""
     text, *sections = _SECTION.split(inspect.getdoc(one) or "")
     parts = [_prose(text)]
     for title, body in zip(sections[::2], sections[1::2], strict=True):
@@ -132,7 +132,7 @@ def documented(one: object) -> str:
 
 
 def _prose(text: str) -> str:
-    """Paragraphs; what is indented is code."""
+    """Return paragraphs as Markdown; indented text is code."""
     blocks = re.split(r"\n\n", text.strip("\n"))
     shown: list[str] = []
     for block in blocks:
@@ -144,7 +144,7 @@ def _prose(text: str) -> str:
 
 
 def _entries(body: str) -> Iterator[tuple[str, str]]:
-    """Names with their meanings: `name : meaning`, with further lines indented."""
+    """Yield names with their descriptions: `name : description`, with indented further lines."""
     for entry in re.split(r"\n(?=\S)", body.strip("\n")):
         name, mark, meaning = entry.partition(" : ")
         if mark:

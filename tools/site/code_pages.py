@@ -1,4 +1,4 @@
-"""Pages of metrics and commands, from the code that counts and runs them."""
+"""Pages of metrics and commands, generated from the code."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class MetricFamily:
 
     Parameters
     ----------
-    name : as Prometheus is told
+    name : name in Prometheus
     kind : counter, gauge or histogram
-    labels : of its series
-    meaning : its help text
+    labels : labels of its series
+    meaning : help text
     """
 
     name: str
@@ -34,10 +34,10 @@ class MetricFamily:
 
 
 def metric_families() -> list[MetricFamily]:
-    """All families that a service serves, also those without data, by name."""
+    """Return all families of a service by name, including those without data."""
     metrics = Metrics()
     found = set()
-    for collector in metrics.registry._collector_to_names:  # `collect` leaves out empty ones
+    for collector in metrics.registry._collector_to_names:  # `collect` omits empty families
         assert isinstance(collector, MetricWrapperBase)
         for family in collector.describe():
             name = family.name + ("_total" if family.type == "counter" else "")
@@ -47,7 +47,7 @@ def metric_families() -> list[MetricFamily]:
 
 
 def metrics_page() -> str:
-    """Markdown that lists every metric."""
+    """Return Markdown that lists every metric."""
     found = metric_families()
     rows = (
         (f"`{one.name}`", one.kind, ", ".join(map(code, one.labels)), cell(one.meaning))
@@ -62,7 +62,7 @@ def metrics_page() -> str:
 
 
 def commands_page() -> str:
-    """Markdown that describes every command with its options."""
+    """Return Markdown that describes every command with its options."""
     found = {name: (line, one) for name, line, one in subcommands(parser())}
     own = [name for name in found if " " not in name]
     added = ", ".join(f"`{name}`" for name in own if name not in COMMANDS)
@@ -80,7 +80,7 @@ def commands_page() -> str:
 
 
 def _command(name: str, one: argparse.ArgumentParser) -> str:
-    # argparse wraps usage at the width of the terminal
+    # argparse wraps the usage at the width of the terminal.
     columns, os.environ["COLUMNS"] = os.environ.get("COLUMNS"), "88"
     try:
         usage = one.format_usage().removeprefix("usage: ")
@@ -98,7 +98,7 @@ def _command(name: str, one: argparse.ArgumentParser) -> str:
 
 
 def _groups(one: argparse.ArgumentParser) -> Iterator[str]:
-    """The options of each group, as the help has them."""
+    """Yield the options of each group as in the help."""
     formatter = one._get_formatter()
     for group in one._action_groups:
         rows = [

@@ -1,14 +1,14 @@
-"""Diagrams from text: the part of mermaid's flowcharts that the pages use, drawn as SVG.
+"""Diagrams from text: SVG for the part of mermaid's flowcharts that the pages use.
 
-Git hosts draw mermaid in the browser, with a script that they bring along; the site draws it while
-it is built, so that a page needs no script for it and follows the theme.
+Git hosts draw mermaid in the browser with their own script. The site draws it during the build, so
+that a page needs no script and the diagram follows the theme.
 
     flowchart LR
       accTitle: What the picture shows
       robot[Robot] -->|frames| service(Service)
       service -.-> store[("Database<br>and blobs")]
 
-    text  --read_diagram-->  Diagram  --layered-->  nodes with places  --svg_of-->  SVG
+    text  --read_diagram-->  Diagram  --layered-->  LayeredGraph  --svg_of-->  SVG
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from html import escape
 from itertools import combinations, pairwise
 
-#: What text takes, in pixels of the picture: of a line, and of a letter on average.
+#: Height of a line of text, and mean width of a letter, pixels.
 LINE, LETTER = 17.0, 7.0
-#: Around the text of a node; between neighbours of a layer; between layers.
+#: Padding around the text of a node, and gaps within and between layers, pixels.
 PAD_X, PAD_Y, BESIDE, BETWEEN = 14.0, 9.0, 22.0, 26.0
 _SHAPES = {"[(": "store", "[": "box", "(": "round"}
 _NODE = r'(\w+)(?:(\[\(|\[|\()"?([^"\])]*)"?[\])]+)?'
@@ -33,16 +33,16 @@ _HEAD = re.compile(r"^flowchart (LR|TD)$")
 
 @dataclass
 class Node:
-    """A node of a diagram, or (without a shape) a place that an edge passes.
+    """A node of a diagram, or (without a shape) a point on the route of an edge.
 
     Parameters
     ----------
-    name : unique
-    lines : of its text
-    shape : box, round or store; "" for a place of an edge
+    name : unique name
+    lines : lines of its text
+    shape : box, round or store; "" for a point of a route
     width, height : pixels
-    layer : counted along the direction of the edges
-    x, y : of its centre, pixels
+    layer : index of the layer along the direction of the edges
+    x, y : position of the centre, pixels
     """
 
     name: str
@@ -55,7 +55,7 @@ class Node:
     height: float = 0.0
 
     def __post_init__(self) -> None:
-        """Give it the room that its text takes."""
+        """Set the size from that of the text."""
         pad_x, pad_y = (PAD_X, PAD_Y) if self.shape else (5.0, 2.0)
         if self.lines:
             self.width = max(map(len, self.lines)) * LETTER + 2 * pad_x
@@ -69,8 +69,8 @@ class Link:
     Parameters
     ----------
     source, target : names of nodes
-    lines : of its label
-    dashed : how it is drawn
+    lines : lines of its label
+    dashed : whether the edge is dashed
     """
 
     source: str
@@ -81,14 +81,14 @@ class Link:
 
 @dataclass
 class Diagram:
-    """A directed graph, as a text describes it.
+    """A directed graph that a text describes.
 
     Parameters
     ----------
-    title : what it shows, for those who do not see it
-    across : edges go from left to right, not down
-    nodes : by name, in the order of the text
-    links : in the order of the text
+    title : description for people who cannot see the diagram
+    across : whether edges go from left to right instead of down
+    nodes : nodes by name, in the order of the text
+    links : edges in the order of the text
     """
 
     title: str
@@ -98,16 +98,16 @@ class Diagram:
 
 
 def read_diagram(text: str) -> Diagram:
-    """A diagram from its text.
+    """Return the diagram that a text describes.
 
     Raises
     ------
-    ValueError : a line is none that is understood here, or the title is missing.
+    ValueError : If a line is not supported, or the title is missing.
     """
     first, *rest = [line.strip() for line in text.strip().splitlines() if line.strip()]
     head = _HEAD.match(first)
     if head is None:
-        raise ValueError(f"{first!r}: begin with `flowchart LR` or `flowchart TD`.")
+        raise ValueError(f"{first!r}: Start with `flowchart LR` or `flowchart TD`.")
     found = Diagram("", head[1] == "LR")
     for line in rest:
         edge = _EDGE.match(line)
@@ -118,19 +118,19 @@ def read_diagram(text: str) -> Diagram:
             source = _note(found, *edge.group(1, 2, 3))
             target = _note(found, *edge.group(6, 7, 8))
             if source == target:
-                raise ValueError(f"{line!r}: an edge that leads back to its node is not drawn.")
+                raise ValueError(f"{line!r}: An edge from a node to itself is not supported.")
             found.links.append(Link(source, target, _lines(edge[5] or ""), edge[4] == "-.->"))
         elif alone is not None:
             _note(found, *alone.group(1, 2, 3))
         else:
-            raise ValueError(f"{line!r} is no node, no edge and no `accTitle: ...`.")
+            raise ValueError(f"{line!r} is not a node, an edge or `accTitle: ...`.")
     if not found.title:
-        raise ValueError("The diagram needs a line `accTitle: ...` that says what it shows.")
+        raise ValueError("The diagram has no title. Add a line `accTitle: ...`.")
     return found
 
 
 def _note(diagram: Diagram, name: str, shape: str | None, text: str | None) -> str:
-    """Enter a node when it is first named, and give it its text when that comes."""
+    """Add a node at its first use, and set its text when a line defines it."""
     if name not in diagram.nodes or shape:
         diagram.nodes[name] = Node(name, _lines(text or name), _SHAPES[shape or "["])
     return name
@@ -142,12 +142,12 @@ def _lines(text: str) -> tuple[str, ...]:
 
 @dataclass
 class LayeredGraph:
-    """A diagram whose nodes have places.
+    """A diagram with positions of its nodes.
 
     Parameters
     ----------
-    nodes : those of the diagram, and places that edges pass
-    routes : nodes that each link passes, from its source to its target
+    nodes : nodes of the diagram, and points on the routes of edges
+    routes : nodes of each link's route, from its source to its target
     width, height : pixels
     """
 
@@ -158,9 +158,10 @@ class LayeredGraph:
 
 
 def layered(diagram: Diagram) -> LayeredGraph:
-    """Nodes in layers, so that edges lead on, but for those that close a circle (Sugiyama et al.).
+    """Return nodes in layers along the direction of the edges (Sugiyama et al.).
 
-    Labels of edges have layers of their own, so that nothing lies upon them.
+    Only edges that close a cycle lead backward. Labels of edges have separate layers, so that they
+    overlap nothing.
     """
     backward = set(_backward(diagram))
     _assign_layers(diagram, backward)
@@ -178,7 +179,7 @@ def layered(diagram: Diagram) -> LayeredGraph:
 
 
 def _backward(diagram: Diagram) -> Iterator[int]:
-    """Numbers of the links that lead to where the text has come from: they close circles."""
+    """Yield the indices of the links that close a cycle."""
     leaving = defaultdict(list)
     for number, link in enumerate(diagram.links):
         leaving[link.source].append((number, link.target))
@@ -200,7 +201,7 @@ def _backward(diagram: Diagram) -> Iterator[int]:
 
 
 def _assign_layers(diagram: Diagram, backward: set[int]) -> None:
-    """Each node two layers after the last of those that lead to it: one between is for labels."""
+    """Put each node two layers after its last predecessor; labels use the layer between."""
     pairs = [
         (link.target, link.source) if number in backward else (link.source, link.target)
         for number, link in enumerate(diagram.links)
@@ -216,7 +217,7 @@ def _assign_layers(diagram: Diagram, backward: set[int]) -> None:
 
 
 def _route(source: Node, target: Node, link: Link, number: int) -> Iterator[Node]:
-    """Nodes that a link passes: one in each layer, the first odd one with its label."""
+    """Yield the points of a link's route: one in each layer, the label at the first odd one."""
     yield source
     for layer in range(source.layer + 1, target.layer):
         label = link.lines if layer == source.layer + 1 else ()
@@ -225,7 +226,7 @@ def _route(source: Node, target: Node, link: Link, number: int) -> Iterator[Node
 
 
 def _ordered(found: LayeredGraph) -> list[list[Node]]:
-    """Nodes of each layer in the order, of those that sweeps find, in which fewest edges cross."""
+    """Return the order of nodes in each layer with the fewest crossings that the sweeps found."""
     layers: list[list[Node]] = [[] for _ in range(max(one.layer for one in found.nodes) + 1)]
     for one in found.nodes:
         layers[one.layer].append(one)
@@ -241,7 +242,7 @@ def _ordered(found: LayeredGraph) -> list[list[Node]]:
 
 
 def _sort(layer: list[Node], before: list[Node], routes: list[list[Node]]) -> None:
-    """Order a layer by the mean places of each node's neighbours in the layer before."""
+    """Sort a layer by the mean position of each node's neighbours in the layer before."""
     places = {one.name: float(at) for at, one in enumerate(before)}
     near: dict[str, list[float]] = defaultdict(list)
     for route in routes:
@@ -254,7 +255,7 @@ def _sort(layer: list[Node], before: list[Node], routes: list[list[Node]]) -> No
 
 
 def crossings(layers: list[list[Node]], routes: list[list[Node]]) -> int:
-    """How many pairs of edges cross between neighbouring layers."""
+    """Return the number of crossings of edges between neighbouring layers."""
     places = {one.name: at for layer in layers for at, one in enumerate(layer)}
     between: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for route in routes:
@@ -274,7 +275,7 @@ def _mean(values: Iterable[float], default: float) -> float:
 
 
 def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
-    """Give nodes their places: layers one after another, in each of them near their neighbours."""
+    """Set the positions of nodes: layer after layer, and near their neighbours within a layer."""
     size = {one.name: (one.height, one.width) if across else (one.width, one.height)
             for one in found.nodes}  # fmt: skip
     beside = {one.name: 0.0 for one in found.nodes}
@@ -292,7 +293,7 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
     for layer in layers:
         depth = max(size[one.name][1] for one in layer)
         for one in layer:
-            # a layer without labels takes no room: its edges pass half way between its neighbours
+            # A layer without labels has no depth; its edges pass the middle of the gap.
             middle = along + (depth / 2 if depth else -BETWEEN / 2)
             places = beside[one.name] - low + 2.0, middle
             one.x, one.y = places[::-1] if across else places
@@ -304,9 +305,9 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
 def _spread(
     layer: list[Node], wanted: list[float], beside: dict[str, float], size: dict[str, float]
 ) -> None:
-    """Nodes of a layer as near as can be to where they are wanted, in their order, apart.
+    """Place the nodes of a layer without overlaps, in order and near their wanted positions.
 
-    Neighbours that would overlap form a block, which lies where its nodes want it on average.
+    Neighbours that would overlap form a block, at the mean of its nodes' wanted positions.
     """
     blocks: list[tuple[list[int], float]] = []
     offsets: list[float] = [0.0]
@@ -314,7 +315,7 @@ def _spread(
         offsets.append(offsets[-1] + (size[a.name] + size[b.name]) / 2 + BESIDE)
     for number in range(len(layer)):
         block, at = [number], wanted[number] - offsets[number]
-        while blocks and blocks[-1][1] > at:  # in coordinates without the room between them
+        while blocks and blocks[-1][1] > at:  # in coordinates without the gaps
             block = blocks.pop()[0] + block
             at = _mean([wanted[i] - offsets[i] for i in block], 0.0)
         blocks.append((block, at))
@@ -324,12 +325,12 @@ def _spread(
 
 
 def svg_of(diagram: Diagram, identity: str) -> str:
-    """The diagram as SVG of one line, whose colours a style sheet gives.
+    """Return the diagram as one line of SVG; a style sheet sets its colours.
 
     Parameters
     ----------
-    diagram : read from its text
-    identity : unique on the page, for its marker
+    diagram : the diagram
+    identity : id of its marker, unique on the page
     """
     layout = layered(diagram)
     arrow = f"arrow-{identity}"
@@ -350,7 +351,7 @@ def svg_of(diagram: Diagram, identity: str) -> str:
 
 
 def _curve(route: list[Node], across: bool) -> str:
-    """A smooth line through the middles of the nodes, from border to border."""
+    """Return a smooth path through the centres of the nodes, from border to border."""
     points = [(one.x, one.y) for one in route]
     sign = 1.0 if route[-1].layer > route[0].layer else -1.0
     for at, direction in ((0, sign), (-1, -sign)):
@@ -369,7 +370,7 @@ def _curve(route: list[Node], across: bool) -> str:
 
 
 def _drawn(one: Node) -> str:
-    """A node's outline and text, or the label of an edge on a ground that hides the edge."""
+    """Return a node's outline and text, or the label of an edge on an opaque background."""
     left, top = one.x - one.width / 2, one.y - one.height / 2
     radius = {"round": one.height / 2, "": 3.0}.get(one.shape, 4.0)
     outline = (

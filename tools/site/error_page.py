@@ -1,4 +1,4 @@
-"""The page of errors: what a service answers, and what the client and the command line raise."""
+"""The page of errors of the service, the client and the command line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sceneprint.errors import SceneprintError
 from service.problems import STATUSES, phrase, type_of
 from tools.site.markup import cell, code, page, table
 
-#: What to do about an error; about one that is not here, what helps against its nearest base.
+#: Remedies by error class; other classes have that of their nearest base.
 REMEDIES: dict[type[SceneprintError], str] = {
     errors.FrameError: "Do not repeat the request: nothing was stored. `detail` names the fault.",
     errors.UnreadableFrame: "Send a 16-bit greyscale PNG, or a two-dimensional NPY.",
@@ -72,41 +72,41 @@ REMEDIES: dict[type[SceneprintError], str] = {
     errors.ServiceError: "Check the address, and whether the service runs: `sceneprint doctor`.",
     errors.Refused: "See `status` and `problem` of the error, and the table above.",
 }
-#: Problems that have no class of their own: status, kind, meaning, remedy.
+#: Problems without an error class: status, kind, meaning, remedy.
 OTHERS = (
     (400, "BadRequest", "The request is not HTTP.", "Use an HTTP client."),
-    (404, "NotFound", "There is no such path.", "Check the path against the operations."),
+    (404, "NotFound", "No operation has this path.", "Check the path against the operations."),
     (405, "MethodNotAllowed", "The path does not support this method.",
      "`Allow` lists the methods that it supports."),
     (406, "NotAcceptable", "`Accept` names no type that the operation returns.",
-     "Leave `Accept` out."),
-    (416, "RangeNotSatisfiable", "The file is shorter than `Range` asks for.",
-     "Ask for a range within the file."),
+     "Omit `Accept`."),
+    (416, "RangeNotSatisfiable", "`Range` starts beyond the end of the file.",
+     "Request a range within the file."),
     (500, "InternalError", "The service failed; nothing was partially written.",
      "Report it with the traceback that the log has under the request's id."),
 )  # fmt: skip
 
 
 def kinds() -> list[type[SceneprintError]]:
-    """All kinds of errors that are public, without the one that all are."""
+    """Return all public error classes, without their common base."""
     found = [getattr(errors, name) for name in errors.__all__ if name[:1].isupper()]
     return [one for one in found if one is not SceneprintError]
 
 
 def status(kind: type[SceneprintError]) -> int:
-    """The HTTP status that a service answers with where it meets such an error."""
+    """Return the HTTP status of an error in an answer of the service."""
     return next(STATUSES[base] for base in kind.__mro__ if base in STATUSES)
 
 
 def remedy(kind: type[SceneprintError]) -> str:
-    """What to do about an error."""
+    """Return the remedy for an error."""
     return next(REMEDIES[base] for base in kind.__mro__ if base in REMEDIES)
 
 
 def error_page() -> str:
-    """Markdown that lists every error, by status and by name."""
+    """Return Markdown that lists every error, by status and by name."""
     known = sorted(kinds(), key=lambda kind: (status(kind), kind.__name__))
-    told = [kind for kind in known if status(kind) != 500]
+    problem_kinds = [kind for kind in known if status(kind) != 500]
     inner = sorted((kind for kind in known if status(kind) == 500), key=lambda one: one.__name__)
     return page(
         "# Errors",
@@ -115,7 +115,7 @@ def error_page() -> str:
         "the request's id, as in the service's log. The Python client raises the class of "
         "`sceneprint_client.errors` that the problem is named for.",
         "## Problems by status",
-        table(("status", "`type`", "meaning", "what to do"), sorted(_problems(told))),
+        table(("status", "`type`", "meaning", "what to do"), sorted(_problems(problem_kinds))),
         "## Other errors",
         "The client, the command line and the library raise these. If a service meets one, it "
         "answers with status 500.",
@@ -126,8 +126,8 @@ def error_page() -> str:
     )
 
 
-def _problems(told: list[type[SceneprintError]]) -> Iterator[tuple[str, str, str, str]]:
-    for kind in told:
+def _problems(problem_kinds: list[type[SceneprintError]]) -> Iterator[tuple[str, str, str, str]]:
+    for kind in problem_kinds:
         number = status(kind)
         yield _status(number), code(type_of(kind.__name__)), _meaning(kind), cell(remedy(kind))
     for number, name, meaning, what in OTHERS:

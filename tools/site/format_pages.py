@@ -15,8 +15,8 @@ _TITLES: dict[Kind, str] = {
     "recording": "Recordings of ROS",
     "capture": "Files of other systems",
 }
-#: Kinds of files that the dashboard takes, in the order in which it looks at their first bytes: an
-#: array is a cloud rather than an image, and a cloud a frame rather than a whole map.
+#: Kinds of files that the dashboard accepts, in the order of its checks: an array is rather a cloud
+#: than an image, and a cloud rather a frame than a whole map.
 _DASHBOARD: tuple[Kind, ...] = ("cloud", "depth", "map", "archive")
 
 
@@ -24,7 +24,7 @@ def formats_page() -> str:
     """Return Markdown with a table of the formats of each kind."""
     return page(
         "# File formats",
-        "For anyone who wonders whether a file can be read: every format, and what is read of it.",
+        "For anyone who asks whether a file can be read: every format, and the data that is read.",
         *(f"## {title}\n\n{_rows(kind)}" for kind, title in _TITLES.items()),
         "What becomes of them: [point clouds](clouds.md), [recordings](recordings.md), "
         "[captures](exports.md).",
@@ -49,8 +49,8 @@ def _rows(kind: Kind) -> str:
 
 
 def formats_module() -> str:
-    """Return JavaScript with the formats that the dashboard takes."""
-    clouds = {one.name for one in formats_of("cloud")}  # any of them may be marked as a map
+    """Return JavaScript with the formats that the dashboard accepts."""
+    clouds = {one.name for one in formats_of("cloud")}  # the user may mark any of them as a map
     rows = "".join(
         f"  {json.dumps(row)},\n"
         for kind in _DASHBOARD

@@ -1,4 +1,4 @@
-"""What mkdocs calls while it builds the site: mkdocs.yml names this file.
+"""Hooks that mkdocs calls during the build of the site; mkdocs.yml names this file.
 
 docs/*.md, and the pages that they link to elsewhere  --rewritten-->  pages of the site
 the code                           --generated_pages-->  pages below reference/
@@ -30,11 +30,11 @@ from tools.site.reference import GeneratedPage, generated_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 INDEX = "docs/README.md"
-#: The section of the index that generated pages are listed in, after its own.
+#: Section of the index that lists the generated pages after its own.
 REFERENCE = "Reference"
-#: The last tab: pages about the project itself.
+#: The last tab, with pages about the project.
 PROJECT = {"Contribute": "CONTRIBUTING.md", "Changelog": "CHANGELOG.md"}
-#: Pages of measurements, and about the project's inside: a search finds them after all others.
+#: Pages of measurements and internals, which a search ranks last.
 RANKED_LAST = {
     f"docs/{name}.md"
     for name in (
@@ -42,35 +42,35 @@ RANKED_LAST = {
         "performance", "style",
     )
 }  # fmt: skip
-#: What their scores are multiplied by: a match in a title counts a thousand times one in the text.
+#: Factor of their scores: a match in a title has a thousand times the score of one in the text.
 _LAST = 1e-4
-#: And those of the HTTP operations and their records, so that names come after the text of guides.
+#: Factor of HTTP operations and records, so that they rank after the text of guides.
 _LISTED = 1e-2
 _ROW = re.compile(r"^\| \[([^\]]+)\]\(([^)#]+\.md)\) \|", re.MULTILINE)
 _MERMAID = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-#: What pages look like, by the name on the site.
+#: Assets of the pages, by their names on the site.
 _ASSETS = {"site.css": "tools/site/site.css", "icon.svg": "service/dashboard/pages/icon.svg"}
 
 
 class _Build:
-    """What the events of one build share."""
+    """Shared state of the hooks of one build."""
 
     pages: ClassVar[dict[str, GeneratedPage]] = {}
-    #: Paths in the repository of pages, by their paths on the site.
+    #: Paths of pages in the repository, by their paths on the site.
     sources: ClassVar[dict[str, str]] = {}
 
 
 def navigation_of(index: str, generated: list[GeneratedPage]) -> list[dict[str, Any]]:
-    """Tabs with their pages, from the tables of the index.
+    """Return tabs with their pages, from the tables of the index.
 
     Parameters
     ----------
-    index : text of docs/README.md: a heading for each tab, a row for each page
-    generated : pages that are listed in the section Reference
+    index : text of docs/README.md with a heading for each tab and a row for each page
+    generated : pages to list in the section Reference
 
     Raises
     ------
-    ValueError : there is no such section.
+    ValueError : If the section Reference does not exist.
     """
     tabs: list[dict[str, Any]] = [{"Home": site_path(INDEX)}]
     for part in index.split("\n## ")[1:]:
@@ -82,13 +82,13 @@ def navigation_of(index: str, generated: list[GeneratedPage]) -> list[dict[str, 
             pages += _listed(generated)
         tabs.append({title: pages})
     if not any(REFERENCE in tab for tab in tabs):
-        raise ValueError(f"{INDEX} has no section {REFERENCE!r}, where generated pages belong.")
+        raise ValueError(f"{INDEX} has no section {REFERENCE!r} for the generated pages.")
     tabs.append({"Project": [{name: site_path(path)} for name, path in PROJECT.items()]})
     return tabs
 
 
 def _listed(generated: list[GeneratedPage]) -> list[Any]:
-    """Entries of generated pages; those of a group lie below the group's name."""
+    """Return the entries of generated pages; those of a group are below the group's name."""
     entries: list[Any] = []
     groups: dict[str, list[Any]] = {}
     for one in generated:
@@ -104,7 +104,7 @@ def _listed(generated: list[GeneratedPage]) -> list[Any]:
 
 
 def with_generated(index: str, generated: list[GeneratedPage]) -> str:
-    """The index, with rows of the generated pages at the end of its section Reference."""
+    """Return the index with rows for the generated pages at the end of its section Reference."""
     rows = "\n".join(
         f"| [{one.title}]({one.path}) | {one.about} |" for one in generated if one.about
     )
@@ -114,7 +114,7 @@ def with_generated(index: str, generated: list[GeneratedPage]) -> str:
 
 
 def with_figures(text: str, page: str) -> str:
-    """A page's text with its blocks of mermaid drawn."""
+    """Return a page's text with its mermaid blocks drawn."""
     count = 0
 
     def drawn(found: re.Match[str]) -> str:
@@ -128,7 +128,7 @@ def with_figures(text: str, page: str) -> str:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Set the navigation, and anchors as git hosts make them."""
+    """Set the navigation, and anchors in the style of git hosts."""
     made = generated_pages()
     _Build.pages = {one.path: one for one in made}
     config.nav = navigation_of((ROOT / INDEX).read_text(encoding="utf-8"), made)
@@ -137,7 +137,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add generated pages, the linked files outside docs/, and what pages look like."""
+    """Add generated pages, linked files outside docs/, and assets."""
     documents = [f"docs/{one.src_uri}" for one in files.documentation_pages()]
     _Build.sources = {site_path(path): path for path in documents}
     for path, one in _Build.pages.items():
@@ -151,7 +151,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def _outside(path: str, config: MkDocsConfig) -> File:
-    """A file outside docs/: a page, or a page that shows its text."""
+    """Return a file outside docs/ as a page, or as a page that shows its text."""
     text = (ROOT / path).read_text(encoding="utf-8")
     if not path.endswith(".md"):
         language = {".py": "python", ".yaml": "yaml"}.get(Path(path).suffix, "text")
@@ -163,7 +163,7 @@ def _outside(path: str, config: MkDocsConfig) -> File:
 
 
 def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """A page as the site shows it: links, lists and figures."""
+    """Return a page as the site shows it: links, lists and diagrams."""
     del config, files
     path = _Build.sources.get(page.file.src_uri)
     if path is None:
@@ -173,18 +173,18 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
     text = with_deep_lists(rewritten(text, path))
     if path == INDEX:
         text = with_generated(text, list(_Build.pages.values()))
-        page.meta["hide"] = ["navigation"]  # the page itself is one
+        page.meta["hide"] = ["navigation"]  # the index itself is the navigation
     if path == PROJECT["Changelog"] or not path.endswith(".md"):
-        page.meta["search"] = {"exclude": True}  # what is true today would be found after it
+        page.meta["search"] = {"exclude": True}  # its entries would rank before current pages
     if path in RANKED_LAST:
         page.meta["search"] = {"boost": _LAST}
-    # git hosts need a backslash before a bar within a table; Python-Markdown takes it as it is
+    # Git hosts need a backslash before a bar in a table; Python-Markdown would show it.
     text = outside_fences(text, lambda part: re.sub(r"`[^`\n]*`", _without_escapes, part))
     return with_figures(text, path)
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Name the dialog of the search for screen readers, as the theme does not."""
+    """Name the search dialog for screen readers, since the theme does not."""
     del page, config
     return output.replace('role="dialog"', 'role="dialog" aria-label="Search"', 1)
 

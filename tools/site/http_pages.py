@@ -1,4 +1,4 @@
-"""Pages of the HTTP API from its OpenAPI document: one for each resource, one for all records."""
+"""Pages of the HTTP API from its OpenAPI document: one for each resource, and one for records."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROBLEM = "application/problem+json"
 #: Prefix of the descriptions of parameters that replace fields of a form.
 BARE = "Only if the body is the frame: "
 _METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD")
-#: Bounds of JSON Schema, as they are written after a type.
+#: Bounds of JSON Schema in words, which follow a type.
 _BOUNDS = {
     "minimum": "at least {}", "exclusiveMinimum": "above {}", "maximum": "at most {}",
     "exclusiveMaximum": "below {}", "minLength": "at least {} characters",
@@ -30,9 +30,9 @@ class Operation:
 
     Parameters
     ----------
-    method, path : of its requests
-    resource : its tag
-    body : what OpenAPI says of it
+    method, path : method and path of its requests
+    resource : tag
+    body : entry in the OpenAPI document
     """
 
     method: str
@@ -42,17 +42,17 @@ class Operation:
 
     @property
     def title(self) -> str:
-        """Its name in words."""
+        """Title of the operation."""
         return str(self.body["summary"]).capitalize()
 
     @property
     def anchor(self) -> str:
-        """Where it is described on its resource's page."""
+        """Anchor of the operation on the page of its resource."""
         return str(self.body["summary"]).lower().replace(" ", "-")
 
 
 def operations(document: Json) -> list[Operation]:
-    """All operations, by resource and in the order of their paths."""
+    """Return all operations by resource, in the order of their paths."""
     found = [
         Operation(method.upper(), path, body["tags"][0], body)
         for path, methods in document["paths"].items()
@@ -63,7 +63,7 @@ def operations(document: Json) -> list[Operation]:
 
 
 def resource_page(name: str, document: Json) -> str:
-    """Markdown that describes the operations of a resource."""
+    """Return Markdown that describes the operations of a resource."""
     own = [one for one in operations(document) if one.resource == name]
     return page(
         f"# {name.capitalize()}",
@@ -73,7 +73,7 @@ def resource_page(name: str, document: Json) -> str:
 
 
 def index_page(document: Json) -> str:
-    """Markdown that lists all operations, by resource."""
+    """Return Markdown that lists all operations by resource."""
     found = operations(document)
     names = sorted({one.resource for one in found})
     return page(
@@ -126,7 +126,7 @@ def _indented(text: str) -> str:
     return "\n".join(f"    {line}" if line else line for line in text.split("\n"))
 
 
-def _parameters(given: list[Json]) -> str:
+def _parameters(parameters: list[Json]) -> str:
     rows = (
         (
             code(one["name"]),
@@ -134,13 +134,13 @@ def _parameters(given: list[Json]) -> str:
             type_of(one["schema"]),
             _meaning(one.get("description", "").removeprefix(BARE), one["schema"]),
         )
-        for one in given
+        for one in parameters
     )
     return table(("name", "in", "type", "meaning"), rows)
 
 
 def _request(body: Json) -> str:
-    """What may be sent, by media type."""
+    """Return the accepted bodies by media type."""
     parts = []
     for kind, content in body.get("content", {}).items():
         schema = content.get("schema", {})
@@ -152,7 +152,7 @@ def _request(body: Json) -> str:
 
 
 def _answers(responses: Json) -> str:
-    """A row for each status; those that are problems share the last one."""
+    """Return a row for each status, with a common last row for problems."""
     rows = []
     problems = []
     for status, response in responses.items():
@@ -173,7 +173,7 @@ def _answers(responses: Json) -> str:
 
 
 def records_page(document: Json) -> str:
-    """Markdown that describes every record, by name."""
+    """Return Markdown that describes every record by name."""
     schemas = document["components"]["schemas"]
     return page(
         "# Records",
@@ -194,7 +194,7 @@ def _record(name: str, schema: Json) -> str:
 
 
 def _record_title(name: str) -> str:
-    """A generic record is written as it is in Python: Page[Frame]."""
+    """Return the name of a record; a generic one as in Python, such as Page[Frame]."""
     generic, mark, of = name.partition("_")
     return f"{generic}\\[{of.rstrip('_')}\\]" if mark else name
 
@@ -226,7 +226,7 @@ def _meaning(description: str, schema: Json) -> str:
 
 
 def type_of(schema: Json) -> str:
-    """A type in words, with its bounds; a record is a link to it."""
+    """Return a type in words with its bounds; a record is a link to its description."""
     content = schema.get("contentSchema")
     if content is not None:
         return f"{type_of(content)} as JSON"
@@ -262,5 +262,5 @@ def _array(schema: Json) -> str:
 
 
 def resources(document: Json) -> Iterator[str]:
-    """Names of the resources that have operations."""
+    """Yield the names of the resources that have operations."""
     yield from sorted({one.resource for one in operations(document)})

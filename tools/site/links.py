@@ -1,7 +1,7 @@
-"""Where each page of the site comes from, and what changes on the way there: links, inner lists.
+"""Paths of pages on the site, and changes of their links and nested lists.
 
-A page of the site is a file of the repository. Pages below docs/ lie at the top of the site; what
-they link to elsewhere in the repository keeps its path, so that no link leads out of the site.
+A page of the site is a file of the repository. Pages of docs/ are at the top of the site; linked
+files elsewhere keep their paths, so that no link leads out of the site.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 DOCS = "docs/"
-#: Where the README of the repository is read, if a page links to it: the site has its own index.
+#: Path of the repository's README on the site, which has its own index.
 README = "introduction.md"
 _LINK = re.compile(r"(?<=\]\()([^)\s]+)(?=\))")
 _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 _SHALLOW = re.compile(r"^ {2,3}(?=\S)", re.MULTILINE)
-#: Ends of names of files that a browser shows or saves; all other files are shown as text.
+#: Suffixes of files that a browser shows or saves; all other files are shown as text.
 _BINARY = (".png", ".svg", ".json")
 
 
 def site_path(path: str) -> str:
-    """Where a file of the repository is on the site; both relative, with slashes."""
+    """Return the path of a file on the site; both paths are relative, with slashes."""
     if path.startswith(DOCS):
         return path.removeprefix(DOCS)
     if path == "README.md":
@@ -31,23 +31,23 @@ def site_path(path: str) -> str:
 
 
 def targets(text: str) -> Iterator[str]:
-    """Targets of the relative links of a page, without anchors, outside blocks of code."""
+    """Yield the targets of a page's relative links, without anchors and without blocks of code."""
     for target in _LINK.findall(_FENCE.sub("", text)):
         if "://" not in target and not target.startswith(("#", "mailto:")):
             yield target.partition("#")[0]
 
 
 def linked_files(root: Path, pages: list[str]) -> list[str]:
-    """Files outside docs/ that pages lead to, in the order of their paths.
+    """Return the files outside docs/ that pages link to, in the order of their paths.
 
     Parameters
     ----------
     root : folder of the repository
-    pages : their paths in it; what a linked page links to is found as well
+    pages : paths of pages in the repository; links of linked pages are followed too
 
     Raises
     ------
-    FileNotFoundError : a link leads to no file of the repository.
+    FileNotFoundError : If the target of a link is not a file of the repository.
     """
     found: set[str] = set()
     waiting = list(pages)
@@ -56,7 +56,7 @@ def linked_files(root: Path, pages: list[str]) -> list[str]:
         for target in targets((root / page).read_text(encoding="utf-8")):
             path = posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
             if not (root / path).is_file():
-                raise FileNotFoundError(f"{page} links to {target}, which is no file. Mend it.")
+                raise FileNotFoundError(f"{page} links to {target}, which is not a file. Fix it.")
             if not path.startswith(DOCS) and path not in found:
                 found.add(path)
                 if path.endswith(".md"):
@@ -65,12 +65,12 @@ def linked_files(root: Path, pages: list[str]) -> list[str]:
 
 
 def rewritten(text: str, page: str) -> str:
-    """A page's text with its relative links as they are on the site.
+    """Return a page's text with the relative links of the site.
 
     Parameters
     ----------
     text : Markdown
-    page : its path in the repository
+    page : path of the page in the repository
     """
     here = posixpath.dirname(site_path(page))
 
@@ -85,7 +85,7 @@ def rewritten(text: str, page: str) -> str:
 
 
 def outside_fences(text: str, change: Callable[[str], str]) -> str:
-    """A text of which everything but blocks of code is changed."""
+    """Return a text with changes outside blocks of code."""
     parts, end = [], 0
     for fence in _FENCE.finditer(text):
         parts += [change(text[end : fence.start()]), fence[0]]
@@ -94,13 +94,13 @@ def outside_fences(text: str, change: Callable[[str], str]) -> str:
 
 
 def with_deep_lists(text: str) -> str:
-    """A page's text with what lies within list items indented by four, as Python-Markdown needs it.
+    """Return a page's text with list contents indented by four, as Python-Markdown requires.
 
-    Git hosts are content with two or three, which put it below the text of the item.
+    Git hosts accept two or three, which align with the text of the item.
     """
     return outside_fences(text, lambda part: _SHALLOW.sub("    ", part))
 
 
 def heading_anchor(title: str, separator: str = "-") -> str:
-    """The anchor of a heading, as git hosts make it of the heading's text."""
+    """Return the anchor that git hosts generate from the text of a heading."""
     return re.sub(r"[^\w -]", "", title).strip().lower().replace(" ", separator)

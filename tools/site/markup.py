@@ -1,4 +1,4 @@
-"""Markdown from what the code says of itself."""
+"""Markdown from docstrings and descriptions of the code."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _CODE = re.compile(r"(``.+?``|`[^`]+`)")
 
 
 def plain(text: str) -> str:
-    """Text whose signs mean nothing in Markdown, but for code between backticks."""
+    """Escape a text for Markdown, except code between backticks."""
     return _between_code(text, lambda part: re.sub(r"([<>*_|\\\[\]])", r"\\\1", part))
 
 
@@ -19,17 +19,17 @@ def _between_code(text: str, change: Callable[[str], str]) -> str:
 
 
 def cell(text: str) -> str:
-    """Text of one line, for a cell of a table."""
+    """Return a text as one line for a table cell."""
     return plain(" ".join(text.split()))
 
 
 def code(text: str) -> str:
-    """Code within a line."""
+    """Return inline code."""
     return f"`` {text} ``" if "`" in text else f"`{text}`"
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; its cells are Markdown of one line. Without rows: nothing."""
+    """Return a table with one-line Markdown cells; an empty text without rows."""
     lines = [f"| {' | '.join(row)} |" for row in rows]
     if not lines:
         return ""
@@ -38,17 +38,17 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def fenced(text: str, language: str = "text") -> str:
-    """A block of code."""
+    """Return a block of code."""
     return f"```{language}\n{text.rstrip()}\n```\n"
 
 
 def page(*parts: str) -> str:
-    """Parts with an empty line between them; empty ones are left out."""
+    """Return parts with an empty line between them, without empty parts."""
     return "\n\n".join(part.strip("\n") for part in parts if part.strip()) + "\n"
 
 
 def first_sentence(text: str) -> str:
-    """The first sentence of a text, or its first paragraph if that ends without a full stop."""
+    """Return the first sentence of a text, or its first paragraph without a full stop."""
     paragraph = " ".join(text.split("\n\n")[0].split())
     found = re.match(r".+?[.?!](?=\s|$)", paragraph)
     return found[0] if found else paragraph

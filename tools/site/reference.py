@@ -1,4 +1,4 @@
-"""The pages that are made from the code, in the order in which the site lists them."""
+"""The pages that are generated from the code, in the order of the site."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from tools.site.error_page import error_page
 
 @dataclass(frozen=True)
 class GeneratedPage:
-    """A page of the site that no file holds.
+    """A page of the site without a source file.
 
     Parameters
     ----------
-    path : on the site
-    title : in the navigation
+    path : path on the site
+    title : title in the navigation
     text : Markdown
-    about : what it holds, for the index; "" to leave it out there
-    group : of the navigation that it is listed below; "" for none
+    about : summary for the index; "" omits the page there
+    group : group in the navigation; "" for none
     """
 
     path: str
@@ -37,7 +37,7 @@ class GeneratedPage:
 
 
 def generated_pages() -> list[GeneratedPage]:
-    """All of them."""
+    """Return all generated pages."""
     return [
         *http_reference(),
         GeneratedPage(
@@ -54,13 +54,13 @@ def generated_pages() -> list[GeneratedPage]:
 
 
 def api_document() -> dict[str, Any]:
-    """The OpenAPI document of a service."""
+    """Return the OpenAPI document of a service."""
     with TemporaryDirectory() as folder:
         return create_app(Settings(data_dir=Path(folder))).openapi()
 
 
 def http_reference() -> list[GeneratedPage]:
-    """Pages of the HTTP API."""
+    """Return the pages of the HTTP API."""
     document = api_document()
     made = partial(GeneratedPage, group="HTTP API")
     return [
