@@ -1,48 +1,48 @@
-# Every habit is a verb. Each target makes its own environment in .venv first.
+# Each target first creates or updates the environment in .venv.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# What running needs is installed; development's packages are as well.
+# Stamps of the installed packages: those of the product, and those of development.
 RUNTIME := $(VENV)/.runtime
 STAMP := $(VENV)/.development
-# Our other distributions, each in a folder.
+# Folders of the other distributions.
 PARTS := client lab viewers
-# Tools of the supply chain, apart: what they need must not move what we run.
+# Tools of the supply chain, in a separate environment so that they do not change our packages.
 TOOLS := $(VENV)/tools
-# Our kernels want one thread each; more processes, not more threads, use more processors.
+# Each process uses one thread; tests run in parallel processes.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
-# Bytecode is kept: the tests start hundreds of processes, and each would parse our modules anew.
+# Bytecode is stored, since the tests start hundreds of processes that import the same modules.
 unexport PYTHONDONTWRITEBYTECODE
-# Tests wait for real processes half of their time: twice as many as there are processors.
+# Tests spend half of their time waiting for other processes, so two run per processor.
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$((2 * $$(env -u OMP_NUM_THREADS nproc))))
 
 .PHONY: help demo test pytest test-thorough test-portable test-postgres lint kernels bytecode goldens format bench \
 	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean
 
 help:
-	@echo "make demo    find frames among others with their pose, and draw one, into demo/ [DATASET=folder]"
-	@echo "make test    lint, types, import contracts and the tests"
-	@echo "make test-thorough  tests that make test leaves out, as they take minutes or seldom fail"
-	@echo "make test-portable  numeric tests as other processors compute them, one after another [TARGET=generic]"
-	@echo "make test-postgres  the tests of what stands on the database, on PostgreSQL"
+	@echo "make demo    localize frames in a demo map, and draw a match, into demo/ [DATASET=folder]"
+	@echo "make test    lint, types, import contracts and ordinary tests"
+	@echo "make test-thorough  tests that 'make test' omits because they take minutes or rarely fail"
+	@echo "make test-portable  numeric tests with the arithmetic of other processors [TARGET=generic]"
+	@echo "make test-postgres  tests of everything that uses the database, on PostgreSQL"
 	@echo "make goldens  rewrite tests/golden and docs/settings.md after an intended change; read the diff"
-	@echo "make lint    lint, types and import contracts only, of the dashboard's JavaScript too"
-	@echo "make bench   what each stage costs, beside others"
-	@echo "make screenshots  every page of the dashboard, light and dark, into out/screenshots"
-	@echo "make docs    the documentation as a site, into out/site; a dead link is an error"
-	@echo "make docs-serve  the same at http://127.0.0.1:8009, made anew when a page changes"
-	@echo "make soak    robots on SQLite, 100 kills, a full disk; rewrites its part of docs/fault_injection.md"
-	@echo "make siege   broken uploads, every operation, tenants that attack; likewise"
-	@echo "make fleet   robots on PostgreSQL with a standby, parts killed; likewise"
+	@echo "make lint    lint, types and import contracts, including the dashboard's JavaScript"
+	@echo "make bench   cost of each stage beside references"
+	@echo "make screenshots  screenshots of all dashboard pages, light and dark, into out/screenshots"
+	@echo "make docs    documentation site, into out/site; a dead link is an error"
+	@echo "make docs-serve  documentation site at http://127.0.0.1:8009, rebuilt after changes"
+	@echo "make soak    robots on SQLite, 100 kills, a full disk; updates docs/fault_injection.md"
+	@echo "make siege   broken uploads, every operation, attacking tenants; updates the same page"
+	@echo "make fleet   robots on PostgreSQL with a standby, and kills; updates the same page"
 	@echo "make models  train the presets that ship with the package (minutes)"
-	@echo "make lock    write requirements*.lock anew from pyproject.toml [UPGRADE=1 for the newest]"
-	@echo "make sbom    the packages of the service and its image, as CycloneDX, into out/"
-	@echo "make dist    wheels and source distributions of all packages, tried in an empty environment"
-	@echo "make advisories  known vulnerabilities of all locked packages; needs a network"
+	@echo "make lock    update requirements*.lock from pyproject.toml [UPGRADE=1 for the newest]"
+	@echo "make sbom    list of the packages of the service and its image, as CycloneDX, into out/"
+	@echo "make dist    wheels and source distributions of all packages, tested in an empty environment"
+	@echo "make advisories  known vulnerabilities of all locked packages; requires a network"
 
-# What running needs comes first: `make demo` asks for no more. Development adds its packages.
+# `make demo` installs only the packages of the product; other targets add those of development.
 $(RUNTIME): requirements.lock requirements-lab.lock requirements-uv.lock pyproject.toml \
 		$(addsuffix /pyproject.toml,$(PARTS)) tools/install
 	@tools/install $(PYTHON) $(VENV) requirements-lab.lock client . lab viewers
@@ -63,40 +63,39 @@ lint: $(STAMP)
 	$(BIN)/lint-imports --no-logo
 	@tools/javascript/check
 
-# Compiled once here, and not by each process of the tests for itself.
+# Compile kernels once, instead of in each test process.
 kernels: $(STAMP)
 	@$(BIN)/python -c 'from sceneprint.cli.preparation import prepare_presets; \
 		from sceneprint.settings import Settings; prepare_presets(Settings(), clouds=True)'
 
-# Nor does each compile the tests, whose assertions pytest writes anew, where nobody has yet; what
-# is wrong with them is said by the run itself.
+# Compile the tests once, with the assertions that pytest rewrites. The test run reports any errors.
 bytecode: $(STAMP)
 	@test -d tests/__pycache__ || $(BIN)/python -m pytest --collect-only -q > /dev/null || true
 
-# The linters run beside the kernels and the first tests; where one fails, the target fails too.
+# The linters run in parallel with the tests; the target fails if either fails.
 test: $(STAMP)
 	@$(MAKE) --no-print-directory -j2 lint pytest
 
-# Files stay whole, as their fixtures are dear, and so do folders that share a service; their order
-# is that of tests/conftest.py.
+# A file runs in one process, since its fixtures are expensive, and so does a folder with a shared
+# service; tests/conftest.py sets the order.
 pytest: kernels bytecode
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-# What takes long and seldom breaks: the image built step by step, whole recordings, benchmarks.
+# Slow tests that rarely fail: steps of the image build, whole recordings, benchmarks.
 test-thorough: $(STAMP) kernels
 	$(BIN)/python -m pytest -n auto --dist loadfile -m thorough
 
-# Bounds that hold on this processor alone show here; the script says what each target changes.
+# Detects bounds that hold only on this processor; the script describes the targets.
 test-portable: $(STAMP)
 	$(BIN)/python tools/portable_tests.py $(TARGET)
 
-# What PostgreSQL does as well, on it: tests/on_postgres leads each process there.
+# Run the database's tests on PostgreSQL; tests/on_postgres redirects each process.
 test-postgres: $(STAMP) kernels
 	SCENEPRINT_TEST_DATABASE=postgresql PYTHONPATH=$(CURDIR)/tests/on_postgres \
 		$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder \
 		$(addprefix tests/,store engine service client worker cli_service maintenance dashboard)
 
-# What tests/test_golden.py compares with, after an intended change: read the diff.
+# Update the reference files of tests/test_golden.py after an intended change; read the diff.
 goldens: $(STAMP) kernels
 	SCENEPRINT_UPDATE_GOLDEN=1 $(BIN)/python -m pytest -q tests/test_golden.py
 	$(BIN)/python -m tools.settings_page
@@ -111,7 +110,7 @@ bench: $(STAMP)
 screenshots: $(STAMP)
 	$(BIN)/python -m benchmarks.screenshots --out out/screenshots
 
-# mkdocs-material announces its successor at each start
+# Suppresses the announcement of mkdocs-material's successor.
 docs: export NO_MKDOCS_2_WARNING = 1
 docs: $(STAMP)
 	$(BIN)/python -m mkdocs build --strict
@@ -140,10 +139,10 @@ $(TOOLS)/.installed: requirements-tools.lock requirements-uv.lock tools/install
 	@tools/install $(PYTHON) $(TOOLS) requirements-tools.lock
 	@touch $@
 
-# Every version with the hashes of all its files, for every platform and Python from 3.11 on. Pins
-# that are there stay, unless UPGRADE is set. Without open3d, what running needs and the image has
-# (docs/dependencies.md); with what the lab and the viewers
-# need, `make demo`; with open3d too, development.
+# Versions with hashes of all their files, for every platform and Python from 3.11. Existing pins stay
+# unless UPGRADE is set. requirements.lock holds the packages of the product and its image, without
+# open3d (docs/dependencies.md); -lab adds those of the lab and the viewers, -dev those of
+# development with open3d.
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
 	--no-header --no-annotate --no-emit-index-url --no-emit-package sceneprint-client \
 	$(if $(UPGRADE),--upgrade)
@@ -165,14 +164,14 @@ sbom: $(TOOLS)/.installed
 		--output-reproducible --output-format JSON --output-file out/sbom.cdx.json
 	@echo out/sbom.cdx.json
 
-# It asks OSV about each version that is locked, so it installs nothing.
+# Queries OSV for each locked version, without an installation.
 advisories: $(TOOLS)/.installed
 	@for of in -dev -tools -uv; do \
 		$(TOOLS)/bin/pip-audit --disable-pip --require-hashes --vulnerability-service osv \
 			--requirement requirements$$of.lock || failed=1; \
 	done; exit $${failed:-0}
 
-# The wheels are built from the source distributions: a file that these lack shows at once.
+# The wheels are built from the source distributions, which shows files that these lack.
 dist: $(STAMP)
 	rm -rf dist
 	for of in . $(PARTS); do (cd $$of && $(CURDIR)/$(BIN)/python -c \

@@ -12,7 +12,7 @@
 {{- .Release.Name | trunc 50 | trimSuffix "-" -}}
 {{- end }}
 
-{{/* What never changes of a part, so that an upgrade may change all else: dict root, part */}}
+{{/* Labels of a part that no upgrade changes, as selectors require: dict root, part */}}
 {{- define "sceneprint.selector" -}}
 app.kubernetes.io/name: sceneprint
 app.kubernetes.io/instance: {{ .root.Release.Name }}
@@ -26,8 +26,8 @@ app.kubernetes.io/managed-by: {{ .root.Release.Service }}
 helm.sh/chart: {{ printf "%s-%s" .root.Chart.Name .root.Chart.Version }}
 {{- end }}
 
-{{/* Refuses a URL that has a password, or is none of PostgreSQL: dict name, url. No pattern of the
-schema does, as Helm repeats a value that does not match, and with it the password. */}}
+{{/* Reject a URL with a password, or of another database: dict name, url. A pattern in the schema
+would make Helm print the rejected URL with its password. */}}
 {{- define "sceneprint.checkUrl" -}}
 {{- if regexMatch "://[^/?@]*:[^@]*@|@.*@|[?&]password=" .url -}}
 {{- fail (printf "database.%s must not contain a password: put PGPASSWORD into the secret" .name) -}}
@@ -37,7 +37,7 @@ schema does, as Helm repeats a value that does not match, and with it the passwo
 {{- end -}}
 {{- end }}
 
-{{/* The environment of every pod; no ConfigMap, as the migration runs before one would be there. */}}
+{{/* Environment of every pod. It is not a ConfigMap, since the migration runs before it would exist. */}}
 {{- define "sceneprint.env" -}}
 {{- include "sceneprint.checkUrl" (dict "name" "url" "url" .Values.database.url) -}}
 - name: SCENEPRINT_DATABASE_URL
@@ -50,7 +50,7 @@ schema does, as Helm repeats a value that does not match, and with it the passwo
 {{- end }}
 {{- end }}
 
-{{/* What every pod has in common: dict root, part, values, and the sizes of its folders. */}}
+{{/* Common settings of every pod: dict root, part, values, and the sizes of its folders. */}}
 {{- define "sceneprint.pod" -}}
 {{- with .root.Values.imagePullSecrets }}
 imagePullSecrets:
@@ -61,7 +61,7 @@ serviceAccountName: {{ . }}
 {{- end }}
 automountServiceAccountToken: false
 enableServiceLinks: false
-# The pause process collects orphans, as an init would.
+# The pause process collects orphaned processes.
 shareProcessNamespace: true
 securityContext:
   runAsNonRoot: true
@@ -106,7 +106,7 @@ envFrom:
     sizeLimit: {{ .temporarySize }}
 {{- end }}
 
-{{/* The image has compiled kernels, in a folder that must be writable: a copy, or each pod compiles. */}}
+{{/* Copy the compiled kernels of the image to a writable folder, so that pods need not compile. */}}
 {{- define "sceneprint.kernels" -}}
 - name: kernels
   {{- include "sceneprint.container" . | nindent 2 }}
