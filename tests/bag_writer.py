@@ -1,4 +1,4 @@
-"""Messages of ROS, and bags of them in every container, with a camera off the base."""
+"""Builders of ROS messages, and of bags in every container, with a camera mounted on a base."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What several rooms of the test suite share."""
+"""Fixtures and hooks that several folders of tests share."""
 
 from __future__ import annotations
 

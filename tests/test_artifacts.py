@@ -1,4 +1,4 @@
-"""Geometry artifacts: what comes back, to which precision, and that damage is noticed."""
+"""Tests of geometry artifacts: content, precision and damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometry artifacts of clouds: what comes back, to which precision, and what is refused."""
+"""Tests of geometry artifacts of clouds: content, precision and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of `make bench`: what they compare is the same work."""
+"""Tests that the rows of `make bench` compare equal work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands as a user runs them: their output, files and exit codes."""
+"""Tests of commands as processes: output, files and exit codes."""
 
 from __future__ import annotations
 

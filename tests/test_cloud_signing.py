@@ -1,4 +1,4 @@
-"""Clouds signed beside depth images: the same points are near, turned ones are the same."""
+"""Tests of signatures of clouds: near those of depth images, and invariant to rotation."""
 
 from __future__ import annotations
 

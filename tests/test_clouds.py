@@ -1,4 +1,4 @@
-"""PLY files: byte for byte, and as a reader that knows only the format sees them."""
+"""Tests of PLY files, byte by byte and with a separate reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands of docs/deployment.md, run in their order by a shell, on real servers."""
+"""Tests of the commands of docs/deployment.md, run in order on real servers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of docs/deployment are held to what reads them; each check is shown what it is against."""
+"""Tests of the files of docs/deployment; each check also sees a faulty file."""
 
 from __future__ import annotations
 

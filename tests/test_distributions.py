@@ -1,4 +1,4 @@
-"""What a service installs works without the lab and the viewers."""
+"""Tests that the service works without the lab and the viewers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The documentation is held to the code: functions exist, equations have rows, commands run."""
+"""Tests of the documentation against the code: functions, equations and commands."""
 
 from __future__ import annotations
 

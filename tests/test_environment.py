@@ -1,4 +1,4 @@
-"""How `make` installs: locks that agree, uv or else pip, packages that type checkers find."""
+"""Tests of the installation by `make`: consistent locks, uv or pip, and type checkers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of file formats against files of each, and against what else is written of them."""
+"""Tests of the table of file formats against files, and of its copies."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Views of a box room fused: the surface lies where the walls are, and has their area."""
+"""Tests of fused views of a room: position and area of the surface."""
 
 import subprocess
 import sys

@@ -1,7 +1,7 @@
-"""Behaviour frozen in tests/golden: the API, the help of every command, signatures, an answer.
+"""Tests against recorded behaviour in tests/golden: API, command help, signatures and an answer.
 
-Moving files or renaming code must change none of it. After an intended change, write the files
-again with `make goldens`, read their diff, and say in CHANGELOG.md what users will see.
+Moving or renaming code must not change it. After an intended change, update the files with `make
+goldens`, read their diff, and describe the change in CHANGELOG.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""g2o: written, read back by a strict reader of our own and by one of others, and what it means."""
+"""Tests of g2o files with two readers, and of their meaning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Candidates whose transform follows from the matches before and the map's poses."""
+"""Tests of candidates whose transform follows from earlier matches and the map's poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Helm chart, rendered by Helm itself and held to the schemas of Kubernetes and to our code."""
+"""Tests of the rendered Helm chart against the schemas of Kubernetes and our code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules of the house: names that say what is there, functions that fit a screen, no circles."""
+"""Tests of the project's rules: names, lengths of functions and files, and import cycles."""
 
 from __future__ import annotations
 

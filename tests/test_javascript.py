@@ -1,4 +1,4 @@
-"""Checks of the dashboard's JavaScript: pinned, and skipped with a word where there is no Node."""
+"""Tests of the check of the dashboard's JavaScript, which is skipped without Node."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From matches to a pose: votes by place, competitors, the map's frames, priors and sequences."""
+"""Tests of poses from matches: votes, competitors, parent frames, priors and sequences."""
 
 from __future__ import annotations
 

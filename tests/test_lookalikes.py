@@ -1,4 +1,4 @@
-"""What two frames cannot tell is not believed; what they can is. Seeded, on whole images."""
+"""Tests that ambiguous pairs of frames are not accepted, on whole seeded images."""
 
 from __future__ import annotations
 

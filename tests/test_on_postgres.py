@@ -1,4 +1,4 @@
-"""The same tests on PostgreSQL: those that say most in a second; `make test-postgres` runs all."""
+"""Tests on PostgreSQL that detect most in a second; `make test-postgres` runs all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/operations.md, docs/settings.md and the dashboard say what the code has."""
+"""Tests that docs/operations.md, docs/settings.md and the dashboard match the code."""
 
 from __future__ import annotations
 

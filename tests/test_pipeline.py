@@ -1,4 +1,4 @@
-"""From frame to stored signature: the promises a caller relies on."""
+"""Tests of the path from a frame to its stored signature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points as bytes, against a decoder that reads them as docs/reference.md says, one at a time."""
+"""Tests of encoded points against a decoder that follows docs/reference.md."""
 
 from __future__ import annotations
 

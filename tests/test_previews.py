@@ -1,4 +1,4 @@
-"""Pictures of frames: pixels worked out by hand, and what every picture has."""
+"""Tests of pictures of frames: pixels, and common properties."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages that are edited for plain English stay so: docs/style.md, held to by counting."""
+"""Tests of the pages' language against docs/style.md, by counts."""
 
 from __future__ import annotations
 

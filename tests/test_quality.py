@@ -1,4 +1,4 @@
-"""Bounds on accuracy, on real recordings and on synthetic rooms; deterministic."""
+"""Tests of deterministic bounds on accuracy, with recordings and synthetic rooms."""
 
 from __future__ import annotations
 

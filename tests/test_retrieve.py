@@ -1,4 +1,4 @@
-"""The paper's Fig. 1 as functions: retrieve, diversify, associate, locate."""
+"""Tests of the paper's Fig. 1 as functions: retrieve, diversify, associate, locate."""
 
 from __future__ import annotations
 

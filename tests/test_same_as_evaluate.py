@@ -1,4 +1,4 @@
-"""Answers over HTTP are those of `sceneprint evaluate`: same matches, same transforms."""
+"""Tests that answers over HTTP equal those of `sceneprint evaluate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Secrets in files in place of the environment."""
+"""Tests of secrets in files instead of environment variables."""
 
 from __future__ import annotations
 

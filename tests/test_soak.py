@@ -1,4 +1,4 @@
-"""`python -m benchmarks.soak` at reduced size, with real processes; and that it sees losses."""
+"""Tests of `python -m benchmarks.soak` at reduced size, and of its detection of losses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/api.md: its commands, run as they stand, in their order."""
+"""Tests of the commands of docs/api.md, run in order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training: the same command gives the same model, and too little data is said so."""
+"""Tests of training: reproducibility, and errors for too little data."""
 
 from __future__ import annotations
 

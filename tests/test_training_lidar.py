@@ -1,4 +1,4 @@
-"""The preset for lasers: learnt from sites, at lengths of its own, and good enough to find by."""
+"""Tests of the training of the LiDAR preset: lengths and retrieval."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""docs/from_bag_to_pose.md: its commands are run in a fresh folder, and say what the page says.
-Those of docs/whole_maps.md are run, too.
+"""Tests of the commands of docs/from_bag_to_pose.md and docs/whole_maps.md in a new folder.
 
-With SCENEPRINT_UPDATE_GOLDEN=1 the page has from then on what they said.
+The output of the former must match the page; SCENEPRINT_UPDATE_GOLDEN=1 updates it.
 """
 
 from __future__ import annotations

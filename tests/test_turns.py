@@ -1,4 +1,4 @@
-"""Turns of threads: fair among tenants, given up in time, and none after the end."""
+"""Tests of threads that take turns: fairness among tenants, timeouts and shutdown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How surfaces look to people: which point is on which pixel, by hand and by turning."""
+"""Tests of pictures of surfaces: pixels of points, and rotation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A wheel that carries compiled kernels: whoever installs it compiles nothing."""
+"""Tests of a wheel with compiled kernels, which need no compilation after installation."""
 
 from __future__ import annotations
 

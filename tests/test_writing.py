@@ -1,4 +1,4 @@
-"""Files written whole: in which order, and what is left where it fails."""
+"""Tests of atomic file writes: order of operations, and remains after a failure."""
 
 from __future__ import annotations
 

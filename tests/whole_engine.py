@@ -1,4 +1,4 @@
-"""All concerns of the engine over one store, as a service and a worker in one process have them."""
+"""All parts of the engine over one store, as in a process with service and worker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of bundles share: a data folder with something of every kind, and its bundle."""
+"""Fixtures of the bundle tests: a data folder with objects of every kind, and its bundle."""
 
 from __future__ import annotations
 

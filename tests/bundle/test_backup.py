@@ -1,4 +1,4 @@
-"""What is in a bundle, and what another one costs."""
+"""Tests of the content of a bundle, and of the cost of the next one."""
 
 from __future__ import annotations
 

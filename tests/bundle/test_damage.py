@@ -1,4 +1,4 @@
-"""Bundles that are not as they were written, by accident or on purpose: named, and refused."""
+"""Tests that damaged or manipulated bundles are detected and rejected."""
 
 from __future__ import annotations
 

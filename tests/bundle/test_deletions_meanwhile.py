@@ -1,4 +1,4 @@
-"""Deletions while a backup is being taken: it misses nothing, and what stays is found later."""
+"""Tests of deletions during a backup, which is complete and can be restored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Backups and restores that are killed: every bundle is whole, and a restore goes on."""
+"""Tests of backups and restores that are killed: bundles are complete, and restores continue."""
 
 from __future__ import annotations
 

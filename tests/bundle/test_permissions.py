@@ -1,4 +1,4 @@
-"""What a data folder lets other users of the machine read: nothing, whatever the umask."""
+"""Tests that other users of the machine cannot read a data folder, whatever the umask."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bundles restored to folders and servers: the same rows and answers, and nothing half there."""
+"""Tests that restored folders and servers have the same rows and answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Backups of a running service, whose robots upload and delete all the time."""
+"""Tests of backups of a running service while robots upload and delete."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real service for the commands that talk to one, and a data set to give them."""
+"""Fixtures of commands that use a service: a real service and a data set."""
 
 from __future__ import annotations
 

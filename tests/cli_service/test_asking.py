@@ -1,4 +1,4 @@
-"""`query`, `localize` and `similarity` with their options, as a user gives them."""
+"""Tests of the options of `query`, `localize` and `similarity`."""
 
 from __future__ import annotations
 

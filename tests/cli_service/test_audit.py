@@ -1,4 +1,6 @@
-"""`sceneprint audit`: the newest entries, and all of them as JSON lines or syslog messages."""
+"""Tests of `sceneprint audit`: the newest entries, and all entries as JSON lines or syslog
+messages.
+"""
 
 from __future__ import annotations
 

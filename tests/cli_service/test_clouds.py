@@ -1,4 +1,4 @@
-"""Point clouds by command: a folder into a map of images, and looked up in it."""
+"""Tests of point clouds on the command line, in a map that also has depth images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sceneprint demo` from start to end, and that it leaves nothing however it ends."""
+"""Tests of `sceneprint demo`, which removes its data however it ends."""
 
 from __future__ import annotations
 

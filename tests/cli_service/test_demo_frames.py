@@ -1,4 +1,4 @@
-"""Which frames the demo keeps, and which it looks up."""
+"""Tests of the selection of map and query frames for the demo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sceneprint doctor` on a sound machine, and on several that are not."""
+"""Tests of `sceneprint doctor` on machines with and without problems."""
 
 from __future__ import annotations
 

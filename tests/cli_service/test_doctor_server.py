@@ -1,4 +1,4 @@
-"""What `sceneprint doctor` says of PostgreSQL and of object stores."""
+"""Tests of `sceneprint doctor` with PostgreSQL and object stores."""
 
 from __future__ import annotations
 

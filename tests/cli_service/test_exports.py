@@ -1,4 +1,4 @@
-"""Files of other systems, uploaded as a user does."""
+"""Tests of uploads of files from other systems on the command line."""
 
 from __future__ import annotations
 

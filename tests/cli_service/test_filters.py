@@ -1,4 +1,4 @@
-"""Filters and `--if-novel` as a user gives them."""
+"""Tests of filters and `--if-novel` on the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sceneprint frames` against a service."""
+"""Tests of `sceneprint frames` with a service."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sceneprint jobs` against a real service."""
+"""Tests of `sceneprint jobs` with a service."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sceneprint keys`: made, listed and revoked in a data folder."""
+"""Tests of `sceneprint keys`: creation, list and revocation in a data folder."""
 
 from __future__ import annotations
 

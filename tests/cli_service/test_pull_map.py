@@ -1,4 +1,4 @@
-"""`sceneprint pull`: maps of a running service in a robot's folder."""
+"""Tests of `sceneprint pull`, which copies maps of a running service to a robot's folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sceneprint make mesh` against a real service."""
+"""Tests of `sceneprint make mesh` with a service."""
 
 from __future__ import annotations
 

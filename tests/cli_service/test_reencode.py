@@ -1,4 +1,4 @@
-"""`sceneprint reencode`: begun, watched and given up beside a service, which then answers anew."""
+"""Tests of `sceneprint reencode`: start, progress, cancellation, and answers after the switch."""
 
 from __future__ import annotations
 

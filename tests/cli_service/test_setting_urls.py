@@ -1,6 +1,4 @@
-"""Settings: which URLs are taken, that none is repeated where it is refused, and how large a body
-may be.
-"""
+"""Tests of URLs and body sizes in settings; errors never repeat a rejected URL."""
 
 from __future__ import annotations
 

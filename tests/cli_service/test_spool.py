@@ -1,4 +1,4 @@
-"""`sceneprint spool`, and the example that keeps frames of an offline robot."""
+"""Tests of `sceneprint spool`, and of the example of an offline robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Upload, query and maps as a user runs them: real processes against a real service."""
+"""Tests of upload, query and map commands as processes with a real service."""
 
 from __future__ import annotations
 

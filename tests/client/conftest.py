@@ -1,4 +1,4 @@
-"""A real service for the client's tests, frames as files, and small pieces of HTTP."""
+"""Fixtures of the client tests: a service, frames as files, and scripted HTTP servers."""
 
 from __future__ import annotations
 

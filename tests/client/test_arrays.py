@@ -1,4 +1,4 @@
-"""Frames as robots have them: arrays with a camera, path strings, poses as ROS names them."""
+"""Tests of frames as arrays with a camera, of path strings, and of poses in ROS notation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Associations by client, raw HTTP and command: edges, graphs, joins."""
+"""Tests of associations by client, HTTP and command line: edges, graphs and joins."""
 
 from __future__ import annotations
 

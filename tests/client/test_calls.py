@@ -1,4 +1,4 @@
-"""What a client does with maps, frames and jobs."""
+"""Tests of the client's methods for maps, frames and jobs."""
 
 from __future__ import annotations
 

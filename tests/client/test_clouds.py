@@ -1,4 +1,4 @@
-"""Point clouds through the client."""
+"""Tests of point clouds through the client."""
 
 from __future__ import annotations
 

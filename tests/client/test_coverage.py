@@ -1,4 +1,4 @@
-"""Coverage by client: results, frames, changes."""
+"""Tests of coverage through the client: results, frames and changes."""
 
 from __future__ import annotations
 

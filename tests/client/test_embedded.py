@@ -1,4 +1,4 @@
-"""The service in this process: it streams, works while somebody waits, and ends in order."""
+"""Tests of the service in the client's process: streaming, waiting and shutdown."""
 
 from __future__ import annotations
 

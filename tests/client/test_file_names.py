@@ -1,4 +1,4 @@
-"""Names of files and places in sequences, as they are sent by themselves."""
+"""Tests of the file names and sequence numbers that the client sends with frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a frame at hand is sent as, and what is left of a job that is stopped."""
+"""Tests of the bytes and metadata of frames to send, and of interrupted jobs."""
 
 from __future__ import annotations
 

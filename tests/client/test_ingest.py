@@ -1,4 +1,4 @@
-"""Uploads under an id, batches and archives through the client."""
+"""Tests of uploads under an id, of batches and of archives through the client."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A client of a service that requires a key: no call without one, and each as its scope has it."""
+"""Tests of every client method with a service that requires keys, by scope."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events, figures, models and reencoding through the client."""
+"""Tests of events, statistics, models and re-encoding through the client."""
 
 from __future__ import annotations
 

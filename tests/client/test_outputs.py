@@ -1,4 +1,4 @@
-"""Frames out of the service and edited."""
+"""Tests of downloads and edits of frames through the client."""
 
 from __future__ import annotations
 

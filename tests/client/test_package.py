@@ -1,4 +1,4 @@
-"""What a robot installs: what it loads, what it shares with the service, and the wheel itself."""
+"""Tests of the client's package: its imports, its shared code with the service, and its wheel."""
 
 from __future__ import annotations
 

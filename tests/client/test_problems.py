@@ -1,4 +1,4 @@
-"""The service's names of problems and the client's are the same, from one function."""
+"""Tests that client and service derive the same problem names from one function."""
 
 from __future__ import annotations
 

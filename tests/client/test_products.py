@@ -1,4 +1,4 @@
-"""What all products of maps share, by client and raw HTTP: begin, wait, list, read, delete."""
+"""Tests of operations that all products of maps share, by client and HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ways to ask; and a service over the network and the one in process answer alike."""
+"""Tests of queries, with equal answers over the network and in process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reconstructions through the client: files, figures, refusals."""
+"""Tests of reconstructions through the client: files, results and errors."""
 
 from __future__ import annotations
 

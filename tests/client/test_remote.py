@@ -1,4 +1,4 @@
-"""What only happens where a network lies between: retries, refusals, addresses."""
+"""Tests of network effects: retries, rejected requests and addresses."""
 
 from __future__ import annotations
 

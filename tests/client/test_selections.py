@@ -1,4 +1,4 @@
-"""What a client does with many frames at once, with deletions, and with kept answers."""
+"""Tests of client methods for many frames, for deletions and for kept answers."""
 
 from __future__ import annotations
 

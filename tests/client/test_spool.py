@@ -1,6 +1,4 @@
-"""The spool of a robot that is offline: what it keeps, what it gives up, and that nothing is lost
-or doubled whatever kills it.
-"""
+"""Tests of the spool of an offline robot, which never loses or duplicates frames after a kill."""
 
 from __future__ import annotations
 

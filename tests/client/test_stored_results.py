@@ -1,4 +1,4 @@
-"""Stored results of a query, through the client."""
+"""Tests of stored results of a query through the client."""
 
 from __future__ import annotations
 

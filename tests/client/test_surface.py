@@ -1,4 +1,4 @@
-"""The surface of a map by client and raw HTTP."""
+"""Tests of the surface of a map by client and HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points out of the bytes that the service packs them in."""
+"""Tests of the decoder of points from the service."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The tracker asks with priors, goes on without answers, logs and replays; in a thread; and on runs
-through synthetic buildings, kidnapped and beside what looks alike.
+"""Tests of the tracker: priors, missing answers, logs, threads, and runs through synthetic
+buildings with kidnapped robots and ambiguous places.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The tracker's arithmetic, by hand: first fix, jump gate, kidnapping, ambiguity, drift."""
+"""Tests of the tracker's arithmetic: first fix, gate, kidnapping, ambiguity and drift."""
 
 from __future__ import annotations
 

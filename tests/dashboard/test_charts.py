@@ -1,4 +1,4 @@
-"""Charts, value by value: steps and paths worked out by hand, and what is read out."""
+"""Tests of charts: steps, paths and texts for screen readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of coverage beside the API: a job begun on it, its plan, what a cell holds, changes."""
+"""Tests of the coverage page against the API: a new job, its plan, cells and changes."""
 
 from __future__ import annotations
 

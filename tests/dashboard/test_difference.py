@@ -1,4 +1,4 @@
-"""The page that compares two sessions beside the API: begun on it, its counts, its three views."""
+"""Tests of the page that compares two sessions, against the API: a new job, counts and views."""
 
 from __future__ import annotations
 

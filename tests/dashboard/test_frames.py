@@ -1,4 +1,4 @@
-"""The gallery and the page of a frame, held to what the API says of the same frames."""
+"""Tests of the gallery and of a frame's page against the API."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The queries of a map in a real browser: every row is a record, and looking leaves none."""
+"""Tests of the query history: a row for each record, and no record of a visit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of the maps against the API's own numbers: cards, create, retitle, delete, live."""
+"""Tests of the page of maps against the API: cards, creation, edits, deletion and live updates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Operations in a real browser, over real jobs: what is told is what the API tells."""
+"""Tests of the operations page against the API, with real jobs."""
 
 from __future__ import annotations
 

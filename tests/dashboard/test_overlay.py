@@ -1,4 +1,4 @@
-"""The overlay page over a real service: it says what the API says, and draws what is true."""
+"""Tests of the overlay page against the API, and of the drawn points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs in the place beside the numbers of the API: paths, joins, edges, a query, who may what."""
+"""Tests of paths in the place against the API: joins, edges, a query and permissions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The place of a map in a real browser: its surface beside the API's bytes, spots, robots."""
+"""Tests of the place of a map against the API: surface, spots and robots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking, and the answer: what the page shows is what the API tells, number by number."""
+"""Tests of the query page against the API."""
 
 from __future__ import annotations
 

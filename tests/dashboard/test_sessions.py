@@ -1,4 +1,4 @@
-"""The page of sessions beside the API: the list, one renamed, tagged, joined and deleted."""
+"""Tests of the page of sessions against the API: list, renaming, tags, merging and deletion."""
 
 from __future__ import annotations
 

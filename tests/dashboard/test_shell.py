@@ -1,4 +1,4 @@
-"""The shell: what the first page costs, themes, keys, focus, and a service that goes and comes."""
+"""Tests of the shell: size of the first page, themes, keys, focus and a restarted service."""
 
 from __future__ import annotations
 

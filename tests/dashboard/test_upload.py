@@ -1,4 +1,4 @@
-"""Uploads by the page, held to what the API has of them afterwards."""
+"""Tests of uploads on the page against the API."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The viewer: its sums by value, and pixels where a projection by hand says."""
+"""Tests of the viewer: its sums, and pixels at projected positions."""
 
 from __future__ import annotations
 

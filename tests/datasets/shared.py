@@ -1,4 +1,4 @@
-"""What the tests of datasets share: poses, images whose bytes were changed, what comes of them."""
+"""Helpers of the data set tests: poses, modified images and their results."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,4 +1,4 @@
-"""What is packed is found as in the folder; what is wrong in an archive costs only itself."""
+"""Tests that archives give the same frames as folders, and that faults affect single members."""
 
 from __future__ import annotations
 

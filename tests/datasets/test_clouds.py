@@ -1,4 +1,4 @@
-"""Sequences of points: which files are clouds, how they are read, and where their poses are."""
+"""Tests of sequences of points: their files, layout and poses."""
 
 import io
 import json

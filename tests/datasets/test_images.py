@@ -1,4 +1,4 @@
-"""The door: what becomes of samples of either kind, and what is said where nothing can."""
+"""Tests of the decoding of depth images, and of its errors."""
 
 import dataclasses
 import os

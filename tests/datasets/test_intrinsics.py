@@ -1,4 +1,4 @@
-"""intrinsics.json: where it is looked for, what it may say, what is said about bad ones."""
+"""Tests of intrinsics.json: its location, its fields and its errors."""
 
 import json
 import tracemalloc

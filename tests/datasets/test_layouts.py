@@ -1,4 +1,4 @@
-"""Each layout by itself: which files are frames, in which order, with which pose."""
+"""Tests of each layout: frames, order and poses."""
 
 from pathlib import Path
 

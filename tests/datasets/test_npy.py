@@ -1,4 +1,4 @@
-"""NPY files of metres: right samples from good files, a clear error from every bad one."""
+"""Tests of NPY files of depth: samples of valid files, and errors of invalid ones."""
 
 import io
 import struct

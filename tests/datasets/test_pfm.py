@@ -1,4 +1,4 @@
-"""Depth images in PFM, by the description of the format."""
+"""Tests of depth images in PFM against the description of the format."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Samples that are no depth are refused with what to do; depth of all kinds is not."""
+"""Tests that images other than depth are rejected with advice, and depth is accepted."""
 
 import numpy as np
 import pytest

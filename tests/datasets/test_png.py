@@ -1,4 +1,4 @@
-"""16-bit greyscale PNG: right samples from good files, a clear error from every bad one."""
+"""Tests of 16-bit greyscale PNG: samples of valid files, and errors of invalid ones."""
 
 import io
 import struct

@@ -1,4 +1,4 @@
-"""Poses: by hand, round trips, and every way in which sixteen words are no pose."""
+"""Tests of poses: values, round trips, and invalid files."""
 
 import math
 from pathlib import Path

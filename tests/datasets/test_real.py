@@ -1,4 +1,4 @@
-"""The sequences of the shared data: their numbers, poses that agree, speed."""
+"""Tests of the recorded sequences: frame counts, consistent poses and speed."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The range of samples, and what uploads say of it."""
+"""Tests of the range of samples in uploads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders made by the writers are found again; folders that are wrong say so."""
+"""Tests that written folders are recognised, and that invalid folders raise errors."""
 
 import os
 from collections.abc import Iterable

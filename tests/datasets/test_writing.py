@@ -1,4 +1,4 @@
-"""What is written is read again, and a file is whole or not there."""
+"""Tests that written data can be read, and that files are complete or absent."""
 
 import os
 from pathlib import Path

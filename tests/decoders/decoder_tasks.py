@@ -1,4 +1,4 @@
-"""A decoder's process with tasks that do what no decoder should; see test_decoders.py."""
+"""Misbehaving tasks for a decoder's process; see test_decoders.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decoders in processes of their own: equal arrays, walls, limits, replacement, fair shares."""
+"""Tests of decoder processes: equal arrays, isolation, limits, replacement and fairness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of whole maps read in a process of its own: equal arrays, walls, limits, lies."""
+"""Tests of the decoder of whole maps: equal arrays, isolation, limits and false headers."""
 
 from __future__ import annotations
 

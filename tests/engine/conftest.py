@@ -1,4 +1,4 @@
-"""What the engine tests share: two paths through two rooms, and maps that hold them."""
+"""Fixtures of the engine tests: two paths through two rooms, and maps of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Queries: the right room, the right pose, and the same numbers as the library gives."""
+"""Tests of queries: room, pose, and equality with the library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Associations through the engine: two runs with origins of their own, slices that are lost."""
+"""Tests of associations of two runs with separate origins, including lost slices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two stretches of a real recording with origins of their own; see docs/associations.md."""
+"""Tests of an association of two parts of a recording; see docs/associations.md."""
 
 from __future__ import annotations
 

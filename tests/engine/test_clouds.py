@@ -1,4 +1,4 @@
-"""Point clouds in a store: read again as they were let in, told, and left out where none fit."""
+"""Tests of point clouds in a store: decoding, answers, and mismatched models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kernels compiled ahead: in processes of their own, all that the first frame needs."""
+"""Tests of kernels that separate processes compile ahead of the first frame."""
 
 from __future__ import annotations
 

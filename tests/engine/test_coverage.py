@@ -1,4 +1,4 @@
-"""Coverage of a map through the engine: equal rooms, duplicates, slices that are lost, changes."""
+"""Tests of coverage of a map: equal rooms, duplicates, lost slices and changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plans of coverage by hand: axes, widths of cells, counts, changes, colours."""
+"""Tests of coverage plans: axes, cell widths, counts, changes and colours."""
 
 from __future__ import annotations
 

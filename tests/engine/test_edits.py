@@ -1,4 +1,4 @@
-"""Metadata edited: what a patch changes, what it leaves, and who sees it."""
+"""Tests of metadata edits: changed and unchanged fields, and their visibility."""
 
 from __future__ import annotations
 

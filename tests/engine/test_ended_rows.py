@@ -1,4 +1,4 @@
-"""Rows of deleted and redundant frames go after some days, and what was deleted stays deleted."""
+"""Tests that rows of deleted and redundant frames are removed after some days."""
 
 from __future__ import annotations
 

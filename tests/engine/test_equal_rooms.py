@@ -1,4 +1,4 @@
-"""Two rooms that are equal, mapped from the same viewpoints: C may hold frames of one alone."""
+"""Tests of two equal rooms, of which C may contain only one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Queries with a filter: the ranking that plain Python makes of the frames that pass."""
+"""Tests of filtered queries against a ranking in plain Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Original names of frames and their places in a session: kept, and their order followed."""
+"""Tests of original names of frames, and of their order in a session."""
 
 from __future__ import annotations
 

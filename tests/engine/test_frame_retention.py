@@ -1,4 +1,4 @@
-"""Retention: what is older than its map keeps it goes, block by block, and nothing else."""
+"""Tests of retention: expired frames are deleted in blocks, and no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An import goes on where its last slice was stored, whatever was done in between."""
+"""Tests that an import continues after its last stored slice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The index of a map, from nothing to a damaged file and back: answers are right throughout."""
+"""Tests of correct answers from an empty index to a damaged and rebuilt one."""
 
 from __future__ import annotations
 

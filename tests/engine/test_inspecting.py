@@ -1,4 +1,4 @@
-"""After a query: the same answer, its points, its ranking, and what a match rests on."""
+"""Tests of stored answers: points, ranking, and details of a match."""
 
 from __future__ import annotations
 

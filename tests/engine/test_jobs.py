@@ -1,4 +1,4 @@
-"""Jobs that are cancelled, tried again, or taken from workers that died over them."""
+"""Tests of jobs that are cancelled, retried, or taken over from dead workers."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Index publication, purge and pull, killed at a hundred moments each: nothing lost, nothing left.
+"""Tests of publication, purge and pull, killed at a hundred moments each: no data is lost or left.
 
-A frame is there as soon as its upload was acknowledged, and gone as soon as its deletion was.
+A frame exists once its upload is acknowledged, and not after its deletion is acknowledged.
 """
 
 from __future__ import annotations

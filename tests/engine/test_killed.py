@@ -1,4 +1,4 @@
-"""Workers that are killed: another does their work, and it takes effect once."""
+"""Tests of killed workers, whose jobs take effect once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a robot wants of a query, and two frames compared."""
+"""Tests of localization, and of the comparison of two frames."""
 
 from __future__ import annotations
 

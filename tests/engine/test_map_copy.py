@@ -1,4 +1,4 @@
-"""One map pulled into a robot's store: the same answers, only what is new, and after kills."""
+"""Tests of maps that a robot pulls: equal answers, incremental transfer and kills."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map that comes as one mesh: views of it become frames, once, whatever is done in between."""
+"""Tests of maps from a mesh: each view becomes a frame once, even after interruptions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a map takes on the disk, and its trajectories: against counts by hand and the files."""
+"""Tests of the disk use of a map, and of its trajectories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers while frames come, go and are damaged."""
+"""Tests of answers while frames are added, deleted and damaged."""
 
 from __future__ import annotations
 

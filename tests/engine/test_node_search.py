@@ -1,4 +1,4 @@
-"""A node without the index of a map: it reads the signatures once, and compares all of them."""
+"""Tests of a node without an index, which compares all signatures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that are kept only where their map lacks the place: `if_novel` of an upload."""
+"""Tests of `if_novel`, which keeps only frames of new places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fleet's store: PostgreSQL and an object store, with engines that share nothing else."""
+"""Tests of engines that share only PostgreSQL and an object store."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures, models, retention of events, and what is held of maps that are gone."""
+"""Tests of statistics, models, event retention, and remains of deleted maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is taken out of a map, against what the library makes of the same uploads."""
+"""Tests of downloads from a map against the library's results."""
 
 from __future__ import annotations
 

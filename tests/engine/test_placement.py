@@ -1,4 +1,4 @@
-"""Where a query was taken, by all frames of a map: priors, sequences, causes, and what is read."""
+"""Tests of poses of queries: priors, sequences, causes, and reads from the store."""
 
 from __future__ import annotations
 

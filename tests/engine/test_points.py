@@ -1,4 +1,4 @@
-"""Points that pages draw: those of the artifacts, judged as an overlay's are."""
+"""Tests of points for pages, with residuals like those of an overlay."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A deleted frame leaves no byte of itself: its bytes are looked for in every file and every table.
+"""Tests that no file and no table contains bytes of a deleted frame.
 
-First they are found in each place where they may be; then it is deleted, and they are in none.
+A test first finds the bytes in each possible place, and then none after the deletion.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The log of queries: written beside the answers, read by page, kept, and removed in blocks."""
+"""Tests of the query log: records, pages, kept answers, and deletion in blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options of a query: each does what it says, and says why."""
+"""Tests of the effect and the explanation of each option of a query."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quotas: what a map may hold, counted exactly whatever becomes of its frames and whoever sends."""
+"""Tests that quotas are exact for concurrent uploads and all changes of frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What queries see while maps grow, are indexed, shrink, and are made anew."""
+"""Tests of queries while maps grow, are indexed, shrink and are recreated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map gets another model: in the background, whole, and as if it had never had another."""
+"""Tests of re-encoding in the background, with the same result as a new map."""
 
 from __future__ import annotations
 

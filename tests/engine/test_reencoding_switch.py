@@ -1,4 +1,4 @@
-"""Queries, workers and indexes at the moment a map switches from model to model."""
+"""Tests of queries, workers and indexes at the switch to another model."""
 
 from __future__ import annotations
 

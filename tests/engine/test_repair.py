@@ -1,4 +1,4 @@
-"""Repair while serving: damaged derived data is soon made again from the upload."""
+"""Tests that damaged derived data is rebuilt from uploads during service."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An evaluation gives the answers of a service: the same status, confidences and poses."""
+"""Tests that an evaluation and a service give the same status, confidence and pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be sent, what may not, and what poses become of it."""
+"""Tests of valid and invalid requests, and of the conversion of poses."""
 
 from __future__ import annotations
 

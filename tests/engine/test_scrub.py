@@ -1,4 +1,4 @@
-"""The scrub: reads all stored bytes a slice at a time, tells damage, and has it made again."""
+"""Tests of the scrub, which reads all stored bytes in slices and has damage repaired."""
 
 from __future__ import annotations
 

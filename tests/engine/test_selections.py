@@ -1,4 +1,4 @@
-"""Selected frames: deleted and edited by their ids or a filter, and what undoes an edit."""
+"""Tests of deletions and edits of selected frames, and of undo."""
 
 from __future__ import annotations
 

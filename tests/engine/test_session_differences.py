@@ -1,5 +1,4 @@
-"""Two sessions of a map compared through the engine: a box that came, slices that are lost, and a
-frame that is deleted afterwards."""
+"""Tests of the comparison of two sessions: a new box, lost slices, and a deleted frame."""
 
 from __future__ import annotations
 

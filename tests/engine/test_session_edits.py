@@ -1,4 +1,4 @@
-"""Sessions as a whole: renamed, tagged and deleted block by block, and nothing else with them."""
+"""Tests of sessions that are renamed, tagged and deleted in blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One query over several maps: one ranking, the same distances, nothing mixed that must not be."""
+"""Tests of a query over several maps with a common ranking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Indexes that a fleet shares: built once, fetched whole or not at all, forgotten everywhere."""
+"""Tests of shared indexes: built once, fetched completely, and deleted everywhere."""
 
 from __future__ import annotations
 

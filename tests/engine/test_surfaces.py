@@ -1,4 +1,4 @@
-"""Surfaces of maps through the engine: as an oracle would fuse, whatever comes, goes and moves."""
+"""Tests of map surfaces against a simple fusion after all kinds of changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Long jobs: slices, each stored once, whatever dies in between."""
+"""Tests of long jobs, each of whose slices is stored once."""
 
 from __future__ import annotations
 

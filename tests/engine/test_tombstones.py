@@ -1,4 +1,4 @@
-"""Deleted frames: found by nothing, restored as they were while that can be done, then gone."""
+"""Tests of deleted frames: hidden, restored in time, and finally removed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Up of frames and of maps: stored, learnt, told to the search, and doubted where it is wrong."""
+"""Tests of up vectors of frames and maps: storage, estimation, use, and wrong vectors."""
 
 from __future__ import annotations
 

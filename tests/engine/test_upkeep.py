@@ -1,4 +1,4 @@
-"""Indexes are caches: of this history of the database, of the maps there are, and expendable."""
+"""Tests that indexes are caches, tied to one database history and its maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uploads: taken once, refused where they contradict, and gone when deleted."""
+"""Tests of uploads: repetition, conflicts and deletion."""
 
 from __future__ import annotations
 

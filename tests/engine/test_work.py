@@ -1,4 +1,4 @@
-"""Work: what becomes of frames that cannot be signed, and of workers that come too late."""
+"""Tests of frames that cannot be signed, and of workers that finish too late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rooms to evaluate; and outcomes as data, from which figures are worked out by hand."""
+"""Fixtures of the evaluation tests: rooms, and outcomes with known figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers of a service judged by true poses, by hand."""
+"""Tests of the comparison of answers with true poses."""
 
 from __future__ import annotations
 

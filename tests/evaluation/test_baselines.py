@@ -1,4 +1,4 @@
-"""The baselines: descriptors by hand, and the command from end to end."""
+"""Tests of the baselines: descriptors, and the command."""
 
 from __future__ import annotations
 

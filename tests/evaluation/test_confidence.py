@@ -1,4 +1,4 @@
-"""Confidences are learnt: steps and calibration by hand, and known penalties found again."""
+"""Tests of the confidence fit: steps, calibration and known penalties."""
 
 from __future__ import annotations
 

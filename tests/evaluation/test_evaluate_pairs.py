@@ -1,4 +1,4 @@
-"""The command as a user runs it, on a small synthetic building."""
+"""Tests of `sceneprint evaluate-pairs` on a small synthetic building."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows, acceptance, places where queries are lost, diversity: each worked by hand."""
+"""Tests of rows, acceptance, lost queries and diversity against manual results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Overlap: by hand, and against the plain loop."""
+"""Tests of overlap against manual results and a simple loop."""
 
 from __future__ import annotations
 

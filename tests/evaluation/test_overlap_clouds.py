@@ -1,4 +1,4 @@
-"""Overlap of clouds, by hand: walls of points."""
+"""Tests of the overlap of clouds, for walls of points."""
 
 from __future__ import annotations
 

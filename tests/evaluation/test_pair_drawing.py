@@ -1,4 +1,4 @@
-"""What is drawn, from overlaps made by hand."""
+"""Tests of the sampling of pairs from given overlaps."""
 
 from __future__ import annotations
 

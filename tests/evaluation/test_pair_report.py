@@ -1,4 +1,4 @@
-"""Figures of pairs, worked out by hand."""
+"""Tests of the figures of pairs against manual results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The share of one plane, of surfaces made by hand."""
+"""Tests of the fraction of the main plane of synthetic surfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which frames are database and which are queries."""
+"""Tests of the split into database and query frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""R and C by hand, and whichever way the distances within R are had."""
+"""Tests of R and C, for both computations of the distances within R."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of rates against scipy and their definition; curves against counting pairs."""
+"""Tests of rate bounds against SciPy and their definition, and of curves against counts."""
 
 from __future__ import annotations
 

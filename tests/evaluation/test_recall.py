@@ -1,4 +1,4 @@
-"""Recall and travel, by hand."""
+"""Tests of recall and travelled distance against manual results."""
 
 from __future__ import annotations
 

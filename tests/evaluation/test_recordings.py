@@ -1,4 +1,4 @@
-"""Bounds on the accuracy of a reduced evaluation of real recordings; deterministic."""
+"""Tests of the accuracy of a reduced, deterministic evaluation of recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers at places that look alike, of one small site."""
+"""Tests of answers at a small ambiguous site."""
 
 from __future__ import annotations
 

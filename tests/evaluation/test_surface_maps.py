@@ -1,4 +1,4 @@
-"""Frames of a map become one surface, and views of it are frames with poses."""
+"""Tests of maps that are fused to a surface and rendered as views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A room whose surface is known, and what a camera or a scanner sees in it."""
+"""Fixtures of the export tests: a room with a known surface, and its images and scans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders and files of Polycam, Record3D, nerfstudio and E57, written by their descriptions."""
+"""Tests of Polycam, Record3D, nerfstudio and E57 files, written by their descriptions."""
 
 from __future__ import annotations
 

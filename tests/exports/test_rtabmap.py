@@ -1,4 +1,4 @@
-"""RTAB-Map databases, written by the published schema of several versions, and broken ones."""
+"""Tests of RTAB-Map databases of several schema versions, and of damaged ones."""
 
 from __future__ import annotations
 

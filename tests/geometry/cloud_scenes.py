@@ -1,4 +1,4 @@
-"""Exact clouds: a room of six planes seen from inside, by directions in any number."""
+"""Exact clouds of a room with six planes, for any number of directions."""
 
 from __future__ import annotations
 

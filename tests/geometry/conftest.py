@@ -1,4 +1,4 @@
-"""What the geometry tests share: golden cases and exact scenes, loaded without a package."""
+"""Fixtures of the geometry tests: golden cases and exact scenes, loaded without a package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Eq. (1) and Eq. (2) worked by hand; each check takes the module under test."""
+"""Manual results of Eq. (1) and Eq. (2); each check takes the module under test."""
 
 from __future__ import annotations
 

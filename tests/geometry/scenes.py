@@ -1,4 +1,4 @@
-"""Exact scenes: planes seen by a pinhole camera, and sets of patches."""
+"""Exact scenes: planes in a pinhole camera, and sets of patches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether to believe a transform, by hand: one case on each side of every threshold."""
+"""Tests of the acceptance of a transform on both sides of every threshold."""
 
 from __future__ import annotations
 

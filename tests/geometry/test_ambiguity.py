@@ -1,4 +1,4 @@
-"""Ambiguity: motions that leave a room's planes in themselves, and planes that count the same."""
+"""Tests of ambiguity: motions along a room's planes, and planes that count as equal."""
 
 from __future__ import annotations
 

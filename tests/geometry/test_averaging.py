@@ -1,4 +1,4 @@
-"""The robust average of poses: by hand, and what it must not depend on."""
+"""Tests of the robust average of poses, and of its invariances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells of views, by hand and against one point after the other."""
+"""Tests of the fusion of cells against manual results and a loop over points."""
 
 from __future__ import annotations
 

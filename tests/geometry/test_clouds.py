@@ -1,4 +1,4 @@
-"""Which points of a cloud are looked at, and the axes that turn with it."""
+"""Tests of the selection of points of a cloud, and of rotated axes."""
 
 from __future__ import annotations
 

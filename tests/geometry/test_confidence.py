@@ -1,4 +1,4 @@
-"""The confidence of a pose: by hand, monotone, and with a reason."""
+"""Tests of the confidence of a pose: values, monotonicity and reasons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Consensus: by hand, against numpy, and the motion found among wrong correspondences."""
+"""Tests of the consensus against NumPy, and among wrong correspondences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two halves at once: where a core is free, and never more than there are."""
+"""Tests that two halves run in parallel only on free cores."""
 
 from __future__ import annotations
 

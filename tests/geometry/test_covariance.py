@@ -1,4 +1,4 @@
-"""Covariances: transported, by definition, free where nothing holds, and of the right size."""
+"""Tests of covariances: transport, definition, free directions and magnitude."""
 
 from __future__ import annotations
 

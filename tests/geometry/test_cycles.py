@@ -1,4 +1,4 @@
-"""Loops of edges against a naive oracle, and wrong edges among right ones."""
+"""Tests of cycles of edges against a simple search, and of wrong edges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masking and halving of depth images, worked by hand."""
+"""Tests of the masking and halving of depth images against manual results."""
 
 from __future__ import annotations
 

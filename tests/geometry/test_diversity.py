@@ -1,4 +1,4 @@
-"""The k-DPP: Eq. (3) by hand, greedy steps against determinants, and what it is there for."""
+"""Tests of the k-DPP: Eq. (3), greedy steps against determinants, and its purpose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Eq. (2), its normalisation and its storage."""
+"""Tests of Eq. (2), its normalisation and its storage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What depends on one frame is worked out once, and forgotten with the frame."""
+"""Tests that results of one frame are computed once, and dropped with the frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gravity: what tilts is impossible, what is level is found as before, and a wrong `up` is told."""
+"""Tests of gravity: tilted poses are rejected, level ones stay, and a wrong `up` is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Levels of the hierarchy: counts, unions, and what coarsening must not change."""
+"""Tests of hierarchy levels: counts, unions and invariants of coarsening."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The consensus of associations: known transforms, planted outliers, and where there is none."""
+"""Tests of the consensus of associations: known transforms, outliers and rejection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is kept of compiled kernels: nothing that was made of something else than what is there."""
+"""Tests that compiled kernels are reused only for the code they were compiled from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Correspondences against sorting all of them."""
+"""Tests of correspondences against a full sort."""
 
 from __future__ import annotations
 

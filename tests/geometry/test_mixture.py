@@ -1,4 +1,4 @@
-"""The Gaussian mixture against scipy, scikit-learn and the theorem of EM."""
+"""Tests of the Gaussian mixture against SciPy, scikit-learn and the theorem of EM."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Neighbours against all pairs, and planes against numpy."""
+"""Tests of neighbours against all pairs, and of planes against NumPy."""
 
 from __future__ import annotations
 

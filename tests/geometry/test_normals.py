@@ -1,4 +1,4 @@
-"""The plane fit in inverse depth, against exact planes, a sphere and a naive oracle."""
+"""Tests of plane fits in inverse depth against planes, a sphere and a simple loop."""
 
 from __future__ import annotations
 

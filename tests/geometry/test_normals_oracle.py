@@ -1,4 +1,4 @@
-"""The two-pass fit against lstsq, pixel by pixel, in double precision."""
+"""Tests of the two-pass fit against lstsq for each pixel, in double precision."""
 
 from __future__ import annotations
 

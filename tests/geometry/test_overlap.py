@@ -1,4 +1,4 @@
-"""Overlap of two surfaces: by hand, and against a loop that reads like the definition."""
+"""Tests of the overlap of two surfaces against manual results and the definition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Patch descriptors: by hand, against another formula, and what must not change them."""
+"""Tests of patch descriptors against another formula, and of their invariances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which patch a point lies on: against a search one by one, and against a segmentation."""
+"""Tests of the patch of a point against a linear search and a segmentation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plans of scans: which way is up, how high, and where one lies on the other."""
+"""Tests of plans of scans: up, height and relative pose."""
 
 from __future__ import annotations
 

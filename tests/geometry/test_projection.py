@@ -1,4 +1,4 @@
-"""The learnt subspace: whitening, signs, independence."""
+"""Tests of the learnt subspace: whitening, signs and independence."""
 
 from __future__ import annotations
 

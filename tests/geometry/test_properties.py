@@ -1,4 +1,4 @@
-"""Eq. (1): by hand, against the letter of the paper, and under rigid motion."""
+"""Tests of Eq. (1) against manual results and the paper, and under rigid motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quaternions against SciPy, where they are easy and where they are not."""
+"""Tests of quaternions against SciPy, including degenerate cases."""
 
 from __future__ import annotations
 

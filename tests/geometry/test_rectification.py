@@ -1,4 +1,4 @@
-"""Undistortion and range to z, against a point-by-point oracle and known planes."""
+"""Tests of undistortion and of ranges along rays against a simple loop and known planes."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Refinement: one step by hand and by matrices, where it converges to, and where it gives up."""
+"""Tests of refinement: single steps, convergence and failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Distances of bytes, exact, against the obvious loop; rankings against a full sort."""
+"""Tests of distances against a simple loop, and of rankings against a full sort."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rigid transforms: against numpy and scipy, where they are hard, and where they are degenerate."""
+"""Tests of rigid transforms against NumPy and SciPy, including degenerate cases."""
 
 from __future__ import annotations
 

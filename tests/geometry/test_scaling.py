@@ -1,4 +1,4 @@
-"""Every length is known to be one, and a larger world under longer lengths is the same."""
+"""Tests that all lengths scale together: a scaled world gives the same results."""
 
 from __future__ import annotations
 

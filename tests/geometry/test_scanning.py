@@ -1,4 +1,4 @@
-"""The loops behind the distances: the integers of the oracle."""
+"""Tests of the distance kernels against exact integers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Segmentation of exact scenes, and the sums over its patches."""
+"""Tests of the segmentation of exact scenes, and of sums over patches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sequences of neighbours and their alignment: against an oracle, and under rigid motion."""
+"""Tests of the alignment of neighbour sequences, and of its invariance to rigid motion."""
 
 from __future__ import annotations
 

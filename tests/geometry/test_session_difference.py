@@ -1,4 +1,4 @@
-"""Two sessions compared, by hand: a box before a wall that comes, goes, or stays."""
+"""Tests of session differences: a box in front of a wall that appears, disappears or stays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Range images: exact on planes, cropped to what is seen, gaps closed and edges kept."""
+"""Tests of range images: exact planes, cropping, closed gaps and preserved edges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points spread over what a scan shows: which are kept, and what works on them."""
+"""Tests of points that are spread over a scan, and of their use."""
 
 from __future__ import annotations
 

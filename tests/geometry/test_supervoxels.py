@@ -1,4 +1,4 @@
-"""Voxels and supervoxels of an exact room: normals, connection, gaps, order, turning."""
+"""Tests of voxels and supervoxels of a room: normals, connections, gaps, order and rotation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Counting pairs in the 4-D table, against invariants computed pair by pair."""
+"""Tests of pair counts in the 4-D table against separate invariants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table's signatures against exact ones, over rooms of random patches."""
+"""Tests of signatures from the table against exact signatures of random rooms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Traces: every point judged as the counts say, patches that coincide, and overlays."""
+"""Tests of traces: residuals of points, coinciding patches and overlays."""
 
 from __future__ import annotations
 

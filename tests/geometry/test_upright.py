@@ -1,4 +1,4 @@
-"""Which way is up, and in which units: rooms and halls of ours, turned all ways."""
+"""Tests of the estimated up direction and units of rotated rooms and halls."""
 
 from __future__ import annotations
 

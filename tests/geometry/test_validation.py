@@ -1,4 +1,4 @@
-"""Validation of whole frames: what must hold whatever its thresholds are."""
+"""Tests of the validation of whole frames, independent of its thresholds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Validation of clouds: scans about a viewpoint, clouds without one, and depth beside either."""
+"""Tests of the validation of clouds with and without a viewpoint, and of depth images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of a surface: what they show, where they are taken from, and what they cover."""
+"""Tests of views of a surface: content, viewpoints and coverage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights of patches: by hand, and for what they are there."""
+"""Tests of patch weights: values and purpose."""
 
 from __future__ import annotations
 

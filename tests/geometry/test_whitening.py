@@ -1,4 +1,4 @@
-"""The whitened signature: against numpy's own arithmetic, and what whitening promises."""
+"""Tests of whitened signatures against NumPy, and of their covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Validation worked by hand, on scenes of a few points; each check takes the module under test."""
+"""Manual results of validation on small scenes; each check takes the module under test."""
 
 from __future__ import annotations
 

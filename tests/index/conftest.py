@@ -1,4 +1,4 @@
-"""What the index tests share: signatures of walks through a place that does not exist."""
+"""Fixtures of the index tests: signatures of walks through a synthetic place."""
 
 from __future__ import annotations
 

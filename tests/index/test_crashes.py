@@ -1,4 +1,4 @@
-"""Builders that are killed or run beside others, and readers that do not care."""
+"""Tests of builders that are killed or run in parallel, and of concurrent readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damage: no changed or shortened file is ever used; the version before is, or none."""
+"""Tests that a damaged file is never used, but an older version or none."""
 
 from __future__ import annotations
 

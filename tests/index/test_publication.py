@@ -1,4 +1,4 @@
-"""Versions of an index: appended, merged, cleaned, and opened again as they were."""
+"""Tests of publication: appending, merging, removal, and reopening."""
 
 from __future__ import annotations
 

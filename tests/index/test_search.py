@@ -1,4 +1,4 @@
-"""Search: exact where it says so, against a naive oracle, whatever may be found."""
+"""Tests of exact search against a simple loop, with and without filters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Segments: appended and merged, never all written anew; searched as one, whatever they hold."""
+"""Tests of segments: appending, merging, and search over all of them."""
 
 from __future__ import annotations
 

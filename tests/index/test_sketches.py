@@ -1,4 +1,4 @@
-"""The sketches of a large map: exact where it says so, and what they miss is measured."""
+"""Tests of the sketches of a large map: exact parts, and measured recall."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lengths of the answer belong to the model: none stands in the code that judges poses."""
+"""Tests that the model holds all lengths of answers, and the code none."""
 
 from __future__ import annotations
 

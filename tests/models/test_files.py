@@ -1,4 +1,4 @@
-"""Model files: what is read is what was written, and damage is noticed."""
+"""Tests of model files: round trips and damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The groups that came later: absent where they are as usual, and then no part of the id."""
+"""Tests of optional parameter groups, which leave the id unchanged at their defaults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pair table on disk: built once, mapped afterwards, never trusted blindly."""
+"""Tests of the pair table on disk: built once, memory-mapped, and verified."""
 
 from __future__ import annotations
 

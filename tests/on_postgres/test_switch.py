@@ -1,4 +1,4 @@
-"""What leads tests to PostgreSQL does so: one database for each data folder, as with a file."""
+"""Tests of the switch to PostgreSQL: one database for each data folder."""
 
 from __future__ import annotations
 

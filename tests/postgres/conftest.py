@@ -1,4 +1,4 @@
-"""What the tests of PostgreSQL alone share: stores on it, and waiting for what comes."""
+"""Fixtures of the PostgreSQL tests: stores, and waits for conditions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An asynchronous standby is promoted: what it had not received is gone, and nothing else."""
+"""Tests of the promotion of an asynchronous standby, which loses only what it had not received."""
 
 from __future__ import annotations
 

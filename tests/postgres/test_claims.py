@@ -1,4 +1,4 @@
-"""Claims that wait for no turn, beside all that else happens to a job: who is first, counts."""
+"""Tests of claims of jobs without a lock, in competition with other changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transactions of PostgreSQL that are in each other's way, and servers that are set otherwise."""
+"""Tests of conflicting transactions, and of unusual server settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The primary is killed and its standby promoted, under a service and a worker at work."""
+"""Tests of a failover to the standby under a working service and worker."""
 
 from __future__ import annotations
 

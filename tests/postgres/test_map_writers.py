@@ -1,4 +1,4 @@
-"""Writers of single maps on PostgreSQL: whom they wait for, and the numbers of their events."""
+"""Tests of writers of single maps: their locks, and the numbers of their events."""
 
 from __future__ import annotations
 

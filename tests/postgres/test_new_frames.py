@@ -1,4 +1,4 @@
-"""New frames of several maps, taken by one statement, and those of many threads together."""
+"""Tests of new frames of several maps in one statement, from many threads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A drill: a map is deleted by mistake, and the fleet's database goes back to the moment before."""
+"""Tests of a recovery to the moment before an accidental deletion."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Blobs of a fleet that are removed after the turn: nobody waits for the object store, and nothing
-that is acknowledged goes with them.
-"""
+"""Tests of the removal of blobs, which blocks no writer and keeps acknowledged data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What takes one statement on PostgreSQL leaves what several statements leave."""
+"""Tests that single statements on PostgreSQL have the effect of several statements."""
 
 from __future__ import annotations
 

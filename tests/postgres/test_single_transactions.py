@@ -1,4 +1,4 @@
-"""A transaction of one statement: one round trip, in its turn, and all of it or nothing."""
+"""Tests of transactions of one statement: one round trip, in order, and atomic."""
 
 from __future__ import annotations
 

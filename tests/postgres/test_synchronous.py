@@ -1,4 +1,4 @@
-"""A commit counts when its standby has it: no time limit and no hand makes it count before."""
+"""Tests that a commit counts only once its standby has it."""
 
 from __future__ import annotations
 

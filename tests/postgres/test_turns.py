@@ -1,4 +1,4 @@
-"""A writer's turn on PostgreSQL: what is seen when it comes, and what it costs."""
+"""Tests of a writer's lock on PostgreSQL: visible data, and cost."""
 
 from __future__ import annotations
 

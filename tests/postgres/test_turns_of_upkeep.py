@@ -1,4 +1,4 @@
-"""Whom workers keep waiting: what they do with one map leaves the writers of others alone."""
+"""Tests that workers on one map do not block writers of other maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wakeup by NOTIFY: workers of any host wake up, and no failure harms the sender."""
+"""Tests of wakeup by NOTIFY on all hosts, and of its failures."""
 
 from __future__ import annotations
 

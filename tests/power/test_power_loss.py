@@ -1,6 +1,6 @@
-"""The order of our own fsyncs: whatever a loss of power drops, what was promised is there.
+"""Tests of the order of fsyncs: no power failure loses acknowledged data.
 
-SQLite's files are SQLite's business (synchronous = FULL); here are blobs and the index.
+The tests cover blobs and indexes; SQLite protects its own files (synchronous = FULL).
 """
 
 from __future__ import annotations

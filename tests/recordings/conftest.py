@@ -1,4 +1,4 @@
-"""What tests of recordings have in common: a drive, and what a camera sees on it."""
+"""Fixtures of the recording tests: a drive, and its camera images."""
 
 from __future__ import annotations
 

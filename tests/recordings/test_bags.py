@@ -1,4 +1,4 @@
-"""Bags in all containers and encodings: the same poses and samples as the folder they came from."""
+"""Tests that bags in all containers and encodings give the poses and samples of the folder."""
 
 from __future__ import annotations
 

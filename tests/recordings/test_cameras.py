@@ -1,4 +1,4 @@
-"""Cameras of recordings: the camera info of the time of each frame, and the unit of depth."""
+"""Tests of cameras in recordings: the camera info at each frame, and the unit of depth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that take a bag: what they say, and that they do as with the folder it was made of."""
+"""Tests that commands treat a bag like the folder that it was written from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged bags: only stated errors, in bounded time and memory."""
+"""Tests of damaged bags: only documented errors, in bounded time and memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bag made of redkitchen: the same poses and samples as the folder, in every container."""
+"""Tests of a bag of redkitchen in every container against the folder."""
 
 from __future__ import annotations
 

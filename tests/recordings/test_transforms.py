@@ -1,4 +1,4 @@
-"""Recordings whose clock or transforms go wrong: nothing wrong is taken, and the note says why."""
+"""Tests of recordings with faults in the clock or the transforms."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A drive through a room as topics carry it, a service with a map of it, and a stand-in for rclpy.
+"""Fixtures of the node tests: a drive as topics, a service with its map, and a stand-in for rclpy.
 
-Messages are made by rosbags, go through their bytes, and come out as rosbags reads them.
+rosbags creates, serialises and reads the messages.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The node over a stand-in for rclpy: topics, parameters, and what it publishes through its bytes.
+"""Tests of the node with a stand-in for rclpy: topics, parameters and published messages.
 
-What the real rclpy does is not tried here.
+The real rclpy is not tested here.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The core of the node: messages through their bytes in, transforms and poses out."""
+"""Tests of the node's logic, from serialised messages to transforms and poses."""
 
 from __future__ import annotations
 

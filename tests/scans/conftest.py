@@ -1,4 +1,4 @@
-"""Files of points, written by hand as their formats say, byte for byte."""
+"""Fixtures of the scan tests: files of points, written byte by byte as their formats specify."""
 
 from __future__ import annotations
 

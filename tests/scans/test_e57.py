@@ -1,4 +1,4 @@
-"""E57 files that the reference implementation writes, read back by ours; and damaged ones."""
+"""Tests of E57 files of the reference implementation, and of damaged files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One cloud in every format: the same points, told apart by their first bytes."""
+"""Tests that all formats give the same points, and are recognised by their first bytes."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Damaged files of every format: a frame error or points, and never more memory than they are."""
+"""Tests of damaged files of every format, which raise frame errors in bounded memory."""
 
 import io
 import random

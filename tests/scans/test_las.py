@@ -1,4 +1,4 @@
-"""LAS by its description, LAZ beside another reader and writer."""
+"""Tests of LAS against its description, and of LAZ against another library."""
 
 import builtins
 import io

@@ -1,4 +1,4 @@
-"""PCD: its header, its compression, its viewpoint."""
+"""Tests of the header, compression and viewpoint of PCD files."""
 
 import struct
 import tracemalloc

@@ -1,4 +1,4 @@
-"""PLY: what its header may say, and what it may not."""
+"""Tests of valid and invalid headers of PLY files."""
 
 import struct
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""PointCloud2 as ROS 2 serialises it: by rosbags, read by us; damaged, in bounded memory."""
+"""Tests of serialised PointCloud2 messages, valid and damaged."""
 
 from __future__ import annotations
 

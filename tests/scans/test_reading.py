@@ -1,4 +1,4 @@
-"""The door: units, viewpoints, missing points, limits, thinning."""
+"""Tests of units, viewpoints, missing points, limits and thinning of clouds."""
 
 import struct
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Files of whole maps that other programs write, read back; broken and hostile ones refused."""
+"""Tests of whole maps from other programs, and of damaged and hostile files."""
 
 from __future__ import annotations
 

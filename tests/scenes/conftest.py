@@ -1,4 +1,4 @@
-"""A reader of scenes, a real service with a map, and a way to run commands."""
+"""Fixtures of the viewer tests: a reader of scenes, a service with a map, and a command runner."""
 
 from __future__ import annotations
 

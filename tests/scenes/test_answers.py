@@ -1,4 +1,4 @@
-"""What of an answer is placed where, against the service's own records and clouds."""
+"""Tests of scenes of answers against the service's records and clouds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Outlines and colours, by hand."""
+"""Tests of outlines and colours against manual results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes that commands write, read again and held against what the commands print."""
+"""Tests of the scenes that commands write against their output."""
 
 from __future__ import annotations
 

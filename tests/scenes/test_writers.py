@@ -1,4 +1,4 @@
-"""Scenes written, and read again by Rerun: not by the library that wrote them."""
+"""Tests of written scenes, which Rerun reads back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the service tests share: real servers in process groups of their own, frames, requests."""
+"""Fixtures of the service tests: servers in separate process groups, frames and requests."""
 
 from __future__ import annotations
 

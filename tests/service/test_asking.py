@@ -1,4 +1,4 @@
-"""Asking over HTTP: the same options in JSON, in a form and beside a bare frame; and refusals."""
+"""Tests of query options over HTTP in JSON, in forms and beside a bare frame."""
 
 from __future__ import annotations
 

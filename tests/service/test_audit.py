@@ -1,4 +1,4 @@
-"""Every operation that changes something writes its lines of the audit log."""
+"""Tests that every operation that changes data writes to the audit log."""
 
 from __future__ import annotations
 

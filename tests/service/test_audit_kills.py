@@ -1,5 +1,4 @@
-"""Changes, events and lines of the audit log stay together when a service is killed or its disk is
-full."""
+"""Tests that changes, events and audit entries stay consistent after kills and on a full disk."""
 
 from __future__ import annotations
 

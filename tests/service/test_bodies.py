@@ -1,4 +1,4 @@
-"""Bodies: forms that are none, bodies that are too large, and callers that hang up."""
+"""Tests of invalid forms, bodies that are too large, and aborted requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Point clouds over HTTP: beside depth images in one map, into it, out of it, and refused."""
+"""Tests of point clouds over HTTP: upload, query, download, and errors."""
 
 from __future__ import annotations
 

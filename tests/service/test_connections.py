@@ -1,6 +1,6 @@
-"""Connections and bodies of callers that keep us waiting: uvicorn with our limits, and a small app.
+"""Tests of slow connections and bodies: uvicorn with our limits, and a small application.
 
-The limits are made short; nothing is timed: each test waits until the other side has acted.
+The limits are short. Tests wait for the other side to act, and measure no times.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The dashboard's files on the wire; tests/dashboard has what they make of a browser."""
+"""Tests of the dashboard's files over HTTP; tests/dashboard tests them in a browser."""
 
 from __future__ import annotations
 

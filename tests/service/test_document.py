@@ -1,4 +1,4 @@
-"""The OpenAPI document; every other test's answers are held to it by `promised`."""
+"""Tests of the OpenAPI document, to which `promised` holds the answers of all other tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Event streams: one poller, streams that are far behind, silence, and the end."""
+"""Tests of event streams: polling, lagging streams, silence and shutdown."""
 
 from __future__ import annotations
 

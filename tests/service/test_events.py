@@ -1,4 +1,4 @@
-"""Events over HTTP: as a stream that goes on where it broke, and as pages; who sees which."""
+"""Tests of events over HTTP, as resumable streams and as pages, by permission."""
 
 from __future__ import annotations
 

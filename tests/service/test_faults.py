@@ -1,4 +1,4 @@
-"""Faults of the machine under a running service: told without its secrets, and got over."""
+"""Tests of machine faults under a running service, reported without secrets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures over HTTP: of several processes together; and the ids of requests in all that is said."""
+"""Tests of statistics over several processes, and of request ids in all answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filters and `if_novel` over HTTP, as a form and as JSON; refusals name the field."""
+"""Tests of filters and `if_novel` over HTTP, in forms and JSON; errors name the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names and places of frames over HTTP: in forms, in the query string, in lists and in imports."""
+"""Tests of frame names and sequence numbers in forms, query strings, lists and imports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gate: a few at once, some wait, not for ever, and the rest is sent away."""
+"""Tests of the gate: a few requests run, some wait for a limited time, and others are rejected."""
 
 from __future__ import annotations
 

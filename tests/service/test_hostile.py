@@ -1,4 +1,4 @@
-"""A machine that misbehaves under a running service: it answers what it can, and loses nothing."""
+"""Tests of a service on a faulty machine, which still answers and loses no data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are missing, damaged or of another version, under processes that need them."""
+"""Tests of missing, damaged and mismatched files under running processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A service for its own machine alone is not reached through another's page or name."""
+"""Tests that pages and names of other hosts cannot reach a local service."""
 
 from __future__ import annotations
 

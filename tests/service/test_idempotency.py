@@ -1,4 +1,4 @@
-"""Idempotency keys: whether a repeated request is the same one."""
+"""Tests of idempotency keys, which identify repeated requests."""
 
 from __future__ import annotations
 

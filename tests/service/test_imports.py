@@ -1,4 +1,4 @@
-"""Archives over HTTP: at the door, while they are imported, and when workers die over them."""
+"""Tests of archives over HTTP: checks, imports, and dying workers."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A key for one map learns nothing of another: every operation of the document, one by one.
+"""Tests that a key for one map reveals nothing about other maps, for every operation.
 
-What is not the key's is answered, to the byte, as what is not there: the id of the request and the
-name that was asked for apart. A route that is in no list here fails the test.
+For objects without permission the answer equals that for missing objects, except the request id
+and the requested name. A route that is in no list of this file fails the test.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The priority of an upload over HTTP."""
+"""Tests of the priority of an upload over HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sessions of two robots in one room, each in a frame of its own, become one map when joined."""
+"""Tests of two robots' sessions in separate parent frames that are joined to one map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keys: asked for beyond this machine, made by a command, and stored nowhere."""
+"""Tests of keys: required for remote callers, created by a command, and stored as hashes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Service and worker killed at random moments of an upload run: nothing is lost."""
+"""Tests that kills of service and worker during uploads lose no data."""
 
 from __future__ import annotations
 

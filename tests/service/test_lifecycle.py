@@ -1,4 +1,4 @@
-"""A command that serves, from its first line to its last: signals, deaths, and what cannot be."""
+"""Tests of the serve command from start to end: signals, crashes and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a service tells of a map to who copies it, on both databases."""
+"""Tests of the copies of a map that a service sends, on both databases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps and frames over HTTP: made, sent, listed, deleted, against a running server."""
+"""Tests of maps and frames over HTTP: creation, upload, lists and deletion."""
 
 from __future__ import annotations
 

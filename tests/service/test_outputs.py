@@ -1,4 +1,4 @@
-"""Frames out and edited over HTTP: what the headers promise, and how it is refused."""
+"""Tests of downloads and edits of frames over HTTP: headers and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""More at once than can be worked on: some wait, the rest are asked to come back."""
+"""Tests of overload: some requests wait, and others receive Retry-After."""
 
 from __future__ import annotations
 

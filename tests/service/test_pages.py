@@ -1,4 +1,4 @@
-"""Pages of lists: written by the thread that made them, as pydantic writes them in one go."""
+"""Tests of pages of lists, which must equal pydantic's output."""
 
 from __future__ import annotations
 

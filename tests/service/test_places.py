@@ -1,6 +1,6 @@
-"""What is read of a request and when: nothing before its key and its place, and never too much.
+"""Tests of when a request is read: not before its key and its place, and within limits.
 
-The application runs in this process, and a test hands it the body piece by piece.
+The application runs in this process, and a test sends the body in pieces.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Points over HTTP: typed, tagged, bounded, refused as all else."""
+"""Tests of points over HTTP: type, ETag, limits and errors."""
 
 from __future__ import annotations
 

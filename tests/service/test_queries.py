@@ -1,4 +1,4 @@
-"""Queries over HTTP: found with the right pose, told as they were asked, the same every time."""
+"""Tests of queries over HTTP: pose, stored options and repeatability."""
 
 from __future__ import annotations
 

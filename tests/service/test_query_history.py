@@ -1,6 +1,6 @@
-"""The history of queries over HTTP: what each leaves, who may list it, and what leaves none.
+"""Tests of the query history over HTTP: records, permissions and exceptions.
 
-On both databases; a service without workers, whose jobs are done here.
+They run on both databases, and execute the jobs in this process.
 """
 
 from __future__ import annotations

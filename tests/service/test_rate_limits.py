@@ -1,4 +1,4 @@
-"""Buckets of tokens, against arithmetic by hand, with a clock of the test's."""
+"""Tests of token buckets with a controlled clock."""
 
 from __future__ import annotations
 

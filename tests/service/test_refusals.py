@@ -1,4 +1,4 @@
-"""What the service refuses, and how it says so: a table of requests that cannot be served."""
+"""Tests of rejected requests and their problem documents, as a table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Stored queries repeated with the same options or others, without uploading the file again."""
+"""Tests of stored queries that are repeated without another upload, with the same or other
+options.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Security of the service: headers, origins, proxies, rate limits, and keys."""
+"""Tests of headers, origins, proxies, rate limits and keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several frames asked at once, over HTTP."""
+"""Tests of queries with several frames over HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The socket that is listened on, and TLS on it."""
+"""Tests of the listening socket, and of TLS."""
 
 from __future__ import annotations
 

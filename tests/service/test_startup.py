@@ -1,4 +1,4 @@
-"""While the application is loaded: what is answered at once, and what waits."""
+"""Tests of requests while the application loads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stored results over HTTP: for callers who may read every map of the query."""
+"""Tests of stored results over HTTP, which require access to every map of the query."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Tenants of one service: quotas that only the operator sets, retention, deletion for good.
+"""Tests of tenants: quotas that only operators set, retention and permanent deletion.
 
-On both databases, over HTTP with keys; a service without workers, whose jobs are done here.
+They use HTTP with keys on both databases, and execute the jobs in this process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tenants: two keys of one are counted as one, whatever headers say, and another works on."""
+"""Tests that keys of one tenant share its limits, and other tenants are not affected."""
 
 from __future__ import annotations
 

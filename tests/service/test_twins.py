@@ -1,6 +1,7 @@
-"""Two stores with the same map, in one of which much happens in others: a key for the map that
-both have is told the same by either, but for times and for what is drawn by chance. And a third
-one, on another database.
+"""Tests that activity in other maps is invisible to a key for one map.
+
+Two stores have the same map, and one has many changes in other maps. The answers must be equal
+except times and random values. A third store uses another database.
 """
 
 from __future__ import annotations

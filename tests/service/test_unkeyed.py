@@ -1,4 +1,4 @@
-"""What anybody may ask for without a key costs the service next to nothing, however often."""
+"""Tests that requests without a key cost little."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uploads under an id, as bodies, under a key, in batches."""
+"""Tests of uploads under an id, as bodies, with idempotency keys and in batches."""
 
 from __future__ import annotations
 

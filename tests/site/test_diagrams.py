@@ -1,4 +1,4 @@
-"""Diagrams from text: what is read, where nodes are put, what is drawn."""
+"""Tests of diagrams: parsing, layout and SVG."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages made from the code: everything is on them, once, as the code has it."""
+"""Tests that the generated pages describe all of the code, once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built site: no warning, no dead link, nothing from another host; searched in a browser."""
+"""Tests of the built site: warnings, links, external content, and search in a browser."""
 
 from __future__ import annotations
 

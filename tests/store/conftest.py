@@ -1,4 +1,4 @@
-"""What the store tests share: an opened store, jobs to claim, and processes that race."""
+"""Fixtures of the store tests: an open store, jobs to claim, and racing processes."""
 
 from __future__ import annotations
 

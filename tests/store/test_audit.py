@@ -1,4 +1,4 @@
-"""The audit log: a line for each event, in its transaction; what is kept, found and refused."""
+"""Tests of the audit log: entries in the transaction of their event, retention and filters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blobs: what is put is what comes back, or an error."""
+"""Tests of blobs: round trips and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lists of frames and of sessions, against plain Python over random metadata."""
+"""Tests of lists of frames and sessions against plain Python with random metadata."""
 
 from __future__ import annotations
 

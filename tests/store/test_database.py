@@ -1,4 +1,4 @@
-"""The database: its schema, what it refuses to open, and what its transactions promise."""
+"""Tests of the schema, of rejected databases, and of transactions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events: which are told, in which order, and which are removed."""
+"""Tests of the order and the removal of events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which frames pass a filter, in the database; tests/engine/test_filters.py has the oracle."""
+"""Tests of filters in the database; tests/engine/test_filters.py compares them with Python."""
 
 from __future__ import annotations
 

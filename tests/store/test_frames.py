@@ -1,4 +1,4 @@
-"""Frames, signatures and keys as rows: what is there, what is gone, and who learns of it."""
+"""Tests of rows of frames, signatures and keys, and of notifications."""
 
 from __future__ import annotations
 

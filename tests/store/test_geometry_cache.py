@@ -1,4 +1,4 @@
-"""Decoded artifacts in memory: what they hold, in which bounds, and that they go when they must."""
+"""Tests of the cache of decoded artifacts: content, limits and eviction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A database that may be read and not written: read rightly, or not at all."""
+"""Tests of read-only databases, which are read correctly or not at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The queue: how jobs end, are tried again, are given up and given back."""
+"""Tests of the ends of jobs: success, retries, failure and return to the queue."""
 
 from __future__ import annotations
 

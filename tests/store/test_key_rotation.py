@@ -1,4 +1,4 @@
-"""Which secret of a key opens it, and when a key was last used."""
+"""Tests of the valid secrets of a key, and of the time of its last use."""
 
 from __future__ import annotations
 

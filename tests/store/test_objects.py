@@ -1,4 +1,4 @@
-"""Object stores by URL: what is refused, what is said of a store that is away, and how soon."""
+"""Tests of object stores by URL: invalid URLs, unreachable stores and timeouts."""
 
 from __future__ import annotations
 

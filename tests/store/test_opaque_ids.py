@@ -1,4 +1,4 @@
-"""Opaque ids: only the store that made one can read it, and it reveals nothing."""
+"""Tests of opaque ids, which only their store can decode and which reveal nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parent frames joined and parted again: poses by hand, and exactly as they were sent at last."""
+"""Tests of joined and separated parent frames, which finally have their original poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The queue: who gets which job, for how long, and what becomes of it."""
+"""Tests of claims and leases of jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many workers at one queue: threads of one process, and processes."""
+"""Tests of many workers at one queue, as threads and as processes."""
 
 from __future__ import annotations
 

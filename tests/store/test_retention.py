@@ -1,4 +1,4 @@
-"""Which events go, and which stay: by map, whatever happens in the others."""
+"""Tests of event retention, which is independent for each map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A store that a later version migrates while a process of this version has it open."""
+"""Tests of a store that a later version migrates while this version has it open."""
 
 from __future__ import annotations
 

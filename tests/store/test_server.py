@@ -1,4 +1,4 @@
-"""A database on a server: its schema, its turns, its readers, and what SQLite is not asked."""
+"""Tests of a database server: schema, locks, readers, and statements that SQLite does not need."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a server's faults mean: of which kind they are, what is said, and never the password."""
+"""Tests of the errors for server faults, which never contain the password."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blobs of a fleet: whose a prefix is, and who may remove what another is about to refer to."""
+"""Tests of shared blobs: ownership of a prefix, and removal beside new references."""
 
 from __future__ import annotations
 

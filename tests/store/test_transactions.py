@@ -1,4 +1,4 @@
-"""Transactions: what every connection is set to, and what reading and writing promise."""
+"""Tests of connection settings, and of the guarantees of transactions."""
 
 from __future__ import annotations
 

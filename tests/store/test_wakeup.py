@@ -1,4 +1,4 @@
-"""Wakeup by FIFOs: waiting workers wake up, and nothing wrong with a FIFO harms the sender."""
+"""Tests of wakeup by FIFOs, whose faults do not affect the sender."""
 
 from __future__ import annotations
 

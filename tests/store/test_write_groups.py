@@ -1,4 +1,4 @@
-"""Writers that come together are committed together, and one that fails fails alone."""
+"""Tests of writers that are committed together, and fail separately."""
 
 from __future__ import annotations
 

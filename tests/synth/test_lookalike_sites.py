@@ -1,4 +1,4 @@
-"""Sites that look like themselves or like another: the same each time, and as alike as they say."""
+"""Tests of ambiguous sites: reproducibility and similarity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scanned sites that are mistaken: the same each time, and as alike as they say."""
+"""Tests of laser scans of ambiguous sites: reproducibility and similarity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The spinning scanner: what it measures of a box, and at which angles."""
+"""Tests of the spinning scanner in a box: ranges and angles."""
 
 import math
 from dataclasses import replace

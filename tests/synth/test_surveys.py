@@ -1,4 +1,4 @@
-"""Synthetic sites scanned by a laser: one seed, one site; walkable, no wall crossed."""
+"""Tests of scanned sites: reproducible, walkable, and without paths through walls."""
 
 import hashlib
 

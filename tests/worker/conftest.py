@@ -1,4 +1,4 @@
-"""What the worker tests share: two worker processes, and frames that come slowly."""
+"""Fixtures of the worker tests: two worker processes, and frames that arrive slowly."""
 
 from __future__ import annotations
 

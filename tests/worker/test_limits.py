@@ -1,4 +1,4 @@
-"""What a worker may take, how it is told to stop, and what it leaves behind."""
+"""Tests of a worker's limits, its termination, and its remains."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers survive their input: frames that crash, hang, eat memory or break down are given up."""
+"""Tests that workers survive frames that crash, hang, or exhaust memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers as processes: each frame signed once, whatever becomes of disk, database and workers."""
+"""Tests of worker processes, which sign each frame once after faults of disk and database."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of fsck share: a data folder with something of every kind, and damage to it."""
+"""Fixtures of the fsck tests: a data folder with objects of every kind, and damage to it."""
 
 from __future__ import annotations
 

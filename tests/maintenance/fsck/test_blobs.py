@@ -1,4 +1,4 @@
-"""Blobs that are lost or damaged, and files that nobody needs: named, and repaired."""
+"""Tests of lost and damaged blobs, and of unreferenced files."""
 
 from __future__ import annotations
 

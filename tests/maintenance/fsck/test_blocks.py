@@ -1,4 +1,4 @@
-"""Frames are looked at in blocks, none of which costs more than the one before it."""
+"""Tests that frames are checked in blocks of constant cost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sceneprint fsck` as people use it: what it says, its exit codes, and beside a service."""
+"""Tests of `sceneprint fsck`: output, exit codes, and use beside a service."""
 
 from __future__ import annotations
 

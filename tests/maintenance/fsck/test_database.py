@@ -1,4 +1,4 @@
-"""The database itself: a flipped byte of it, and folders that are not there."""
+"""Tests of a damaged database file, and of missing folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Search indexes: a file that is damaged, and what differs from the database; both made again."""
+"""Tests of damaged indexes, and of indexes that differ from the database."""
 
 from __future__ import annotations
 

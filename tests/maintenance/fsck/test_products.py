@@ -1,4 +1,4 @@
-"""What a backup has beside frames: files of jobs, tiles, kept answers, and deletions."""
+"""Tests of files of jobs, tiles, kept answers and deletions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows and signatures that contradict each other or are damaged: named, and repaired."""
+"""Tests of damaged or contradictory rows and signatures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The check of a fleet's store on PostgreSQL: what is found there, and mended there."""
+"""Tests of the check and repair of a fleet's store on PostgreSQL."""
 
 from __future__ import annotations
 
