@@ -148,7 +148,7 @@ def test_fields_at_fault_are_told(scripted: Make) -> None:
 
 def test_another_kind_of_server(scripted: Make) -> None:
     for reply, message in (
-        ((404, {}, {"message": "nothing here"}), "answered 404 Not Found without saying why"),
+        ((404, {}, {"message": "nothing here"}), "answered 404 Not Found without a reason"),
         ((301, {"Location": "https://x/"}, None), "answered 301 Moved Permanently without"),
         ((200, {}, {"hello": "world"}), "is not one of this version"),
     ):

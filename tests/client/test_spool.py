@@ -206,7 +206,7 @@ def test_a_frame_is_there_once_and_survives(tmp_path: Path) -> None:
 
 def test_what_a_spool_cannot_take_is_refused(tmp_path: Path) -> None:
     with Spool(tmp_path / "spool", CHARGE) as spool:
-        with pytest.raises(InvalidRequest, match=r"takes 16384 bytes.*holds at most 8192"):
+        with pytest.raises(InvalidRequest, match=r"takes 16384 bytes.*limit of 8192"):
             spool.add(np.full((64, 64), 2000, np.uint16), meta())
         assert spool.add(depth(1), meta())
     with pytest.raises(InvalidRequest, match="above 0"):
@@ -306,7 +306,7 @@ def test_a_full_file_system_is_told_and_emptied_by_sync(
     assert ran.returncode == 0, ran.stderr
     told, counted, emptied, explained = ran.stdout.splitlines()
     assert told == (
-        f"{tmp_path}/spool: The disk has no room for the spool (database or disk is full), and "
+        f"{tmp_path}/spool: The disk has no room for the spool (database or disk is full); "
         "nothing was changed. Free some space, or upload frames: `sceneprint spool FILE --to MAP`."
     )
     taken = int(counted.split()[0])
