@@ -22,7 +22,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sceneprint.geometry.kernel import cached_per_frame, disjoint_kernel
+from sceneprint.geometry.kernel import cached_per_frame, disjoint_kernel, kernel
 from sceneprint.geometry.registration.icp import COARSE, QUICK, RefinementParameters, refine_all
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -250,48 +250,92 @@ def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
     the intersection of the two main families of planes, as along a corridor. n is at most 3 n_axes
     n_planes + 2 n_shifts.
     """
-    left = patches.areas.copy()
-    normals, mass = np.ascontiguousarray(patches.normals.T), np.empty(len(patches))
-    motions: list[Floats] = []
-    axes: list[Floats] = []
-    for _ in range(p.n_axes):
-        _sum_parallel(normals, left, math.cos(p.same_direction), mass)
+    motions = np.zeros((3 * p.n_axes * p.n_planes + 2 * p.n_shifts, 4, 4))
+    means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
+    found = _write_symmetries(
+        means, normals, patches.areas, p.n_axes, p.n_planes, math.cos(p.same_direction),
+        p.planes.same_plane, p.least_crossing, p.shift, p.n_shifts, motions,
+    )  # fmt: skip
+    return motions[:found]
+
+
+@kernel
+def _write_symmetries(
+    means: Floats, normals: Floats, areas: Floats, n_axes: int, n_planes: int, cosine: float,
+    same_plane: float, least_crossing: float, shift: float, n_shifts: int, motions: Floats,
+) -> int:  # fmt: skip
+    """Write the motions of `symmetries`, and return their number; means and normals (3, P)."""
+    left, mass, axes = areas.copy(), np.empty(len(areas)), np.zeros((n_axes + 2, 3))
+    found = 0
+    for number in range(n_axes):
+        _sum_parallel(normals, left, cosine, mass)
         most = int(np.argmax(mass))
         if left[most] <= 0:
             break
-        cosines = (patches.normals * patches.normals[most]).sum(axis=1)
-        across = np.abs(cosines) > math.cos(p.same_direction)
-        signed = np.sign(cosines) * patches.areas * across
-        axis = (patches.normals * signed[:, None]).sum(axis=0)
-        axis /= np.linalg.norm(axis)
-        axes.append(axis)
-        middles = _middles(patches, axis, np.where(across, left, 0.0), p)
-        motions += _turns(axis, middles)
-        left = np.where(across, 0.0, left)
-    if len(axes) > 1:
-        along = np.cross(axes[0], axes[1])
-        length = float(np.linalg.norm(along))
-        if length > p.least_crossing:
-            steps = p.shift * np.arange(1, p.n_shifts + 1)
-            shifts = np.tile(np.eye(4), (2 * p.n_shifts, 1, 1))
-            shifts[:, :3, 3] = along / length * np.concatenate([steps, -steps])[:, None]
-            motions += [*shifts]
-    return np.array(motions).reshape(-1, 4, 4)
+        axis, across = np.zeros(3), np.zeros(len(areas))
+        for i in range(len(areas)):
+            dot = 0.0
+            for k in range(3):
+                dot += normals[k, i] * normals[k, most]
+            if abs(dot) > cosine:
+                across[i], left[i] = left[i], 0.0
+                for k in range(3):
+                    axis[k] += normals[k, i] * areas[i] * np.sign(dot)
+        axis /= np.sqrt((axis * axis).sum())
+        found = _write_turns(means, across, axis, n_planes, same_plane, mass, motions, found)
+        axes[number] = axis
+    along = np.array([  # 0 without two axes
+        axes[0, 1] * axes[1, 2] - axes[0, 2] * axes[1, 1],
+        axes[0, 2] * axes[1, 0] - axes[0, 0] * axes[1, 2],
+        axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0],
+    ])  # fmt: skip
+    length = np.sqrt((along * along).sum())
+    if length > least_crossing:
+        for step in range(2 * n_shifts):
+            metres = shift * (step + 1) if step < n_shifts else -shift * (step + 1 - n_shifts)
+            motions[found] = np.eye(4)
+            motions[found, :3, 3] = along / length * metres
+            found += 1
+    return found
 
 
-def _middles(patches: Patches, axis: Floats, area: Floats, p: AmbiguityParameters) -> list[Floats]:
-    """Return the middles of the largest planes across an axis, of patches with positive area."""
-    offsets, mass = (patches.means * axis).sum(axis=1), np.empty(len(patches))
-    middles: list[Floats] = []
-    for _ in range(p.n_planes):
-        _sum_level(offsets, area, p.planes.same_plane, mass)
-        best = int(np.argmax(np.where(area > 0, mass, 0.0)))
-        if area[best] <= 0:
+@kernel
+def _write_turns(
+    means: Floats, areas: Floats, axis: Floats, n_planes: int, same_plane: float, mass: Floats,
+    motions: Floats, found: int,
+) -> int:  # fmt: skip
+    """Write quarter turns about the middles of the largest planes across an axis.
+
+    Planes consist of patches with an area, which is set to 0. Returns the number of motions with
+    the `found` that are there.
+    """
+    x, y, z = axis[0], axis[1], axis[2]
+    offsets, R = x * means[0] + y * means[1] + z * means[2], np.empty((3, 3))
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    for _ in range(n_planes):
+        _sum_level(offsets, areas, same_plane, mass)
+        best = int(np.argmax(np.where(areas > 0, mass, 0.0)))
+        if areas[best] <= 0:
             break
-        on_plane = (np.abs(offsets - offsets[best]) < p.planes.same_plane) & (area > 0)
-        middles.append(np.average(patches.means[on_plane], axis=0, weights=area[on_plane]))
-        area = np.where(on_plane, 0.0, area)
-    return middles
+        middle, total = np.zeros(3), 0.0
+        for i in range(len(areas)):
+            if abs(offsets[i] - offsets[best]) < same_plane and areas[i] > 0:
+                total += areas[i]
+                for k in range(3):
+                    middle[k] += means[k, i] * areas[i]
+                areas[i] = 0.0
+        middle /= total
+        for cosine, sine in ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)):
+            for a in range(3):
+                for b in range(3):
+                    R[a, b] = sine * cross[a, b] + (1.0 - cosine) * axis[a] * axis[b]
+                    R[a, b] += cosine if a == b else 0.0
+            motions[found, :3, :3], motions[found, 3, 3] = R, 1.0
+            for a in range(3):
+                turned = R[a, 0] * middle[0] + R[a, 1] * middle[1] + R[a, 2] * middle[2]
+                motions[found, a, 3] = middle[a] - turned
+            found += 1
+    return found
 
 
 @disjoint_kernel
@@ -318,23 +362,6 @@ def _sum_level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> No
         if area > 0:
             for i in range(len(areas)):
                 mass[i] += area if abs(offset - offsets[i]) < apart else 0.0
-
-
-def _turns(axis: Floats, middles: list[Floats]) -> list[Floats]:
-    """Return rotations by 90, 180 and 270 degrees about an axis through each of some points."""
-    x, y, z = axis
-    cross, outer = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.outer(axis, axis)
-    rotations = [
-        cosine * np.eye(3) + sine * cross + (1 - cosine) * outer
-        for cosine, sine in ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
-    ]
-    turns = []
-    for middle in middles:
-        for R in rotations:
-            turn = np.eye(4)
-            turn[:3, :3], turn[:3, 3] = R, middle - R @ middle
-            turns.append(turn)
-    return turns
 
 
 def select_rivals(T: Floats, others: Floats, p: AmbiguityParameters) -> Floats:
