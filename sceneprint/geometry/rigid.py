@@ -26,11 +26,19 @@ def inverse(T: Floats) -> Floats:
 
 def inverses(transforms: Floats) -> Floats:
     """Return the inverses of (n, 4, 4) rigid transforms."""
-    result = np.zeros_like(transforms)
-    result[:, :3, :3] = transforms[:, :3, :3].transpose(0, 2, 1)
-    result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], transforms[:, :3, 3])
-    result[:, 3, 3] = 1.0
+    result = np.zeros((len(transforms), 4, 4))
+    _write_inverses(np.array(transforms, float), result)
     return result
+
+
+@kernel
+def _write_inverses(transforms: Floats, result: Floats) -> None:
+    for n in range(len(transforms)):
+        for i in range(3):
+            for j in range(3):
+                result[n, i, j] = transforms[n, j, i]
+                result[n, i, 3] -= transforms[n, j, i] * transforms[n, j, 3]
+        result[n, 3, 3] = 1.0
 
 
 def transform_points(T: Floats, points: Floats) -> Floats:

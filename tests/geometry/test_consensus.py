@@ -132,7 +132,7 @@ def test_fit_equals_scipys() -> None:
         weights = rng.uniform(0.1, 1.0, n)
         T = np.zeros((4, 4))
         columns = [np.ascontiguousarray(one.T) for one in (p, normals, q, others)]
-        assert module._fit(*columns, weights, 0.3, np.empty((9, n)), T)
+        assert module._fit(*columns, weights, 0.3, np.empty(n, np.int32), T)
         a, b = np.average(p, axis=0, weights=weights), np.average(q, axis=0, weights=weights)
         R = Rotation.align_vectors(
             np.concatenate([q - b, others]),

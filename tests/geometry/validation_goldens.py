@@ -608,7 +608,7 @@ def check_consensus(module: ModuleType) -> None:
     q, m = source.means @ T[:3, :3].T + T[:3, 3], source.normals @ T[:3, :3].T
     q[3] = 0.0  # counts for nothing
     found = np.zeros((4, 4))
-    weights, room = np.array([1.0, 2.0, 3.0, 0.0]), np.empty((9, 4))
+    weights, room = np.array([1.0, 2.0, 3.0, 0.0]), np.empty(4, np.int32)
 
     def columns(*arrays: Floats) -> list[Floats]:
         return [np.ascontiguousarray(one.T) for one in arrays]

@@ -208,66 +208,43 @@ def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
 
 
 @disjoint_kernel
-def _covariance_terms(
-    p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
-    a: Floats, b: Floats, shares: Floats,
-) -> None:  # fmt: skip
-    """Write the terms (9, M) of the covariance about the means a and b, by rows of q."""
-    p0, p1, p2, n0, n1, n2 = p[0], p[1], p[2], n[0], n[1], n[2]
-    a0, a1, a2 = a[0], a[1], a[2]
-    for r in range(3):
-        first, second, third = shares[3 * r], shares[3 * r + 1], shares[3 * r + 2]
-        qr, mr, br = q[r], m[r], b[r]
-        for i in range(len(weights)):
-            w, moved, facing = weights[i], qr[i] - br, normal_weight * mr[i]
-            first[i] = w * (moved * (p0[i] - a0) + facing * n0[i])
-            second[i] = w * (moved * (p1[i] - a1) + facing * n1[i])
-            third[i] = w * (moved * (p2[i] - a2) + facing * n2[i])
-
-
-@disjoint_kernel
-def _moments(p: Floats, q: Floats, weights: Floats, shares: Floats) -> None:
-    """Write weighted coordinates (6, M)."""
-    for d in range(3):
-        of_p, of_q, in_p, in_q = p[d], q[d], shares[d], shares[3 + d]
-        for i in range(len(weights)):
-            in_p[i] = weights[i] * of_p[i]
-            in_q[i] = weights[i] * of_q[i]
+def _select_weighted(weights: Floats, places: Ints32) -> int:
+    """Write the indices of the weights above 0; return their number."""
+    found = 0
+    for i in range(len(weights)):
+        places[found] = i
+        found += 1 if weights[i] > 0 else 0
+    return found
 
 
 @kernel
 def _fit(
     p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
-    shares: Floats, T: Floats,
+    places: Ints32, T: Floats,
 ) -> bool:  # fmt: skip
     """Fit T by weighted Kabsch to positions and normals, (3, M) each; False with fewer than three.
 
-    shares (9, M) is scratch space: products of correspondences vectorize, and sums keep their
-    order.
+    places (M,) is scratch space: many correspondences have no weight.
     """
-    total, used = 0.0, 0
-    for i in range(len(weights)):
-        total += weights[i]
-        used += 1 if weights[i] > 0 else 0
+    used = _select_weighted(weights, places)
     if used < 3:
         return False
-    a, b, H = np.zeros(3), np.zeros(3), np.zeros((3, 3))
-    _moments(p, q, weights, shares)
-    a0, a1, a2, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    s0, s1, s2, s3, s4, s5 = shares[0], shares[1], shares[2], shares[3], shares[4], shares[5]
-    for i in range(len(weights)):
-        a0, a1, a2 = a0 + s0[i], a1 + s1[i], a2 + s2[i]
-        b0, b1, b2 = b0 + s3[i], b1 + s4[i], b2 + s5[i]
-    a[0], a[1], a[2], b[0], b[1], b[2] = (
-        a0 / total, a1 / total, a2 / total, b0 / total, b1 / total, b2 / total,
-    )  # fmt: skip
-    _covariance_terms(p, n, q, m, weights, normal_weight, a, b, shares)
+    total, a, b, H = 0.0, np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    for k in range(used):
+        i = places[k]
+        total += weights[i]
+        for r in range(3):
+            a[r] += weights[i] * p[r, i]
+            b[r] += weights[i] * q[r, i]
     for r in range(3):
-        s0, s1, s2 = shares[3 * r], shares[3 * r + 1], shares[3 * r + 2]
-        h0, h1, h2 = 0.0, 0.0, 0.0
-        for i in range(len(weights)):
-            h0, h1, h2 = h0 + s0[i], h1 + s1[i], h2 + s2[i]
-        H[r, 0], H[r, 1], H[r, 2] = h0, h1, h2
+        a[r] /= total
+        b[r] /= total
+    for k in range(used):
+        i = places[k]
+        for r in range(3):
+            moved, facing = q[r, i] - b[r], normal_weight * m[r, i]
+            for c in range(3):
+                H[r, c] += weights[i] * (moved * (p[c, i] - a[c]) + facing * n[c, i])
     R = np.empty((3, 3))
     rotation_of_covariance(H, R)
     for r in range(3):
@@ -330,7 +307,7 @@ def _hypotheses(
         for j in range(count):
             total += common[i, j]
         support[i] = total
-    weights, shares, found = np.zeros(count), np.empty((9, count)), 0
+    weights, places, found = np.zeros(count), np.empty(count, np.int32), 0
     order = np.empty(min(n_support, count), np.int32)
     for _ in range(n_seeds):
         seed = int(np.argmax(support))
@@ -346,11 +323,11 @@ def _hypotheses(
             if row[j] > 0:
                 support[j] *= 1.0 - 0.5 * row[j] / row[order[0]]
         support[seed] = 0.0
-        if not _fit(p, n, q, m, weights, normal_weight, shares, T[found]):
+        if not _fit(p, n, q, m, weights, normal_weight, places, T[found]):
             continue
         for _ in range(rounds):
             _weigh_inliers(p, n, q, m, T[found], distance, cosine, weights)
-            if not _fit(p, n, q, m, weights, normal_weight, shares, T[found]):
+            if not _fit(p, n, q, m, weights, normal_weight, places, T[found]):
                 break
         found += 1
     return found

@@ -137,6 +137,33 @@ def _nearest_in_line(
 
 
 @disjoint_kernel
+def _nearest_on_rays(
+    points: Floats32, width: int, camera: Floats, column: Ints32, line: Ints32,
+    x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
+) -> None:  # fmt: skip
+    """Write the nearest of the nine pixels of a pinhole around each point; see `_nearest_in_line`.
+
+    Its points lie on the rays of their pixels, so that their depth is all that is looked up.
+    """
+    across, down, cx, cy = 1.0 / camera[2], 1.0 / camera[3], camera[4], camera[5]
+    for i in range(count):
+        least, found = 1e9, np.int32(-1)
+        middle = line[i] * width + column[i]
+        xn, yn = (column[i] - cx) * across, (line[i] - cy) * down
+        for v in (-1, 0, 1):
+            for u in (-1, 0, 1):
+                place = middle + v * width + u
+                depth = points[np.uint64(place) * np.uint64(3) + np.uint64(2)]
+                ex, ey = x[i] - (xn + u * across) * depth, y[i] - (yn + v * down) * depth
+                ez = z[i] - depth
+                square = ex * ex + ey * ey + ez * ez
+                nearer = (square < least) & (depth != 0)
+                least = square if nearer else least
+                found = np.int32(place) if nearer else found
+        nearest[i], best[i] = least, found
+
+
+@disjoint_kernel
 def _weigh_points(
     source: Floats32, start: int, places: Ints32, points: Floats32, normals: Floats32,
     x: Floats, y: Floats, z: Floats, depth: Floats, nearest: Floats, best: Ints32, T: Floats,
@@ -146,7 +173,7 @@ def _weigh_points(
     weights: negative if the two do not correspond.
     """
     least_cosine, reference, power = numbers[3], numbers[4], numbers[6]
-    per_depth, kind = numbers[7], numbers[8]
+    per_depth = numbers[7]
     xx, xy, xz, yx, yy, yz = T[0, 0], T[0, 1], T[0, 2], T[1, 0], T[1, 1], T[1, 2]
     zx, zy, zz = T[2, 0], T[2, 1], T[2, 2]
     for i in range(count):
@@ -165,11 +192,8 @@ def _weigh_points(
             + (zx * nx + zy * ny + zz * nz) * mz
         )
         tukey = 1.0 - (residual / limit) ** 2
-        near = np.float32(
-            depth_of(kind, source[0, own], source[1, own], source[2, own]) * per_depth
-        )
         far = depth[i] * per_depth
-        weight = tukey * tukey / (0.25 + (near**4 + far**4) * 0.125)
+        weight = tukey * tukey / (0.25 + (source[6, own] + far**4) * 0.125)
         apart = (best[i] < 0) | (nearest[i] > 9.0 * limit * limit)
         apart = apart | (abs(residual) > limit) | (cosine < least_cosine)
         weights[i] = -1.0 if apart else weight
@@ -235,7 +259,7 @@ def _accumulate(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats, gate: float,
     numbers: Floats, room: Floats, indices: Ints32, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Write the normal equations of a Gauss-Newton step on the points of (6, N); return the number
+    """Write the normal equations of a Gauss-Newton step on the points of (7, N); return the number
     of points used, and the sum of their weighted squares.
 
     Each step processes a block of points, which vectorizes; sums keep the order of the points.
@@ -256,12 +280,17 @@ def _accumulate(
         gather(seen[2:], places, count, inside[3:])
         gather_pixels(seen, places, count, pixels)
         x, y, z = inside[0], inside[1], inside[2]
-        nearest[:count] = 1e9
-        best[:count] = -1
-        for beside in range(-1, 2):
-            _nearest_in_line(
-                shown, width, pixels[0], pixels[1], beside, x, y, z, count, nearest, best
+        if camera[0] == 0:
+            _nearest_on_rays(
+                shown, width, camera, pixels[0], pixels[1], x, y, z, count, nearest, best
             )
+        else:
+            nearest[:count] = 1e9
+            best[:count] = -1
+            for beside in range(-1, 2):
+                _nearest_in_line(
+                    shown, width, pixels[0], pixels[1], beside, x, y, z, count, nearest, best
+                )
         _weigh_points(
             source, start, places, shown, facing, x, y, z, inside[3], nearest, best, T, gate,
             numbers, count, rows, weights,
@@ -323,7 +352,7 @@ def _refine_one(
     """Run Gauss-Newton on T; return the number of points in the last step, 0 if it failed, and
     their mean weighted square before it.
 
-    whole, few : points of the last iterations, and of the first, transposed to (6, N)
+    whole, few : points of the last iterations, and of the first; see `_transpose`
     """
     iterations, minimum = int(numbers[0]), int(numbers[5])
     thinned = iterations - int(numbers[10])
@@ -372,6 +401,18 @@ def _refine_one(
 
 
 @kernel
+def _transpose(source: Floats32, step: int, numbers: Floats) -> Floats32:
+    """Return every `step`-th point, transposed to (7, n), with the fourth power of its depth."""
+    kind, per_depth = numbers[8], numbers[7]
+    chosen = np.empty((7, (len(source) + step - 1) // step), np.float32)
+    chosen[:6] = transpose_points(source, step)
+    for i in range(chosen.shape[1]):
+        depth = depth_of(kind, chosen[0, i], chosen[1, i], chosen[2, i])
+        chosen[6, i] = np.float32(depth * per_depth) ** 4
+    return chosen
+
+
+@kernel
 def refine_in_place(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, transforms: Floats, numbers: Floats,
@@ -379,9 +420,9 @@ def refine_in_place(
 ) -> None:  # fmt: skip
     """Refine each of n transforms (n, 4, 4), and write the results of `_refine_one`."""
     room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
-    whole = few = transpose_points(source, 1)
+    whole = few = _transpose(source, 1, numbers)
     if int(numbers[9]) > 1 and int(numbers[0]) > int(numbers[10]):
-        few = transpose_points(source, int(numbers[9]))
+        few = _transpose(source, int(numbers[9]), numbers)
     for k in range(len(transforms)):
         used[k], squares[k] = _refine_one(
             source, whole, few, points, normals, camera, heads, chain, transforms[k], numbers,

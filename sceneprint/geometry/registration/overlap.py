@@ -428,14 +428,14 @@ def _look_up_near(
 
 @kernel
 def _look_up(
-    source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
-    chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+    source: Floats32, transposed: Floats32, points: Floats32, normals: Floats32, camera: Floats,
+    heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
 ) -> None:  # fmt: skip
-    """Write the verdicts (N,) of a target on points (N, 6) under T."""
+    """Write the verdicts (N,) of a target on points (N, 6), also transposed, under T."""
     if camera[0] == 2:
         _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, said)
     else:
-        _look_up_seen(transpose_points(source, 1), points, normals, camera, T, tolerances, said)
+        _look_up_seen(transposed, points, normals, camera, T, tolerances, said)
 
 
 @kernel
@@ -444,13 +444,12 @@ def weigh_overlap(
     heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats,
 ) -> tuple[float, float]:  # fmt: skip
     """Return the weights of inliers and of violations of points (N, 6) on a target under T."""
-    said = np.empty(len(source), np.uint8)
-    _look_up(source, points, normals, camera, heads, chain, T, tolerances, said)
-    inliers, violations = 0.0, 0.0
-    for i in range(len(source)):
-        inliers += weights[i] if said[i] == AGREES else 0.0
-        violations += weights[i] if said[i] == VIOLATES else 0.0
-    return inliers, violations
+    out = np.empty((1, 2))
+    _weigh_all(
+        source, weights, points, normals, camera, heads, chain, T.reshape((1, 4, 4)), tolerances,
+        out,
+    )  # fmt: skip
+    return out[0, 0], out[0, 1]
 
 
 @kernel
@@ -458,12 +457,18 @@ def _weigh_all(
     source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, transforms: Floats, tolerances: Floats, out: Floats,
 ) -> None:  # fmt: skip
+    """Write the weights of inliers and of violations (n, 2) under each of n transforms."""
+    transposed, said = transpose_points(source, 1), np.empty(len(source), np.uint8)
     for k in range(len(transforms)):
-        inliers, violations = weigh_overlap(
-            source, weights, points, normals, camera, heads, chain, transforms[k], tolerances
-        )
-        out[k, 0] = inliers
-        out[k, 1] = violations
+        _look_up(
+            source, transposed, points, normals, camera, heads, chain, transforms[k], tolerances,
+            said,
+        )  # fmt: skip
+        inliers, violations = 0.0, 0.0
+        for i in range(len(source)):
+            inliers += weights[i] if said[i] == AGREES else 0.0
+            violations += weights[i] if said[i] == VIOLATES else 0.0
+        out[k, 0], out[k, 1] = inliers, violations
 
 
 @lru_cache(maxsize=32)
@@ -517,7 +522,8 @@ def look_up(
     tolerances : result of `tolerances`
     """
     said = np.empty(len(source), np.uint8)
-    _look_up(source, *target, np.ascontiguousarray(T_target_source), tolerances, said)
+    T = np.ascontiguousarray(T_target_source)
+    _look_up(source, np.ascontiguousarray(source.T), *target, T, tolerances, said)
     return said
 
 
@@ -528,7 +534,8 @@ def count_verdicts(
 ) -> int:  # fmt: skip
     """Count the verdicts of one more target on points (N, 6); return how many points agree."""
     said, agreeing = np.empty(len(source), np.uint8), 0
-    _look_up(source, points, normals, camera, heads, chain, T, tolerances, said)
+    transposed = transpose_points(source, 1)
+    _look_up(source, transposed, points, normals, camera, heads, chain, T, tolerances, said)
     for i in range(len(source)):
         agree[i] += said[i] == AGREES
         violate[i] += said[i] == VIOLATES

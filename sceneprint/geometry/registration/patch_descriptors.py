@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -71,11 +72,16 @@ class Compression:
     mean: Floats32
     matrix: Floats32
 
-    @property
+    @cached_property
     def offset(self) -> Floats32:
         """Return the mean's own components, (d,)."""
         result: Floats32 = (self.matrix.astype(float) @ self.mean).astype(np.float32)
         return result
+
+    @cached_property
+    def columns(self) -> Floats32:
+        """Return the matrix by bins, (D, d)."""
+        return np.ascontiguousarray(self.matrix.T)
 
 
 #: Limit of the components of a unit vector. Few of 128 exceed it; clipping keeps one large
@@ -299,7 +305,7 @@ def compress(histograms: Floats32, by: Compression) -> Bytes:
     (P, d) uint8, 128 for 0
     """
     out = np.empty((len(histograms), len(by.matrix)), np.float32)
-    _project(histograms, np.ascontiguousarray(by.matrix.T), by.offset, out)
+    _project(histograms, by.columns, by.offset, out)
     length = np.sqrt((out * out).sum(axis=1, keepdims=True))
     unit = out / np.maximum(length, 1e-6)
     stored: Bytes = np.clip(np.rint(unit * (127.0 / RANGE)) + 128, 0, 255).astype(np.uint8)
