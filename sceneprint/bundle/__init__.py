@@ -1,1 +1,1 @@
-"""Bundles: immutable states of a store, listed by manifests and kept as parts named by digest."""
+"""Bundles: immutable states of a store, each a manifest and parts named by their digests."""

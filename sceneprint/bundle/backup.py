@@ -1,10 +1,10 @@
-"""Backups: a bundle of everything that a store must not lose, taken while the service runs.
+"""Backups of a running store as bundles.
 
     database and blobs  --take_backup-->  bundle in a place
 
-All rows are read in one transaction, and then the blobs that they refer to are copied. Blobs never
-change, and none is removed while this runs, so the bundle holds one state, and all of it. Parts
-that are in the place already are not written again.
+A backup reads all rows in one transaction, and then copies the blobs that they refer to. Blobs
+never change, and none is removed during a backup, so the bundle holds one complete state. Parts
+that exist in the place are not written again.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from sceneprint.store.postgres.connection import allow
 from sceneprint.store.read_only import inspect_blobs, require_present_schema
 from sceneprint_client.api import FrameState
 
-#: Parts and blobs that are written at once: each waits for its disk, or for the network.
+#: Number of parts and blobs to write concurrently, since writers wait for the disk or the network.
 THREADS = 8
-#: Blobs that one thread copies after the other: most are there already.
-_TOGETHER = 256
-#: Bytes above which a blob is copied in parts, and not held in memory.
+#: Number of blobs in a task of a thread; most of them exist in the place.
+_BATCH = 256
+#: Size in bytes above which a blob is streamed instead of read into memory.
 LARGE = 8 << 20
-#: Rows and blobs that are done, and all of them.
+#: Callback with the numbers of rows and blobs that are done, and of all.
 Progress = Callable[[int, int], None]
-#: Columns of a list of blobs: the digest, its bytes, and why it is not in the bundle.
+#: Columns of a list of blobs: digest, size in bytes, and reason why the blob is not in the bundle.
 BLOB_COLUMNS = ("digest", "bytes", "lost")
 
-#: The digests of all blobs that have to be there.
+#: SQL query of the digests of all blobs that must exist.
 _REFERRED = (
     "SELECT blob AS digest FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
@@ -70,15 +70,15 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-#: Why a blob is not in a bundle.
+#: Reason why a blob is not in a bundle.
 Loss = Literal["missing", "damaged"]
-#: Digest and bytes of a blob in the list of a bundle, and why it is not in it.
+#: Entry in a bundle's list of blobs: digest, size in bytes, and reason of a loss.
 ListedBlob = tuple[str, int, Loss | None]
 
 
 @dataclass(frozen=True)
 class LostBlob:
-    """A blob that a backup does not hold, as it was missing or damaged in the store."""
+    """A blob that a backup does not hold because it was missing or damaged in the store."""
 
     digest: str
     why: Loss
@@ -86,13 +86,13 @@ class LostBlob:
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle that was written, verified or restored.
+    """A bundle after it was written, verified or restored.
 
     Parameters
     ----------
-    manifest : its content
-    lost : blobs that it does not hold
-    written : bytes that were written for it; the rest was there
+    manifest : list of its parts
+    lost : blobs that are not in the bundle
+    written : number of bytes that were not in the place before
     """
 
     manifest: BundleManifest
@@ -103,70 +103,63 @@ class Bundle:
 def take_backup(
     settings: Settings, place: str, progress: Progress | None = None, *, keep: int | None = None
 ) -> Bundle:
-    """Write a bundle of all that must not be lost; service and workers may go on.
+    """Write a bundle of a store; service and workers may run meanwhile.
 
-    It holds what was acknowledged before this was called, and perhaps some that came later. A blob
-    that is missing or damaged is left out and named: what else there is can still be saved.
+    The bundle holds everything that was acknowledged before the call, and possibly later changes. A
+    missing or damaged blob does not prevent the backup of the other blobs, and is reported.
 
     Parameters
     ----------
-    settings : whose database and blobs are saved
-    place : folder or URL of an object store; a folder is made if it is missing
-    progress : called with the rows and blobs that are done, and all of them
-    keep : number of bundles that stay there, this one among them; default: all
+    settings : settings with the addresses of the database and the blobs
+    place : folder or URL of an object store; a missing folder is created
+    progress : callback with the numbers of rows and blobs that are done, and of all
+    keep : number of newest bundles to keep, including this one; None keeps all
 
     Raises
     ------
-    BundleError : the place is another store's, or another process writes there.
-    UnusableStore, NewerSchema : the database or the place cannot be used, or is damaged.
+    BundleError : If the place belongs to another store, or another process is writing there.
+    UnusableStore, NewerSchema : If the database or the place cannot be used, or is damaged.
     """
-    with _opened(settings.database) as database, inspect_blobs(settings.blobs, database) as blobs:
-        there = BundlePlace.open(place, create=True)
-        there.claim(OpaqueIds(database).owner)
-        with there.turn(), blobs.kept():  # before rows are read: what they refer to must not go
-            backup = _Backup(there, progress or (lambda _done, _total: None))
+    with _open(settings.database) as database, inspect_blobs(settings.blobs, database) as blobs:
+        target = BundlePlace.open(place, create=True)
+        target.claim(OpaqueIds(database).owner)
+        with target.turn(), blobs.kept():  # referenced blobs must remain
+            backup = _Backup(target, progress or (lambda _done, _total: None))
             bundle = backup.write(database, blobs)
             if keep is not None:
-                needed = set[str]()
-                for name in there.names()[:keep]:
-                    needed |= set(part_digests(there, there.read(name)))
-                there.prune(needed, keep)
+                needed_parts = set[str]()
+                for name in target.names()[:keep]:
+                    needed_parts |= set(part_digests(target, target.read(name)))
+                target.prune(needed_parts, keep)
     return bundle
 
 
 @contextmanager
-def _opened(url: str) -> Iterator[Database]:
-    """Open a database that may be in use; nothing is written to it.
-
-    Raises
-    ------
-    UnusableStore, NewerSchema : it is missing, cannot be read, or is of another schema.
-    """
+def _open(url: str) -> Iterator[Database]:
+    """Open a database, which may be in use, without writing to it."""
     database = reach_database(url)
     with closing(database):
         if database.is_sqlite and database.file is None:
-            raise BundleError("A database in memory has no backup. Name one in a file.")
+            raise BundleError("A database in memory cannot be backed up. Use one in a file.")
         if not database_exists(url):
             shown = database.file or database.shown
-            raise UnusableStore(f"{shown}: there is no database. Name its folder with --data.")
+            raise UnusableStore(f"{shown}: the database does not exist. Pass --data FOLDER.")
         require_present_schema(database)
         yield database
 
 
 class _Backup:
-    """Writes one bundle."""
-
     def __init__(self, place: BundlePlace, progress: Progress) -> None:
         self._place, self._progress = place, progress
         self._done = self._total = self._written = self._blob_bytes = 0
         self._lost = list[LostBlob]()
-        self._known = _known_parts(place)
+        self._reusable = _reusable_parts(place)
 
     def write(self, database: Database, blobs: Blobs) -> Bundle:
-        begun, parts = datetime.now(UTC), list[Part]()
+        started_at, parts = datetime.now(UTC), list[Part]()
         with tempfile.TemporaryFile() as digests:
             with database.read() as connection:
-                allow(connection, 0)  # what is on the way may be large, and the place slow
+                allow(connection, 0)  # copying may take hours, so no timeout applies
                 check_sound(connection, database.shown)
                 self._total = sum(_rows_of(connection, one.name) for one in tables())
                 for digest in referred(connection):
@@ -181,7 +174,7 @@ class _Backup:
             rows = cut_rows(self._blobs(blobs, digests), [0])
             lists = [*self._parts("blobs", rows, partial(write_part, BLOB_COLUMNS))]
         manifest = BundleManifest(
-            created_at=begun, sceneprint=version("sceneprint"),
+            created_at=started_at, sceneprint=version("sceneprint"),
             schema_revision=known_revisions()[0],
             blobs=sum(one.rows for one in lists) - len(self._lost), blob_bytes=self._blob_bytes,
             lost=len(self._lost), parts=(*parts, *lists), **summary,
@@ -190,16 +183,16 @@ class _Backup:
         return Bundle(manifest, tuple(self._lost), self._written)
 
     def _parts(
-        self, kind: str, found: Iterable[tuple[list[Row], str]],
+        self, kind: str, groups: Iterable[tuple[list[Row], str]],
         write: Callable[[list[Row]], bytes],
     ) -> Iterator[Part]:  # fmt: skip
-        """Write the parts that are not of the same rows as one of the bundle before."""
+        """Write the parts whose rows differ from those of the previous bundle."""
 
         def changed() -> Iterator[Part | tuple[bytes, int, str]]:
-            for rows, source in found:
-                known = self._known.get((kind, source))
-                if known is not None and self._place.size(known.digest) == known.bytes:
-                    yield known
+            for rows, source in groups:
+                reusable = self._reusable.get((kind, source))
+                if reusable is not None and self._place.size(reusable.digest) == reusable.bytes:
+                    yield reusable
                 else:
                     yield write(rows), len(rows), source
 
@@ -214,30 +207,30 @@ class _Backup:
         for part, new in in_order(put, changed()):
             self._written += part.bytes if new else 0
             if kind != "blobs":
-                self._go_on(part.rows)
+                self._advance(part.rows)
             yield part
 
     def _blobs(self, blobs: Blobs, digests: IO[bytes]) -> Iterator[ListedBlob]:
-        """Copy blobs, and yield the list of them."""
+        """Copy blobs, and yield their entries in the list of blobs."""
         names = (line.decode().rstrip("\n") for line in digests)
-        some = iter(lambda: list(islice(names, _TOGETHER)), [])
-        for found in in_order(lambda block: [self._copy(blobs, one) for one in block], some):
-            for listed, new in found:
+        batches = iter(lambda: list(islice(names, _BATCH)), [])
+        for entries in in_order(lambda block: [self._copy(blobs, one) for one in block], batches):
+            for listed, new in entries:
                 digest, size, why = listed
                 if why is not None:
                     self._lost.append(LostBlob(digest, why))
                 self._blob_bytes += size
                 self._written += new
                 yield listed
-            self._go_on(len(found))
+            self._advance(len(entries))
 
     def _copy(self, blobs: Blobs, digest: str) -> tuple[ListedBlob, int]:
-        """Copy a blob unless it is there; return how it is listed, and the bytes written."""
-        if not is_digest(digest):  # of a database that somebody has edited
+        """Copy a blob if it is missing; return its list entry and the number of bytes written."""
+        if not is_digest(digest):  # the database was edited by hand
             return (digest, 0, "missing"), 0
-        there = self._place.size(digest)
-        if there is not None:
-            return (digest, there, None), 0
+        stored_size = self._place.size(digest)
+        if stored_size is not None:
+            return (digest, stored_size, None), 0
         size = blobs.size(digest)
         if size is not None and size > LARGE:
             condition = blobs.condition(digest)
@@ -253,17 +246,17 @@ class _Backup:
         self._place.put(data)
         return (digest, len(data), None), len(data)
 
-    def _go_on(self, rows: int) -> None:
+    def _advance(self, rows: int) -> None:
         self._done += rows
         self._progress(self._done, max(self._total, self._done))
 
 
-def _known_parts(place: BundlePlace) -> dict[tuple[str, str], Part]:
-    """Return the parts of the newest bundle by kind and source.
+def _reusable_parts(place: BundlePlace) -> dict[tuple[str, str], Part]:
+    """Return the reusable parts of the newest bundle by kind and source.
 
-    Another version may have written the same rows in another way: its parts are none of them.
+    Parts of another version of sceneprint are not reusable, since it may encode rows differently.
     """
-    with suppress(BundleError):  # there is none, or it is damaged
+    with suppress(BundleError):  # there is no bundle, or the newest is damaged
         manifest, own = place.read(), (version("sceneprint"), known_revisions()[0])
         if (manifest.sceneprint, manifest.schema_revision) == own:
             return {(one.kind, one.source): one for one in manifest.parts}
@@ -271,10 +264,10 @@ def _known_parts(place: BundlePlace) -> dict[tuple[str, str], Part]:
 
 
 def in_order(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
-    """Yield what `work` returns for each item, in order; some items are worked at at once.
+    """Yield the results of `work` in the order of the items, computed by a pool of threads.
 
-    An iterator that is not exhausted ends without waiting for its threads: the garbage collector
-    may close it in a thread that is just starting, which could then never join another.
+    Closing the iterator early does not wait for the threads: the garbage collector may close it in
+    a thread that is just starting, which could then never join another.
     """
     pool, wait = ThreadPoolExecutor(THREADS, thread_name_prefix="bundle"), True
     waiting: deque[Future[B]] = deque()
@@ -293,8 +286,8 @@ def in_order(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
 
 
 def referred(connection: Connection) -> Iterator[str]:
-    """Yield the digests of all blobs that have to be there, each once, in order."""
-    # as text, whatever a database that somebody has edited holds
+    """Yield the digests of all blobs that must exist, each once, in ascending order."""
+    # a cast, since a database that was edited by hand may hold values of other types
     order = ' COLLATE "C"' if connection.dialect.name == "postgresql" else ""
     text = f"CAST(digest AS TEXT){order}"
     statement = f"SELECT DISTINCT {text} AS d FROM ({_REFERRED}) AS found ORDER BY d"
@@ -302,25 +295,25 @@ def referred(connection: Connection) -> Iterator[str]:
 
 
 def listed_blobs(place: BundlePlace, manifest: BundleManifest) -> Iterator[ListedBlob]:
-    """Yield digest, bytes and, where it is not in the bundle, why, of each blob of a bundle."""
+    """Yield the entries of a bundle's lists of blobs."""
     lists = (one for one in manifest.parts if one.kind == "blobs")
     for data in in_order(lambda one: place.get(one.digest), lists):
         for digest, size, why in read_rows(data, BLOB_COLUMNS):
             if not is_digest(digest) or not isinstance(size, int) or why not in (
                 None, "missing", "damaged",
             ):  # fmt: skip
-                raise place.damaged(str(digest)[:64], "is listed as no blob can be")
+                raise place.damaged(str(digest)[:64], "has an invalid entry in the list of blobs")
             yield digest, size, why
 
 
 def part_digests(place: BundlePlace, manifest: BundleManifest) -> Iterator[str]:
-    """Yield the digests of all parts of a bundle, its blobs among them."""
+    """Yield the digests of all parts of a bundle, including its blobs."""
     yield from (one.digest for one in manifest.parts)
     yield from (digest for digest, _, why in listed_blobs(place, manifest) if why is None)
 
 
 def summary_of(connection: Connection) -> dict[str, Any]:
-    """Return how many maps, signatures and frames in each state there are, and the numbers."""
+    """Return the counts and the last row numbers for a manifest."""
     states = connection.exec_driver_sql(
         "SELECT state, count(*) FROM frames GROUP BY state ORDER BY state"
     )
@@ -333,11 +326,11 @@ def summary_of(connection: Connection) -> dict[str, Any]:
 
 
 def check_sound(connection: Connection, shown: str) -> None:
-    """See that what SQLite reads is whole: rows that contradict each other cannot be restored.
+    """Check the integrity of a SQLite database, since inconsistent rows could not be restored.
 
     Raises
     ------
-    UnusableStore : it is not.
+    UnusableStore : If the database is damaged.
     """
     if connection.dialect.name != "sqlite":
         return  # PostgreSQL enforces its constraints

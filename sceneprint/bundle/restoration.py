@@ -1,11 +1,11 @@
-"""Bundles restored into an empty store, SQLite and PostgreSQL alike, and verified.
+"""Verification of bundles, and their restoration into an empty store.
 
     bundle  --verify_bundle-->  Bundle
     bundle  --restore_to_folder-->  data folder with SQLite
-    bundle  --restore_to_server-->  empty database of PostgreSQL, and wherever its blobs are kept
+    bundle  --restore_to_server-->  empty database of PostgreSQL, and its place of blobs
 
-Blobs are durable before the first row, and all rows are one transaction. A restore that was killed
-leaves no store that anybody would take for a whole one, and goes on when it is run again.
+Blobs are durable before the first row is written, and all rows are one transaction. A restore that
+was killed leaves no usable store, and continues when it is run again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sceneprint.bundle.backup import (
     summary_of,
 )
 from sceneprint.bundle.place import BundleManifest, BundlePlace
-from sceneprint.bundle.rows import Row, count_on, decoded_rows, read_rows, tables, write_rows
+from sceneprint.bundle.rows import Row, decoded_rows, read_rows, set_numbers, tables, write_rows
 from sceneprint.errors import BundleError, DamagedBundle, NewerSchema, UnusableStore
 from sceneprint.settings import Settings
 from sceneprint.store import Blobs, FolderBlobs, open_blobs
@@ -47,28 +47,17 @@ from sceneprint.store.opaque_ids import OpaqueIds, owner_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.tables import keys, secrets
 
-#: The database and the blobs of a data folder, and where they are until both are whole.
+#: Names of the database and the blobs in a data folder, and of the folder for unfinished ones.
 _DATABASE, _BLOBS, _WORK = "sceneprint.db", "blobs", ".restoring"
-#: Tables of which a database that nobody has used holds rows: its secret, what a service counts,
-#: who may write, and where a scrub stands.
-_OF_ITSELF = ("secrets", "samples", "schema_range", "scrubs")
-#: Seconds after which a server lists no connection that was closed before.
-_NOTICED_S = 5.0
+#: Tables that have rows in an unused database: its secret, samples of a service, the schema range,
+#: and the progress of a scrub.
+_INITIAL_TABLES = ("secrets", "samples", "schema_range", "scrubs")
+#: Seconds after which a server no longer lists a closed connection.
+_DISCONNECT_S = 5.0
 
 
 class _Restoration:
-    """Reads one bundle.
-
-    Parameters
-    ----------
-    place, name : of the bundle; None: the newest
-    progress : called with the rows and blobs that are done, and all of them
-
-    Raises
-    ------
-    BundleError, DamagedBundle : see `BundlePlace.read`.
-    NewerSchema : another version wrote it.
-    """
+    """Reader of one bundle; see `verify_bundle` for its parameters and errors."""
 
     def __init__(self, place: str, name: str | None, progress: Progress | None) -> None:
         self.place = BundlePlace.open(place)
@@ -76,7 +65,7 @@ class _Restoration:
         revision, (head, _) = self.manifest.schema_revision, known_revisions()
         if revision != head:
             raise NewerSchema(
-                f"The bundle has schema {revision!r:.40}, and this version works with {head}. "
+                f"The bundle has schema {revision!r:.40}, but this version requires {head}. "
                 f"Restore it with sceneprint {self.manifest.sceneprint:.40}."
             )
         self._progress = progress or (lambda _done, _total: None)
@@ -86,7 +75,7 @@ class _Restoration:
         self._total = max(sum(rows) + listed, 1)
 
     def blobs(self, blobs: Blobs | None) -> tuple[LostBlob, ...]:
-        """Copy all blobs, or verify them alone; return those that the bundle does not hold."""
+        """Copy all blobs, or only verify them if `blobs` is None; return the lost ones."""
         lost, count, size = list[LostBlob](), 0, 0
 
         def take(one: ListedBlob) -> ListedBlob:
@@ -99,11 +88,11 @@ class _Restoration:
                 count, size = count + 1, size + length
             else:
                 lost.append(LostBlob(digest, why))
-            self._go_on(1)
+            self._advance(1)
         if (count, size, len(lost)) != (
             self.manifest.blobs, self.manifest.blob_bytes, self.manifest.lost,
         ):  # fmt: skip
-            raise self._other("its list of blobs")
+            raise self._differing("its blobs")
         return tuple(lost)
 
     def _take(self, blobs: Blobs | None, digest: str, size: int) -> None:
@@ -113,7 +102,7 @@ class _Restoration:
             if condition != "sound":
                 raise place.damaged(digest, f"is {condition}")
         elif blobs.condition(digest) == "sound":
-            pass  # a restore that was killed has copied it
+            pass  # a restore that was killed copied it
         elif size <= LARGE:
             blobs.put(place.get(digest))
         else:
@@ -124,7 +113,7 @@ class _Restoration:
                     raise place.damaged(digest, "is damaged")
 
     def rows(self, connection: Connection, *, keep_keys: bool = True) -> None:
-        """Write all rows into an empty database, in a transaction of the caller's.
+        """Write all rows into an empty database, in the caller's transaction.
 
         Parameters
         ----------
@@ -132,31 +121,32 @@ class _Restoration:
 
         Raises
         ------
-        BundleError : the database holds rows, or cannot hold one of these.
-        DamagedBundle : the rows are not those that were written, or contradict each other.
+        BundleError : If the database has rows, or cannot store a row.
+        DamagedBundle : If rows are damaged or inconsistent.
         """
         allow(connection, 0)
         check_empty(connection)
         sqlite = connection.dialect.name == "sqlite"
         if sqlite:
             connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
-        for name in _OF_ITSELF:
+        for name in _INITIAL_TABLES:
             connection.exec_driver_sql(f"DELETE FROM {name}")
         for table in tables():
             read = self._read(table.name, [one.name for one in table.columns])
             write_rows(connection, table, decoded_rows([*table.columns], read))
-        count_on(connection, self.manifest.numbers)
-        found, manifest = summary_of(connection), self.manifest
-        if any(found[name] != getattr(manifest, name) for name in ("maps", "frames", "signatures")):
-            raise self._other("the rows that it holds")
+        set_numbers(connection, self.manifest.numbers)
+        manifest, names = self.manifest, ("maps", "frames", "signatures")
+        summary = summary_of(connection)
+        if any(summary[name] != getattr(manifest, name) for name in names):
+            raise self._differing("its rows")
         try:
             check_sound(connection, self.place.shown)
         except UnusableStore as error:
             raise DamagedBundle(str(error)) from error
         listed = (digest for digest, _, _ in listed_blobs(self.place, self.manifest))
         if any(one != other for one, other in zip_longest(listed, referred(connection))):
-            raise self._other("the blobs that its rows refer to")
-        # answers in files are not in a bundle
+            raise self._differing("the blobs that its rows refer to")
+        # a bundle holds no answers that are stored in files
         connection.exec_driver_sql("DELETE FROM queries WHERE NOT listed AND kept_at IS NULL")
         connection.exec_driver_sql(
             "UPDATE queries SET bytes = 0, shown = NULL WHERE bytes > 0 AND kept_at IS NULL"
@@ -172,7 +162,7 @@ class _Restoration:
         return sorted(str(row[columns.index("name")]) for row in rows)
 
     def secrets(self) -> list[Row]:
-        """Return the rows of the secrets, which give a store its name."""
+        """Return the rows of the secrets, which identify a store."""
         columns = [one.name for one in secrets.columns]
         return list(
             decoded_rows([*secrets.columns], self._read(secrets.name, columns, counts=False))
@@ -183,42 +173,42 @@ class _Restoration:
         for part, data in zip(
             parts, in_order(lambda one: self.place.get(one.digest), parts), strict=True
         ):
-            found = list(read_rows(data, columns))
-            if len(found) != part.rows:
-                raise self._other(f"its rows of table {table}")
-            yield from found
+            rows = list(read_rows(data, columns))
+            if len(rows) != part.rows:
+                raise self._differing(f"its rows of table {table}")
+            yield from rows
             if counts:
-                self._go_on(len(found))
+                self._advance(len(rows))
 
-    def _other(self, what: str) -> DamagedBundle:
+    def _differing(self, what: str) -> DamagedBundle:
         return DamagedBundle(
-            f"{self.place.shown}: bundle {self.manifest.name} is damaged: {what} differ from what "
-            "its manifest says. Nothing was restored. Restore another bundle."
+            f"{self.place.shown}: bundle {self.manifest.name} is damaged: {what} differ from its "
+            "manifest. Nothing was restored. Restore another bundle."
         )
 
-    def _go_on(self, rows: int) -> None:
+    def _advance(self, rows: int) -> None:
         self._done += rows
         self._progress(self._done, self._total)
 
 
 def check_empty(connection: Connection) -> None:
-    """See that a database of our schema, or of none, holds nothing that would be lost.
+    """Check that a database has no rows that a restore would overwrite.
 
     Raises
     ------
-    BundleError : it does.
+    BundleError : If a table has rows.
     """
     server = connection.dialect.name == "postgresql"
     for table in tables():
         name = table.name
-        if name in _OF_ITSELF:
+        if name in _INITIAL_TABLES:
             continue
         if server and connection.exec_driver_sql(f"SELECT to_regclass('{name}')").scalar() is None:
             continue
         if connection.exec_driver_sql(f"SELECT 1 FROM {name} LIMIT 1").first() is not None:
             raise BundleError(
                 f"The database has rows in its table {name}, and nothing is overwritten. "
-                "Make an empty one (CREATE DATABASE), and name it in SCENEPRINT_DATABASE_URL."
+                "Create an empty one (CREATE DATABASE), and set SCENEPRINT_DATABASE_URL to it."
             )
 
 
@@ -237,17 +227,19 @@ def list_bundle_keys(place: str, name: str | None = None) -> list[str]:
 
 
 def verify_bundle(place: str, name: str | None = None, progress: Progress | None = None) -> Bundle:
-    """Read all of a bundle and check it; its rows are written into a temporary database.
+    """Read and check a whole bundle, and write its rows into a temporary database.
 
     Parameters
     ----------
     place : folder or URL of an object store
-    name : of the bundle; None: the newest
-    progress : called with the rows and blobs that are done, and all of them
+    name : name of the bundle; None selects the newest
+    progress : callback with the numbers of rows and blobs that are done, and of all
 
     Raises
     ------
-    BundleError, DamagedBundle, NewerSchema : there is none, it is damaged, or another version's.
+    BundleError : If the bundle does not exist.
+    DamagedBundle : If the bundle is damaged.
+    NewerSchema : If a version with another schema wrote the bundle.
     """
     reading = _Restoration(place, name, progress)
     lost = reading.blobs(None)
@@ -260,73 +252,74 @@ def restore_to_folder(
     place: str, folder: Path, name: str | None = None, progress: Progress | None = None,
     *, keep_keys: bool = True,
 ) -> Bundle:  # fmt: skip
-    """Make a data folder of a bundle; a restore that was killed there is gone on with.
+    """Restore a bundle to a data folder, and continue a restore that was killed there.
 
     Parameters
     ----------
     place, name, progress : see `verify_bundle`
-    folder : missing or empty
+    folder : folder that is missing or empty
     keep_keys : False revokes all keys of the bundle
 
     Raises
     ------
-    BundleError, DamagedBundle, NewerSchema : as for `verify_bundle`; or the folder holds something,
-        has no room, or another process restores to it.
-    OSError : the folder cannot be written.
+    BundleError : If the bundle does not exist, the folder is not empty, the disk is too small, or
+        another process is restoring to the folder.
+    DamagedBundle, NewerSchema : See `verify_bundle`.
+    OSError : If the folder cannot be written.
     """
-    folder = Path(os.path.realpath(folder))  # a link stays one
+    folder = Path(os.path.realpath(folder))  # a symbolic link is preserved
     _check_folder(folder)
     reading, work = _Restoration(place, name, progress), folder / _WORK
     is_new = not folder.exists()
     make_folder(work)
     with folder_turn(work) as mine:
         if not mine:
-            raise BundleError(f"{folder}: another process restores to it.")
-        if (folder / _BLOBS).exists():  # a restore was killed between two names, see `_put`
+            raise BundleError(f"{folder}: another process is restoring to it. Wait for it to end.")
+        if (folder / _BLOBS).exists():  # a restore was killed inside `_publish`
             (folder / _BLOBS).rename(work / _BLOBS)
-        for half in work.glob(f"{_BLOBS}/*/.*"):  # of a restore that was killed
+        for half in work.glob(f"{_BLOBS}/*/.*"):  # unfinished files of a killed restore
             half.unlink()
         _check_room(folder, reading.manifest, work)
         with closing(FolderBlobs(work / _BLOBS)) as blobs:
             lost = reading.blobs(blobs)
         _write_file(work / _DATABASE, reading, keep_keys=keep_keys)
-        _put(work, folder)
+        _publish(work, folder)
     if is_new:
         sync_folder(folder.parent)
     return Bundle(reading.manifest, lost)
 
 
 def _check_folder(folder: Path) -> None:
-    """See that a folder is missing or empty, but for what killed restores have left."""
+    """Check that a folder is missing, or has only files of a killed restore."""
     if not folder.is_dir():
         if os.path.lexists(folder):
-            raise BundleError(f"{folder} is no folder. Name another with --data.")
+            raise BundleError(f"{folder} is not a folder. Pass another path with --data.")
         return
-    ours = {_WORK, "lost+found"} if os.path.ismount(folder) else {_WORK}
+    allowed = {_WORK, "lost+found"} if os.path.ismount(folder) else {_WORK}
     if (folder / _WORK / _DATABASE).exists() and not (folder / _WORK / _BLOBS).exists():
-        ours.add(_BLOBS)  # a restore was killed when its blobs had their name, and no database
-    found = sorted({one.name for one in folder.iterdir()} - ours)
-    if found:
-        more = "" if len(found) <= 3 else f" and {len(found) - 3} more"
+        allowed.add(_BLOBS)  # a restore was killed inside `_publish`
+    names = sorted({one.name for one in folder.iterdir()} - allowed)
+    if names:
+        more = "" if len(names) <= 3 else f" and {len(names) - 3} more"
         raise BundleError(
-            f"{folder} holds {', '.join(found[:3])}{more}, and nothing is overwritten. Name "
-            "another folder with --data, or move away what is there."
+            f"{folder} holds {', '.join(names[:3])}{more}, and nothing is overwritten. Pass "
+            "another folder with --data, or move its files away."
         )
 
 
 def _check_room(folder: Path, manifest: BundleManifest, work: Path) -> None:
-    """See before long work that the disk has room for a bundle, less what is there of it."""
-    there = sum(one.stat().st_size for one in work.rglob("*") if one.is_file())
-    wanted, free = manifest.bytes - there, shutil.disk_usage(folder).free
-    if free < wanted:
+    """Check that the disk has room for the parts of a bundle that were not restored yet."""
+    restored = sum(one.stat().st_size for one in work.rglob("*") if one.is_file())
+    required, free = manifest.bytes - restored, shutil.disk_usage(folder).free
+    if free < required:
         raise BundleError(
-            f"{folder}: what is in the bundle takes {wanted / 1e6:,.1f} MB, and {free / 1e6:,.1f} "
-            "MB are free. Free some space, or choose another place."
+            f"{folder}: the bundle needs {required / 1e6:,.1f} MB, but only {free / 1e6:,.1f} MB "
+            "are free. Free some space, or choose another folder."
         )
 
 
 def _write_file(path: Path, reading: _Restoration, *, keep_keys: bool = True) -> None:
-    """Write the rows of a bundle into a new SQLite file, which is durable and alone at the end."""
+    """Write the rows of a bundle into a new SQLite file, without a write-ahead log at the end."""
     for one in path.parent.glob(f"{path.name}*"):
         one.unlink()
     url = URL.create("sqlite", database=str(path)).render_as_string(hide_password=False)
@@ -334,44 +327,43 @@ def _write_file(path: Path, reading: _Restoration, *, keep_keys: bool = True) ->
         reading.rows(connection, keep_keys=keep_keys)
 
 
-def _put(work: Path, folder: Path) -> None:
-    """Move blobs and database to their names; the database comes last, and with it the store."""
+def _publish(work: Path, folder: Path) -> None:
+    """Move blobs and database to the data folder; the database comes last and makes it a store."""
     try:
         (work / _BLOBS).rename(folder / _BLOBS)
         put_new(work / _DATABASE, folder / _DATABASE)
         shutil.rmtree(work)
     except OSError as error:
         raise BundleError(
-            f"{folder}: the bundle cannot be put there ({error.strerror}). Nothing was "
-            "overwritten; see what has come to be there, and its permissions."
+            f"{folder}: the restored files cannot be moved there ({error.strerror}). Nothing was "
+            "overwritten. Check the files in the folder and its permissions."
         ) from error
-
-
-# PostgreSQL, and wherever its blobs are kept.
 
 
 def restore_to_server(
     place: str, settings: Settings, name: str | None = None, progress: Progress | None = None,
     *, keep_keys: bool = True,
 ) -> Bundle:  # fmt: skip
-    """Put all of a bundle into an empty database and where blobs are kept, or no row of it.
+    """Restore a bundle to an empty database of PostgreSQL and its place of blobs.
 
     Parameters
     ----------
     place, name, progress : see `verify_bundle`
-    settings : whose database is PostgreSQL; its schema is made where there is none
+    settings : settings with the addresses of the database, whose schema is created if it is
+        missing, and of the blobs
     keep_keys : False revokes all keys of the bundle
 
     Raises
     ------
-    BundleError : as for `verify_bundle`; or the database holds something, is in use, or cannot
-        hold a row of the bundle.
-    UnusableStore : database or blobs cannot be reached or written.
+    BundleError : If the bundle does not exist, the database is in use or not empty, or it cannot
+        store a row of the bundle.
+    DamagedBundle, NewerSchema : See `verify_bundle`.
+    UnusableStore : If the database or the blobs cannot be reached or written.
     """
     if isinstance(settings.blobs, Path) and settings.blob_dir.with_name(_DATABASE).exists():
-        raise BundleError(  # either would remove blobs that only the other refers to
+        raise BundleError(  # each store would remove the blobs of the other
             f"{settings.blob_dir.with_name(_DATABASE)} is the database of another store, whose "
-            "blobs lie beside it. Name another folder with --data."
+            "blobs are in the same folder. Pass another folder with --data."
         )
     with closing(reach_database(settings.database)) as before:
         _check_unused(before)
@@ -380,9 +372,9 @@ def restore_to_server(
         names = reading.secrets()
         owner = next((owner_of(value) for name, value in names if name == "seals"), "")
         with database.read() as connection:
-            check_empty(connection)  # so what a service has marked with its name is nobody's
+            check_empty(connection)  # so a mark of its service at the blobs may be replaced
         with _marked(settings, owner, OpaqueIds(database).owner):
-            with database.write() as connection:  # who keeps the blobs may ask whose they are
+            with database.write() as connection:  # opening the blobs checks their owner
                 check_empty(connection)
                 connection.exec_driver_sql("DELETE FROM secrets")
                 write_rows(connection, secrets, iter(names))
@@ -396,9 +388,9 @@ def restore_to_server(
 
 @contextmanager
 def _marked(settings: Settings, owner: str, before: str) -> Iterator[None]:
-    """Hold the prefix of an object store, or a folder, while blobs are put there.
+    """Mark a place of blobs as that of a store while blobs are copied there.
 
-    The store that the backup was taken of has the same name: what it keeps must not be shared.
+    The original store has the same secret, but must not share the place with the restored one.
     """
     if isinstance(settings.blobs, Path):
         make_folder(settings.blobs)
@@ -411,24 +403,24 @@ def _marked(settings: Settings, owner: str, before: str) -> Iterator[None]:
 
 
 def _check_unused(database: Database) -> None:
-    """See that the database holds nothing, and that nobody has it open, as far as it can tell.
+    """Check that the database is empty and has no other connections of sceneprint.
 
-    A connection that was closed is listed until the server has noticed, so it looks for a while.
+    The check is repeated for a while, since a server still lists connections that were just closed.
     """
     with database.read() as connection:
         check_empty(connection)
-    end = time.monotonic() + _NOTICED_S
+    end = time.monotonic() + _DISCONNECT_S
     while others := _connections_of(database):
         if time.monotonic() >= end:
             raise BundleError(
                 f"{database.shown} is in use: {others} connections of sceneprint. Stop its "
-                "services and workers, and try again."
+                "services and workers, and run the command again."
             )
         time.sleep(0.1)
 
 
 def _connections_of(database: Database) -> int:
-    """Return how many other connections of sceneprint the server lists."""
+    """Return the number of other connections of sceneprint that the server lists."""
     with database.read() as connection:
         return int(
             connection.exec_driver_sql(

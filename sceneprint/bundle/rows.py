@@ -1,11 +1,11 @@
-"""Rows of tables as parts of a bundle, the same from SQLite and from PostgreSQL.
+"""Rows of tables as parts of a bundle, in one format for SQLite and PostgreSQL.
 
     rows of a table  --cut_rows-->  rows of each part, and their digest
     --write_part-->  JSON lines, compressed  --read_rows-->  the same rows
 
-A part ends after a row whose key has a hash of a certain kind. So a row that comes, changes or goes
-changes the part that it is in, and no other: what did not change is in the bundle before already.
-The digest tells so before the part is written, which costs several times as much as to read it.
+The hash of a row's key decides whether a part ends after the row. Therefore an inserted, changed or
+deleted row changes only its own part, and the previous bundle holds the other parts. Comparing
+digests of rows avoids writing these parts, which takes several times as long as reading their rows.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from sqlalchemy.exc import IntegrityError
 from sceneprint.errors import BundleError, DamagedBundle, UnusableStore
 from sceneprint.store.tables import events, metadata, pending_events
 
-#: Rows of a part on average, and bytes after which one ends in any case.
+#: Mean number of rows in a part, and size in bytes after which a part ends in any case.
 _ROWS, _BYTES = 1024, 8 << 20
-#: Most bytes of a part when it is read: one row may be as large as a request.
+#: Maximum uncompressed size of a part in bytes; one row may be as large as a request.
 _MOST_BYTES = 1 << 28
-#: Rows that are read or written at once; a signature may have 125,000 bytes.
+#: Number of rows to read or write at once; a signature may have 125,000 bytes.
 _BLOCK = 200
-#: Rows whose bytes are counted at once while a part grows.
-_TOGETHER = 32
+#: Number of rows to hash at once.
+_BATCH = 32
 
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
@@ -56,33 +56,29 @@ Row = Sequence[Any]
 def tables() -> list[Table]:
     """Return the tables of a bundle, each after those that it refers to.
 
-    Pending events are none of them: they are numbered as they are read.
+    The table of pending events is not among them, since `read_table` numbers its rows as events.
     """
     return [one for one in metadata.sorted_tables if one is not pending_events]
 
 
 def numbered(table: Table) -> bool:
-    """Return whether the database numbers the rows of a table, and uses no number twice."""
+    """Return whether the database numbers the rows of a table and never reuses a number."""
     return bool(table.dialect_options["sqlite"]["autoincrement"])
 
 
 def column_names(table: Table) -> str:
-    """Return all columns of a table, as SQL wants them."""
+    """Return the quoted names of all columns of a table, separated by commas."""
     return ", ".join(f'"{one.name}"' for one in table.columns)
 
 
 def read_table(connection: Connection, table: Table) -> Iterator[Row]:
-    """Yield all rows of a table in the order of their keys, as the driver has them.
+    """Yield all rows of a table in the order of their keys, with the values of SQLite's driver.
 
-    Documents (JSON) are text, and on PostgreSQL truth values are numbers, as they are on SQLite.
-
-    Parameters
-    ----------
-    connection : of a transaction that sees one state
+    JSON documents are text, and Boolean values are integers.
     """
     server = connection.dialect.name == "postgresql"
     columns = ", ".join(f'"{one.name}"' + (_cast(one) if server else "") for one in table.columns)
-    order = ", ".join(  # SQLite orders texts by their bytes
+    order = ", ".join(  # SQLite compares texts by their bytes
         f'"{one.name}"' + (' COLLATE "C"' if server and isinstance(one.type, String) else "")
         for one in table.primary_key.columns
     )
@@ -92,10 +88,10 @@ def read_table(connection: Connection, table: Table) -> Iterator[Row]:
 
 
 def fetch_rows(connection: Connection, statement: str) -> Iterator[Row]:
-    """Yield the rows of a statement as tuples, a block at a time."""
+    """Yield the result rows of a statement as tuples, fetched in blocks."""
     options = {"stream_results": True}
-    with closing(connection.exec_driver_sql(statement, execution_options=options)) as found:
-        while block := found.fetchmany(_BLOCK):
+    with closing(connection.exec_driver_sql(statement, execution_options=options)) as result:
+        while block := result.fetchmany(_BLOCK):
             yield from map(tuple, block)
 
 
@@ -106,7 +102,7 @@ def _cast(column: Column[Any]) -> str:
 
 
 def _pending(connection: Connection) -> Iterator[Row]:
-    """Yield the events that PostgreSQL has not numbered yet, with the numbers that come next."""
+    """Yield the events that PostgreSQL has not numbered yet, with the next numbers."""
     last = _last_of_server(connection, events.name)
     for number, row in enumerate(read_table(connection, pending_events), last + 1):
         yield (number, *row[1:])
@@ -121,33 +117,33 @@ def _last_of_server(connection: Connection, name: str) -> int:
 
 
 def last_numbers(connection: Connection) -> dict[str, int]:
-    """Return the last number that each table has given out, 0 where it has given none."""
-    found = {one.name: 0 for one in tables() if numbered(one)}
+    """Return the last row number that was assigned in each numbered table, 0 if there is none."""
+    numbers = {one.name: 0 for one in tables() if numbered(one)}
     if connection.dialect.name == "sqlite":
-        given_out = connection.exec_driver_sql(
+        sequences = connection.exec_driver_sql(
             "SELECT name, seq FROM sqlite_sequence WHERE typeof(seq) = 'integer'"
         )
-        return found | {name: seq for name, seq in given_out if name in found}
-    found = {name: _last_of_server(connection, name) for name in found}
+        return numbers | {name: seq for name, seq in sequences if name in numbers}
+    numbers = {name: _last_of_server(connection, name) for name in numbers}
     pending = f"SELECT count(*) FROM {pending_events.name}"
-    found[events.name] += int(connection.exec_driver_sql(pending).scalar_one())
-    return found
+    numbers[events.name] += int(connection.exec_driver_sql(pending).scalar_one())
+    return numbers
 
 
 def cut_rows(rows: Iterable[Row], keys: Sequence[int]) -> Iterator[tuple[list[Row], str]]:
-    """Yield the rows of one part after the other, and a digest that no other rows have.
+    """Yield the rows of each part with their digest.
 
     Parameters
     ----------
-    rows : of texts, bytes and numbers
-    keys : places of the values in a row by which the rows are in order
+    rows : rows in the order of their keys
+    keys : positions of the key's values in a row
     """
     key = itemgetter(*keys)
     part, size, hashed = list[Row](), 0, hashlib.sha256()
     for row in rows:
         part.append(row)
         ends = zlib.crc32(repr(key(row)).encode()) % _ROWS == 0
-        if ends or len(part) % _TOGETHER == 0:
+        if ends or len(part) % _BATCH == 0:
             size += _add(hashed, part)
         if ends or size >= _BYTES:
             yield part, hashed.hexdigest()
@@ -158,15 +154,15 @@ def cut_rows(rows: Iterable[Row], keys: Sequence[int]) -> Iterator[tuple[list[Ro
 
 
 def _add(hashed: hashlib._Hash, part: list[Row]) -> int:
-    """Add the last rows of a part to its digest; return their bytes."""
-    first = (len(part) - 1) // _TOGETHER * _TOGETHER
-    packed = marshal.dumps(part[first:], 2)  # the last version without references between values
+    """Add the last rows of a part to its digest; return their size in bytes."""
+    first = (len(part) - 1) // _BATCH * _BATCH
+    packed = marshal.dumps(part[first:], 2)  # later versions refer to equal objects
     hashed.update(packed)
     return len(packed)
 
 
 def write_part(columns: Sequence[str], rows: Iterable[Row]) -> bytes:
-    """Return the bytes of a part: the names of the columns and each row, as lines of JSON."""
+    """Return the bytes of a part: the names of the columns, and the rows, as lines of JSON."""
     from isal import isal_zlib
 
     lines = "\n".join([json.dumps(list(columns)), *map(_encode, rows)])
@@ -174,11 +170,11 @@ def write_part(columns: Sequence[str], rows: Iterable[Row]) -> bytes:
 
 
 def table_part(table: Table, rows: Iterable[Row]) -> bytes:
-    """Return the bytes of a part of a table; see `write_part`.
+    """Return the bytes of a part with rows of a table.
 
     Raises
     ------
-    UnusableStore : a value is not of its column's type, as after somebody has edited the database.
+    UnusableStore : If a value does not have its column's type because the database was edited.
     """
     try:
         return write_part([one.name for one in table.columns], encoded_rows(table.columns, rows))
@@ -189,19 +185,19 @@ def table_part(table: Table, rows: Iterable[Row]) -> bytes:
 
 
 def encoded_rows(columns: Iterable[Column[Any]], rows: Iterable[Row]) -> Iterator[Row]:
-    """Yield rows of a database as JSON has them: bytes as base64, documents as text."""
+    """Yield rows of a database with values for JSON: bytes as base64, documents as text."""
     encoders = [_encoder(one) for one in columns]
     for row in rows:
         yield [x if f is None or x is None else f(x) for f, x in zip(encoders, row, strict=True)]
 
 
 def _encoder(column: Column[Any]) -> Callable[[Any], Any] | None:
-    """Return what turns a value of the driver into one of JSON; None where it is one."""
+    """Return the function that encodes a driver's value for JSON; None if JSON supports it."""
     if isinstance(column.type, LargeBinary):
         return lambda value: base64.b64encode(value).decode()
     if isinstance(column.type, Boolean):
         return bool
-    if isinstance(column.type, JSON):  # SQLite keeps a bare number as one
+    if isinstance(column.type, JSON):  # SQLite returns a bare number as a number
         return lambda value: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return None
 
@@ -211,18 +207,18 @@ def read_rows(data: bytes, columns: Sequence[str]) -> Iterator[Row]:
 
     Parameters
     ----------
-    data : of `write_part`
-    columns : that it must have
+    data : result of `write_part`
+    columns : expected names of the columns
 
     Raises
     ------
-    DamagedBundle : it is no such part.
+    DamagedBundle : If the part is damaged or has other columns.
     """
     try:
         unpacker = zlib.decompressobj()
         text = unpacker.decompress(data, _MOST_BYTES)
         if not unpacker.eof or unpacker.unused_data:
-            raise ValueError("it is longer than any that is written")
+            raise ValueError("it is too long or truncated")
         head, *lines = text.split(b"\n")
         if json.loads(head) != list(columns):
             raise ValueError("it has other columns")
@@ -233,16 +229,16 @@ def read_rows(data: bytes, columns: Sequence[str]) -> Iterator[Row]:
             yield row
     except (zlib.error, ValueError, RecursionError) as error:
         raise DamagedBundle(
-            f"A part of the bundle holds no rows ({error}), and nothing was restored."
+            f"A part of the bundle is damaged ({error}). Nothing was restored."
         ) from error
 
 
 def decoded_rows(columns: Sequence[Column[Any]], rows: Iterable[Row]) -> Iterator[Row]:
-    """Yield rows of `encoded_rows` as the database takes them, each value of its column's type.
+    """Yield rows of `encoded_rows` with values for the database, each of its column's type.
 
     Raises
     ------
-    DamagedBundle : a value is of another type.
+    DamagedBundle : If a value has another type.
     """
     decoders = [_decoder(one) for one in columns]
     for row in rows:
@@ -250,8 +246,8 @@ def decoded_rows(columns: Sequence[Column[Any]], rows: Iterable[Row]) -> Iterato
             yield [None if x is None else f(x) for f, x in zip(decoders, row, strict=True)]
         except (TypeError, ValueError, binascii.Error) as error:
             raise DamagedBundle(
-                f"A row of table {columns[0].table.name} of the bundle is not one of this schema "
-                f"({error}), and nothing was restored."
+                f"A row of table {columns[0].table.name} in the bundle does not fit its schema "
+                f"({error}). Nothing was restored."
             ) from error
 
 
@@ -276,12 +272,12 @@ def _decoder(column: Column[Any]) -> Callable[[Any], Any]:
 
 
 def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> None:
-    """Insert rows as `decoded_rows` yields them.
+    """Insert rows from `decoded_rows` into a table.
 
     Raises
     ------
-    DamagedBundle : they break a constraint of the table.
-    BundleError : the database cannot hold one of them.
+    DamagedBundle : If a row violates a constraint of the table.
+    BundleError : If the database cannot store a row.
     """
     if connection.dialect.name == "sqlite":
         marks = ", ".join("?" * len(table.columns))
@@ -303,23 +299,23 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
     except psycopg.IntegrityError as error:
         raise _contradiction(table, error) from error
     except psycopg.DataError as error:
-        # SQLite keeps what it is given: a file that somebody has edited may hold anything
+        # SQLite does not check values, so a file that was edited may hold any
         raise BundleError(
-            f"PostgreSQL cannot hold a row of table {table.name} "
-            f"({str(error).partition(chr(10))[0]}), and nothing was restored. Restore the bundle "
-            "to a folder, mend the row there, and take a snapshot of that."
+            f"PostgreSQL cannot store a row of table {table.name} "
+            f"({str(error).partition(chr(10))[0]}). Nothing was restored. Restore the bundle to a "
+            "folder, correct the row there, and take a snapshot of the folder."
         ) from error
 
 
 def _contradiction(table: Table, error: object) -> DamagedBundle:
     return DamagedBundle(
-        f"The rows of table {table.name} of the bundle contradict each other or those before "
-        f"({str(error).partition(chr(10))[0]}), and nothing was restored. Restore another bundle."
+        f"The rows of table {table.name} in the bundle are inconsistent "
+        f"({str(error).partition(chr(10))[0]}). Nothing was restored. Restore another bundle."
     )
 
 
-def count_on(connection: Connection, numbers: dict[str, int]) -> None:
-    """Let every table go on after the last number that it has given out."""
+def set_numbers(connection: Connection, numbers: dict[str, int]) -> None:
+    """Make every numbered table continue after the last number that was assigned in it."""
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql("DELETE FROM sqlite_sequence")
     for table in tables():

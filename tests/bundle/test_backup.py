@@ -330,10 +330,10 @@ def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
         assert text in sceneprint("snapshot", "--data", data, "--to", to, expect=2).stderr
         assert not (folder / "bundles").exists() or names_in(folder / "bundles") == []
 
-    refused("there is no database", tmp_path / "typo")
+    refused("the database does not exist", tmp_path / "typo")
     refused("names no object store", to="s3://")
     (tmp_path / "file").touch()
-    refused("is no folder", to=tmp_path / "file")
+    refused("is not a folder", to=tmp_path / "file")
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").touch()
     refused("holds a.txt", to=tmp_path / "notes")

@@ -153,7 +153,7 @@ def test_what_is_there_stays(place, data, tmp_path, content, sceneprint):
     assert "notes holds a, b, c and 1 more" in said.stderr
     (tmp_path / "file").write_bytes(b"x")
     said = sceneprint("restore", place, "--data", tmp_path / "file", expect=2)
-    assert "file is no folder" in said.stderr
+    assert "file is not a folder" in said.stderr
     assert names_in(tmp_path) == ["data", "file", "notes"]
     assert content(data) == before
 
@@ -227,7 +227,7 @@ def test_two_at_once(place, tmp_path):
             inner.append(error)
 
     restore_to_folder(place, tmp_path / "new", progress=come)
-    assert "another process restores to it" in str(inner[0])
+    assert "another process is restoring to it" in str(inner[0])
     assert names_in(tmp_path / "new") == ["blobs", "sceneprint.db"]
 
 
