@@ -128,8 +128,8 @@ def test_manifests_that_lie(copy, place, refused):
     lies(lambda one: one.update(schema_revision="9999"), "9999", NewerSchema)
     for other in ({"format": "other"}, {"more": 1}, {"maps": "1"}):
         lies(lambda one, other=other: one.update(other), "the manifest of the bundle is damaged")
-    lies(lambda one: one.update(maps=2), "the rows that it holds")
-    lies(lambda one: one["frames"].update(indexed=3), "the rows that it holds")
+    lies(lambda one: one.update(maps=2), "its rows")
+    lies(lambda one: one["frames"].update(indexed=3), "its rows")
     lies(lambda one: one.update(blobs=8), "its blobs")
     lies(lambda one: one["parts"][0].update(digest="../../../../etc/passwd"), "no manifest")
     lies(lambda one: one["parts"][0].update(rows=99), "its rows of table")
@@ -218,7 +218,7 @@ def test_a_part_of_gigabytes_takes_no_memory(copy, refused):
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(data)
     rewrite(copy, lambda one: one["parts"][0].update(digest=digest, bytes=len(data)))
-    refused("longer than any that is written")
+    refused("too long or truncated")
 
 
 def test_places_without_a_bundle(tmp_path):

@@ -184,7 +184,7 @@ def test_somebody_else_is_faster(place, tmp_path, name):
         restore_to_folder(place, folder, progress=come)
         assert names_in(folder) == ["blobs", "other", "sceneprint.db"]
     else:
-        with pytest.raises(BundleError, match="cannot be put there"):
+        with pytest.raises(BundleError, match="cannot be moved there"):
             restore_to_folder(place, folder, progress=come)
     assert (folder / name).read_bytes() == b"somebody else's"
 
@@ -270,7 +270,7 @@ def test_a_mount_is_filled_and_never_moved(place, tmp_path):
     assert done.returncode == 0, done.stderr
     first, second, third = done.stdout.splitlines()
     assert first == "['blobs', 'lost+found', 'sceneprint.db']"
-    assert "small: what is in the bundle takes" in second
+    assert "small: the bundle needs" in second
     assert "The store is full" in third
 
 

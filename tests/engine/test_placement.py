@@ -235,7 +235,7 @@ def test_priors_of_any_deviation_in_range_are_used(
 def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> None:
     flat = np.eye(6)
     flat[0, 0] = 0.0
-    with pytest.raises(InvalidRequest, match="covariance of the prior is not one"):
+    with pytest.raises(InvalidRequest, match="covariance of the prior is not valid"):
         localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(flat)))
     unlike = np.eye(6)
     unlike[0, 1] = 0.5  # the first axis with the second, and not the second with the first
@@ -243,7 +243,7 @@ def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> Non
     hostile = np.eye(6)
     hostile[0, 1], hostile[1, 0] = 1e308, -1e308
     for given in (unlike, equal, hostile, -np.eye(6)):
-        with pytest.raises(InvalidRequest, match="covariance of the prior is not one"):
+        with pytest.raises(InvalidRequest, match="covariance of the prior is not valid"):
             localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
     for least, most, told in (
         (1e-320, 1.0, "from 1e-160 to 1, and"), (0.9e-12, 1.0, "from 9.49e-07 to 1, and"),
@@ -300,7 +300,7 @@ def test_a_sequence_needs_frames_and_odometry(full: Engine, uploads: Any) -> Non
     bare = uploads[0].meta.model_copy(update={"pose": None})
     one, other = (uploads[0].data, uploads[0].meta), (uploads[0].data, bare)
     for frames, why in (
-        ([one], "A sequence of 1 frames"), ([one] * 11, "A sequence of 11 frames"),
+        ([one], "The sequence has 1 frames"), ([one] * 11, "The sequence has 11 frames"),
         ([one, other], "frame 1 has no pose"),
         ([one, (uploads[6].data, uploads[6].meta)], "several parent frames"),
     ):  # fmt: skip
@@ -311,8 +311,8 @@ def test_a_sequence_needs_frames_and_odometry(full: Engine, uploads: Any) -> Non
 @pytest.mark.parametrize(
     ("change", "cause", "told"),
     [
-        ("scale", "scale", "times as far away as those of the map. Check `depth_scale`"),
-        ("wall", "one_plane", "Turn towards furniture"),
+        ("scale", "scale", "times as far away as those in the map. Check `depth_scale`"),
+        ("wall", "one_plane", "towards furniture"),
     ],
 )
 def test_what_is_not_found_names_its_likeliest_cause(

@@ -315,17 +315,17 @@ def test_waiting_answers_take_bounded_memory(engine, monkeypatch):
 def test_an_answer_comes_back_as_it_was():
     asked = Query(k=2, seed=9, validation={"evidence": 0.35}, filter={"robot": "r1"})
     base = ("base_link", np.arange(16.0).reshape(4, 4))
-    taken = QueryOrigin("r1", "run", 12.5)
+    origin = QueryOrigin("r1", "run", 12.5)
     for one in (
         stored(query=asked), replace(stored(), geometry=None), replace(stored(), geometry=b""),
-        replace(stored(), taken=taken, base=base, up=np.array([0.0, 0.0, 1.0])),
+        replace(stored(), origin=origin, base=base, up=np.array([0.0, 0.0, 1.0])),
     ):  # fmt: skip
         again = decode_answer(encode_answer(one))
         assert again.answer.model_dump_json() == one.answer.model_dump_json()
         assert again.query == one.query
         assert (again.model_id, again.geometry, again.at) == (one.model_id, one.geometry, one.at)
         assert (again.ranked, again.vector.tobytes()) == ((7, 3), one.vector.tobytes())
-        assert again.taken == one.taken
+        assert again.origin == one.origin
     assert again.base[0] == "base_link"
     assert (again.base[1] == base[1]).all()
     assert again.up.tolist() == [0.0, 0.0, 1.0]

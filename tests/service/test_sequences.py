@@ -39,7 +39,7 @@ def odometry(T: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("count", "poses", "more", "told"),
     [
-        (1, True, {}, "A sequence of 1 frames"),
+        (1, True, {}, "The sequence has 1 frames"),
         (2, False, {}, "frame 0 has no pose"),
         (2, True, {"k": "0"}, "greater than or equal to 1"),
         (2, True, {"colour": "red"}, "colour"),

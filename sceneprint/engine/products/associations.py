@@ -1,4 +1,4 @@
-"""Sessions associated with each other, or one session with itself, frame by frame.
+"""Associations of two sessions, or of a session with itself, frame by frame.
 
 sessions  --start-->  frames  --step-->  edges  --finish_association-->  verdicts, joins
 """
@@ -60,28 +60,32 @@ from sceneprint_client.api import Page
 from sceneprint_client.api.base import Transform
 from sceneprint_client.api.sessions import APART, Association, Edge, GraphFormat, NewAssociation
 
-#: Most frames of both sessions together: more are hours, and edges past what a page holds.
+#: Maximum number of frames of both sessions; more would take hours.
 MOST_FRAMES = 5000
 
 
 def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
-    """Return session and robot of both sides; of the one side for loop closures."""
+    """Return session and robot of each side; loop closures have one side."""
     robots: list[str | None] = [*(request.robots or [])] or [None] * len(request.sessions)
     return list(zip(request.sessions, robots, strict=True))
 
 
 def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> list[list[PathFrame]]:
-    """Return the frames of each session that pass the filter, by time. Raise InvalidRequest if a
-    session has no indexed frame, frames of several robots, or too many frames.
+    """Return the frames of each session that pass the filter, in order of time.
+
+    Raises
+    ------
+    InvalidRequest : If a session has no indexed frame, frames of several robots, or too many
+        frames.
     """
-    sides, found = sessions_of(request), []
+    sides, runs = sessions_of(request), []
     numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
     if request.filter is not None:
         passed = passing_frames(
             connection, row.number, request.filter, QueryOrigin(None, None, None)
         )
-        kept = set(passed.tolist())
-        numbers = [[number for number in own if number in kept] for own in numbers]
+        passing = set(passed.tolist())
+        numbers = [[number for number in own if number in passing] for own in numbers]
     if sum(map(len, numbers)) > MOST_FRAMES:
         raise InvalidRequest(
             f"The sessions have {sum(map(len, numbers))} frames, but an association takes at "
@@ -91,9 +95,9 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
         )
     for own in numbers:
         stops = path_frames(connection, own)
-        found.append([stops[number] for number in own if number in stops])
-    for stops_found, (session, robot) in zip(found, sides, strict=True):
-        robots = sorted({stop.robot or "" for stop in stops_found})
+        runs.append([stops[number] for number in own if number in stops])
+    for run, (session, robot) in zip(runs, sides, strict=True):
+        robots = sorted({stop.robot or "" for stop in run})
         if not robots:
             whose = "" if robot is None else f" of robot {robot!r:.80}"
             raise InvalidRequest(
@@ -104,15 +108,15 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
         if len(robots) > 1:
             raise InvalidRequest(
                 f"Session {session!r:.80} exists for several robots: {', '.join(robots)!r:.200}. "
-                "Name one in `robots`.",
+                "Specify one in `robots`.",
                 (("robots", "needed"),),
             )
-    return found
+    return runs
 
 
 def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
-    """Return the frames that the next one may be found near, in rising order: those of the other
-    session, or earlier ones of its own.
+    """Return the frames with which the next frame is compared, in ascending order: those of the
+    other session, or earlier ones of the same session.
     """
     place, target = progress["done"], progress["target"]
     if len(request.sessions) == 2:
@@ -120,8 +124,8 @@ def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
     apart = request.apart or (1 if request.not_within_s is not None else APART)
     before = np.array(target[: max(place - apart + 1, 0)], np.int64)
     if request.not_within_s is not None:
-        taken = np.array(progress["taken"], float)  # NaN where not known, which is before nothing
-        before = before[taken[: len(before)] < taken[place] - request.not_within_s]
+        times = np.array(progress["taken"], float)  # NaN if unknown, which compares as false
+        before = before[times[: len(before)] < times[place] - request.not_within_s]
     return np.sort(before)
 
 
@@ -134,7 +138,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     item_count = "edges"
 
     def start(self, connection: Connection, row: MapRow, request: NewAssociation) -> dict[str, Any]:
-        """Fix the frames of both sessions, in the order of time; see `runs_of`."""
+        """Return the initial progress with the frames of both sessions; see `runs_of`."""
         runs = runs_of(connection, row, request)
         source, target = runs[0], runs[-1]
         return {
@@ -158,7 +162,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             blobs = geometry_blobs(connection, [number], row.model_id)
         geometry = self._geometry(row, number, blobs)
         if number not in vectors or not alive or geometry is None:
-            if alive:  # damaged: it is signed again
+            if alive:  # the frame is damaged, so it is signed again
                 resign_frames(self._store, row, [number], row.model_id)
             progress["skipped"] += 1
             return []
@@ -187,7 +191,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             (one for one in matches if one.validation.status == "accepted"),
             key=lambda one: order[one.index],
         )
-        # a frame that is deleted from here on is left out where edges are listed
+        # edges with frames that are deleted later are left out of pages
         return [
             _item(number, one) for one in accepted if one.validation.overlap >= request.min_overlap
         ]
@@ -196,18 +200,18 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         self, task: LongJob, request: NewAssociation, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Check the edges against each other, and join the sessions where they agree."""
+        """Return the end of a job: verdicts on the edges, and joins of the sessions."""
         source, target = progress["source"], progress["target"]
         with self._store.database.read() as connection:
-            found = items_of(connection, task.job.number) + items
+            edges = items_of(connection, task.job.number) + items
             stops = path_frames(connection, {*source, *target})
         model = self._context.signers(task.of_map.model_id).model
         scale = model.answer.map.same_m / MapParameters().same_m
-        verdicts, counts, joins = finish_association(found, source, target, stops, request, scale)
+        verdicts, counts, joins = finish_association(edges, source, target, stops, request, scale)
         rooted = self._rooted(task, joins) if request.join and len(request.sessions) == 2 else []
         result = {
             "frames": len(source), "skipped": progress["skipped"],
-            "validated": progress["validated"], "edges": len(found), **counts, "joins": joins,
+            "validated": progress["validated"], "edges": len(edges), **counts, "joins": joins,
         }  # fmt: skip
         return SliceResult(
             True, progress, items + verdicts, result=result, event="association.found",
@@ -215,42 +219,39 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         )  # fmt: skip
 
     def _rooted(self, task: LongJob, joins: list[dict[str, Any]]) -> list[ParentJoin]:
-        """Return what strong joins lead to: the parent frame whose frames came first is the root.
-
-        Each of these joins comes to name it.
+        """Return the transforms of strong joins to the root, which is the parent frame with the
+        oldest frames, and set the field `root` of these joins.
         """
         with self._store.database.read() as connection:
             parents = [run.parent for run in posed_runs(connection, task.of_map.number)]
         place = {name: i for i, name in enumerate(dict.fromkeys(parents))}
-        found: dict[str, ParentJoin] = {}
+        rooted: dict[str, ParentJoin] = {}
         for one in joins:
             ends = one["from_parent"], one["to_parent"]
             if one["strength"] != "strong" or ends[0] == ends[1] or not place.keys() >= {*ends}:
                 continue
             root, parent = sorted(ends, key=place.__getitem__)
             T = np.array(one["transform"]["matrix"])
-            if parent in found or root in found:  # by a pair of frames before: one is enough
+            if parent in rooted or root in rooted:
                 continue
             one["root"] = root
-            found[parent] = ParentJoin(parent, root, T if root == ends[1] else inverse(T))
-        return list(found.values())
+            rooted[parent] = ParentJoin(parent, root, T if root == ends[1] else inverse(T))
+        return list(rooted.values())
 
     def _geometry(self, row: MapRow, number: int, blobs: Mapping[int, str]) -> Geometry | None:
-        """The artifact of a frame, of those that `blobs` names; None where it is damaged."""
-        if number not in blobs:  # deleted in the meantime
+        """Return the geometry of a frame; None if it was deleted or is damaged."""
+        if number not in blobs:  # the frame was deleted meanwhile
             return None
         try:
             return self._store.geometries.read(blobs[number])
-        except (DamagedBlob, UnreadableGeometry):  # one frame must not cost the others
+        except (DamagedBlob, UnreadableGeometry):  # the other frames are still useful
             resign_frames(self._store, row, [number], row.model_id)
             return None
 
     def _view(self, of: MapRow) -> tuple[MapRow, Model, IndexView]:
-        """Return the map as it is now: its model may have changed, and frames may be deleted. Raise
-        UnknownMap if it was deleted, even if another map has its name.
-        """
+        """Return the current row, model and view of a map; raise UnknownMap if it was deleted."""
         row = of
-        while True:  # its signer opened while no connection is held
+        while True:  # until the signer, which is loaded outside of a transaction, fits
             model = self._context.signers(row.model_id).model
             with self._store.database.read() as connection:
                 row = find_map(connection, of.name)
@@ -260,9 +261,15 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
                     return row, model, self._context.readers.view(connection, row)
 
     def undo_join(self, map_name: str, job_id: str) -> Association:
-        """Undo the join of an association: its frames get the poses that the remaining joins give
-        them, or those that were sent. Raise UnknownMap, UnknownJob or NotIndexed if there is no
-        finished association; without a join nothing changes.
+        """Undo the joins of an association, and return it.
+
+        Its frames get the poses that the remaining joins imply, or the poses as sent. An
+        association without a join does not change.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : If the association does not exist.
+        NotIndexed : If it has not succeeded.
         """
         with self._store.database.write() as connection:
             job = self.find(connection, map_name, job_id)
@@ -277,35 +284,35 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             return self.record_of(job, map_name)
 
     def check_removal(self, connection: Connection, job: JobRow) -> None:
-        """Raise JoinStands where poses of the map follow from an association."""
+        """Raise JoinStands if poses of the map depend on an association."""
         if job.map_number is not None and is_joined_by(connection, job.map_number, job.id):
             raise JoinStands(
-                f"Association {job.id} joined parent frames of its map, and only with it this can "
-                "be undone. Undo its join first: DELETE the path of the association with /join."
+                f"Association {job.id} joined parent frames of its map, so it is needed to undo "
+                "this. Undo its join first: DELETE the path of the association with /join."
             )
 
     def items(
         self, connection: Connection, job: JobRow, first: int, limit: int
     ) -> list[dict[str, Any]]:
-        """Return edges, with their verdicts when the association is over."""
-        found = super().items(connection, job, first, limit)
-        verdicts = [dict[str, Any](consistent=None, loops=None, closed=None)] * len(found)
-        if job.result is not None:  # as many verdicts follow the edges
+        """Return edges, with their verdicts after the association has succeeded."""
+        edges = super().items(connection, job, first, limit)
+        verdicts = [dict[str, Any](consistent=None, loops=None, closed=None)] * len(edges)
+        if job.result is not None:  # verdicts are stored after the edges
             after = job.result["edges"] + first
-            verdicts = items_of(connection, job.number, after, len(found))
-        return [item | verdict for item, verdict in zip(found, verdicts, strict=True)]
+            verdicts = items_of(connection, job.number, after, len(edges))
+        return [item | verdict for item, verdict in zip(edges, verdicts, strict=True)]
 
     def edges(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
         min_overlap: float = 0.0, *, consistent: bool | None = None,
     ) -> Page[Edge]:  # fmt: skip
-        """Return edges between frames that exist, in the order in which they were found.
+        """Return a page of edges between existing frames, in the order of the job.
 
         Parameters
         ----------
         map_name, job_id, cursor, limit : see `page_of_items`
-        min_overlap : least overlap
-        consistent : those that others support, or those that were outvoted; default: all
+        min_overlap : minimum overlap
+        consistent : True selects supported edges, False outvoted ones, None all
         """
 
         def records(connection: Connection, block: list[dict[str, Any]]) -> list[Edge]:
@@ -325,15 +332,18 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", min_overlap: float = 0.0,
         *, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
-        """Return the pose graph of an association that is over, as a file of a kind.
+        """Return the pose graph of an association as a file.
 
-        It has the edges of at least `min_overlap` that a second edge or a join supports, or, unless
-        `consistent`, all that were not outvoted; and with `odometry` one between each two
-        consecutive frames.
+        Parameters
+        ----------
+        min_overlap : minimum overlap of the edges
+        odometry : whether to add edges between consecutive frames
+        consistent : whether to select only edges that another edge or a join supports, instead of
+            all that were not outvoted
 
         Raises
         ------
-        UnknownMap, UnknownJob, NotIndexed : it does not exist, or did not succeed.
+        UnknownMap, UnknownJob, NotIndexed : If the association does not exist or has not succeeded.
         """
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)
@@ -357,8 +367,11 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
 
 def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> list[str]:
-    """Join parent frames in the commit that ends an association; no blob becomes unused. Raise
-    Swept if another association has joined one of them: the end is then concluded again.
+    """Join parent frames in the commit that ends an association; return no unused blobs.
+
+    Raises
+    ------
+    Swept : If another association joined one of the frames; the end of the job is then repeated.
     """
     for one in joins:
         if not join_parent(connection, task.of_map.number, one, task.job.id):
@@ -367,9 +380,9 @@ def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> li
 
 
 def _item(number: int, match: PairMatch) -> dict[str, Any]:
-    """An edge as it is kept."""
+    """Return the stored item of an edge."""
     v = match.validation
-    T = np.eye(4) if v.T_match_query is None else v.T_match_query  # an accepted one has one
+    T = np.eye(4) if v.T_match_query is None else v.T_match_query
     return {
         "from": number, "to": match.index, "T": T.ravel().tolist(),
         "covariance": None if v.covariance is None else v.covariance.ravel().tolist(),

@@ -1,4 +1,4 @@
-"""What all edges of an association say together: which to believe, and how sessions lie.
+"""Consensus of the edges of an association: their consistency, and joins of the sessions.
 
 edges, frames with poses  --finish_association-->  verdicts, joins
 """
@@ -27,60 +27,60 @@ from sceneprint.store.frame_queries import PathFrame
 from sceneprint.types import Floats
 from sceneprint_client.api.sessions import Join, NewAssociation
 
-#: What a vote of a weak edge counts beside that of a strong one.
+#: Weight of the vote of a weak edge, relative to a strong one.
 _WEAK = 0.5
 
 
 def finish_association(
-    found: list[dict[str, Any]], source: list[int], target: list[int], stops: dict[int, PathFrame],
-    asked: NewAssociation, scale: float = 1.0,
+    items: list[dict[str, Any]], source: list[int], target: list[int], stops: dict[int, PathFrame],
+    request: NewAssociation, scale: float = 1.0,
 ) -> tuple[list[dict[str, Any]], dict[str, int], list[dict[str, Any]]]:  # fmt: skip
-    """Check edges against each other, and let those that stand vote.
+    """Check edges against each other, and join parent frames by votes of the accepted edges.
 
-    An edge is consistent if a loop with an edge of another viewpoint closes, or if it agrees with
-    the join of the two parent frames that it leads between.
+    An edge is consistent if it closes a loop with an edge of another viewpoint, or agrees with the
+    join of its two parent frames.
 
     Parameters
     ----------
-    found : items of all edges
-    source, target : numbers of the frames of both runs, in the order of time
-    stops : what is known of them; deleted ones are missing
-    asked : see NewAssociation
-    scale : by which lengths of the model are longer than those for rooms
+    items : items of all edges
+    source, target : numbers of the frames of both runs, in order of time
+    stops : frames by number, without deleted ones
+    request : options of the association
+    scale : ratio of the model's lengths to those for rooms
 
     Returns
     -------
-    verdicts : one of each edge, in their order, as items
-    counts : consistent, inconsistent, unchecked
-    joins : as JSON
+    verdicts : verdict of each edge, in their order, as items
+    counts : numbers of consistent, inconsistent and unchecked edges
+    joins : joins as JSON
     """
     named = sorted({stop.parent for stop in stops.values() if stop.parent is not None})
     parents = {name: i for i, name in enumerate(named)}
     runs = _run(source, stops, parents), _run(target, stops, parents)
     places = [{number: i for i, number in enumerate(numbers)} for numbers in (source, target)]
     edges = LoopEdges(
-        np.array([places[0][item["from"]] for item in found], np.int64),
-        np.array([places[1][item["to"]] for item in found], np.int64),
-        np.array([item["T"] for item in found], float).reshape(-1, 4, 4),
-        np.array([1.0 if item["strength"] == "strong" else _WEAK for item in found]),
+        np.array([places[0][item["from"]] for item in items], np.int64),
+        np.array([places[1][item["to"]] for item in items], np.int64),
+        np.array([item["T"] for item in items], float).reshape(-1, 4, 4),
+        np.array([1.0 if item["strength"] == "strong" else _WEAK for item in items]),
     )
     cycles = CycleParameters().scaled(scale)
-    judged = judge_edges(edges, *runs, cycles, within_run=len(asked.sessions) == 1)
+    judged = judge_edges(edges, *runs, cycles, within_run=len(request.sessions) == 1)
     numbers = JoiningParameters(view_m=cycles.view_m)
-    joins, agree = _joins(found, edges, runs, judged, stops, asked, numbers)
+    joins, agree = _joins(items, edges, runs, judged, stops, request, numbers)
     confirmed = judged.supported | agree
     counts = {
         "consistent": int(confirmed.sum()), "inconsistent": int((~judged.accepted).sum()),
         "unchecked": int((judged.accepted & ~confirmed).sum()),
     }  # fmt: skip
-    told = [
-        {"consistent": True if sure else None if kept else False, "loops": loops, "closed": closed}
-        for sure, kept, loops, closed in zip(
+    verdicts = [
+        {"consistent": True if sure else None if stands else False, "loops": loops, "closed": closed}
+        for sure, stands, loops, closed in zip(
             confirmed.tolist(), judged.accepted.tolist(), judged.loops.tolist(),
             judged.closed.tolist(), strict=True,
         )
     ]  # fmt: skip
-    return told, counts, joins
+    return verdicts, counts, joins
 
 
 def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int]) -> RobotPath:
@@ -93,36 +93,36 @@ def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int
 
 
 def _joins(
-    found: list[dict[str, Any]], edges: LoopEdges, runs: tuple[RobotPath, RobotPath],
-    judged: EdgeVerdicts, stops: dict[int, PathFrame], asked: NewAssociation,
+    items: list[dict[str, Any]], edges: LoopEdges, runs: tuple[RobotPath, RobotPath],
+    judged: EdgeVerdicts, stops: dict[int, PathFrame], request: NewAssociation,
     numbers: JoiningParameters,
 ) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:  # fmt: skip
-    """A consensus of each two parent frames that edges lead between, and the edges that agree."""
+    """Return the join of each pair of parent frames with edges, and which edges agree with it."""
     between: dict[tuple[str, str], list[int]] = {}
     for i in np.flatnonzero(judged.accepted).tolist():
-        ends = [stops.get(found[i][side]) for side in ("from", "to")]
-        here, there = (None if end is None or end.pose is None else end.parent for end in ends)
-        # loop closures within one frame correct its drift, and join nothing
-        if here is not None and there is not None and (len(asked.sessions) == 2 or here != there):
-            between.setdefault((here, there), []).append(i)
-    told, agree = [], np.zeros(len(found), np.bool_)
-    for (here, there), chosen in sorted(between.items()):
+        ends = [stops.get(items[i][side]) for side in ("from", "to")]
+        a, b = (None if end is None or end.pose is None else end.parent for end in ends)
+        # loop closures within one parent frame do not join frames
+        if a is not None and b is not None and (len(request.sessions) == 2 or a != b):
+            between.setdefault((a, b), []).append(i)
+    joins, agree = [], np.zeros(len(items), np.bool_)
+    for (a, b), chosen in sorted(between.items()):
         own: NDArray[np.intp] = np.array(chosen)
         source, target = edges.source[own], edges.target[own]
         poses: tuple[Floats, Floats] = (runs[0].poses[source], runs[1].poses[target])
         votes = association_votes(edges.transforms[own], *poses, source, target, edges.weights[own])
-        one = join_sessions(votes, asked.seed, numbers)
+        one = join_sessions(votes, request.seed, numbers)
         agree[own] = one.agree & (one.T is not None)
-        first, second = (stops[found[chosen[0]][side]] for side in ("from", "to"))
-        told.append(
+        first, second = (stops[items[chosen[0]][side]] for side in ("from", "to"))
+        joins.append(
             Join(
                 from_session=first.session or "", to_session=second.session or "",
-                from_robot=first.robot, to_robot=second.robot, from_parent=here, to_parent=there,
-                transform=None if one.T is None else transform(one.T, there, here),
+                from_robot=first.robot, to_robot=second.robot, from_parent=a, to_parent=b,
+                transform=None if one.T is None else transform(one.T, b, a),
                 strength=one.strength, support=one.support, votes=len(own), rival=one.rival,
                 spread_m=None if one.T is None else one.spread_m,
                 spread_deg=None if one.T is None else math.degrees(one.spread_rad),
                 reason=one.reason,
             ).model_dump(mode="json")
         )  # fmt: skip
-    return told, agree
+    return joins, agree

@@ -1,8 +1,8 @@
-"""Start the associations that may join the parent frames of a map, without anybody asking.
+"""Automatic associations that may join the parent frames of a map.
 
-A map whose frames have poses in several parent frames gets an association of the largest session
-of each of them with the largest one of its root, once none of its frames waits to be signed. It is
-repeated only after the two sessions have grown, and never across a join that was undone.
+In a map with poses in several parent frames, the largest session of each parent frame is associated
+with the largest session of the root frame, once no frame waits for a signature. An association is
+repeated only after its sessions have grown, and not at all if its join was undone.
 """
 
 from __future__ import annotations
@@ -29,28 +29,26 @@ from sceneprint_client.api.sessions import NewAssociation
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at all maps.
+#: Seconds between two checks of all maps.
 LOOK_S = 5.0
-#: Frames that either session needs: a strong join has ten votes from five frames of each.
+#: Minimum number of frames in each session: a strong join has ten votes from five frames of each.
 LEAST_FRAMES = 5
-#: How many times as many frames as in the last association of two sessions are worth another.
+#: Growth factor of the number of frames after which two sessions are associated again.
 GROWTH = 1.25
-#: Associations of a map that are looked at, the newest first.
+#: Maximum number of newest associations of a map to consider.
 _JOBS = 200
 
 
 class JoinUpkeep:
-    """Starts associations of maps with several parent frames if `auto`; any number of processes
-    may.
-    """
+    """Starter of associations if `auto` is set; any number of processes may run it."""
 
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:
         self._store, self._bell, self._auto = store, bell, auto
         self._next = 0.0
-        self._settled: dict[int, int] = {}  # revisions of maps in which there was nothing to do
+        self._settled: dict[int, int] = {}  # revisions of maps without due associations
 
     def run(self) -> None:
-        """Look at all maps, if it is time. Errors are logged, and the next look tries again."""
+        """Check all maps if it is due; log errors, after which the next check tries again."""
         if not self._auto or time.monotonic() < self._next:
             return
         self._next = time.monotonic() + LOOK_S
@@ -62,11 +60,11 @@ class JoinUpkeep:
                 if before.get(row.number) == row.revision or self._look(row):
                     self._settled[row.number] = row.revision
         except SceneprintError as error:
-            log.warning("joins not looked for", extra={"error": str(error)})
+            log.warning("search for joins failed", extra={"error": str(error)})
 
     def _look(self, row: MapRow) -> bool:
-        """Start an association of a map where one is due; return whether nothing is left to do."""
-        with self._store.database.read() as connection:  # most often there is nothing: no lock
+        """Start an association of a map if one is due; return whether it needs no further check."""
+        with self._store.database.read() as connection:  # usually nothing is due, so no lock
             if _is_busy(connection, row):
                 return False
             if _due(connection, row) is None:
@@ -83,13 +81,13 @@ class JoinUpkeep:
 
 
 def _is_busy(connection: Connection, row: MapRow) -> bool:
-    """Return whether frames of a map wait to be signed: more of a session are about to come."""
+    """Return whether frames of a map wait for a signature."""
     states = count_states(connection, row.number)
     return bool(states.get(FrameState.RECEIVED) or states.get(FrameState.SIGNING))
 
 
 def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
-    """Return the association that may join a map's parent frames next, if there is one."""
+    """Return the next association that may join parent frames of a map; None if none is due."""
     runs = posed_runs(connection, row.number)
     largest = _largest(runs)
     if len(largest) < 2:
@@ -110,19 +108,19 @@ def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
 
 
 def _largest(runs: Sequence[ParentRun]) -> list[ParentRun]:
-    """Return the largest named session of each parent frame, that of the root first."""
-    found: dict[str, ParentRun] = {}
+    """Return the largest named session of each parent frame, the root's first."""
+    runs_by_parent: dict[str, ParentRun] = {}
     for one in runs:
-        if one.session is not None and one.frames > found.get(one.parent, _NONE).frames:
-            found[one.parent] = one
-    return list(found.values())
+        if one.session is not None and one.frames > runs_by_parent.get(one.parent, _NONE).frames:
+            runs_by_parent[one.parent] = one
+    return list(runs_by_parent.values())
 
 
 _NONE = ParentRun("", None, None, 0, 0)
 
 
 def _request(one: ParentRun, root: ParentRun) -> NewAssociation | None:
-    """Return the association of two sessions, if it can be made."""
+    """Return the request to associate two sessions; None if they are too small or too large."""
     few = min(one.frames, root.frames) < LEAST_FRAMES
     if few or one.frames + root.frames > MOST_FRAMES:
         return None
@@ -136,11 +134,11 @@ def _request(one: ParentRun, root: ParentRun) -> NewAssociation | None:
 
 
 def _is_worth(request: NewAssociation, total: int, jobs: Sequence[JobRow]) -> bool:
-    """Return whether two sessions were not associated yet, or have grown since."""
+    """Return whether two sessions were not associated yet, or have grown since then."""
     for job in jobs:
         before = NewAssociation.model_validate(job.data or {})
         if {*sessions_of(before)} == {*sessions_of(request)}:
             progress = job.progress or {}
-            known = len(progress.get("source", ())) + len(progress.get("target", ()))
-            return job.state == JobState.SUCCEEDED and total >= GROWTH * known
+            associated = len(progress.get("source", ())) + len(progress.get("target", ()))
+            return job.state == JobState.SUCCEEDED and total >= GROWTH * associated
     return True

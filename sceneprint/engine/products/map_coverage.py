@@ -1,9 +1,9 @@
-"""Coverage of a map: its frames queried against the rest of it, one by one.
+"""Coverage of a map: each frame is localised in the rest of the map.
 
-    frames, in the order of runs  -->  an item each  --coverage_plans-->  plans, counts
+    frames  --step-->  items  --coverage_plans-->  plans, counts
 
-A frame that is queried finds neither itself nor, as asked, the frames taken around it or its whole
-session. The answers are those that a robot would get; none is kept.
+A query excludes the frame itself and, depending on the request, frames of the same time or session.
+Its answer is otherwise that for a robot, and is not stored.
 """
 
 from __future__ import annotations
@@ -61,24 +61,27 @@ from sceneprint_client.api.coverage import (
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """A coverage job that has succeeded."""
+    """A succeeded coverage job."""
 
     request: NewMapCoverage
     result: CoverageResult
     plans: list[CoveragePlan]
 
 
-#: Parent frames that get a plan: those of most queried frames.
+#: Maximum number of parent frames with a plan; those with the most queried frames come first.
 MOST_PLANS = 20
-#: Longer than any session, seconds.
+#: Duration in seconds that exceeds any session.
 _FOREVER_S = 1e12
-#: What costs a frame, and not the job: it was deleted or edited meanwhile, or is damaged.
+#: Errors after which a frame is skipped: it was deleted, edited or damaged.
 _SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, UnreadableGeometry)
 
 
 def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage) -> list[int]:
-    """Return the numbers of the frames that a coverage job queries, in its order; raise
-    InvalidRequest if there is none.
+    """Return the numbers of the frames that a coverage job queries, in its order.
+
+    Raises
+    ------
+    InvalidRequest : If no frame passes the filter.
     """
     numbers = numbers_of_runs(connection, row.number, request.session, request.robot)[
         :: request.every
@@ -111,7 +114,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         self._queries = queries
 
     def start(self, connection: Connection, row: MapRow, request: NewMapCoverage) -> dict[str, Any]:
-        """Choose the frames to query; raise InvalidRequest if there is none."""
+        """Return the initial progress with the frames to query; see `frames_to_query`."""
         numbers = frames_to_query(connection, row, request)
         return {
             "done": 0, "total": len(numbers), "skipped": 0, "frames": numbers,
@@ -121,7 +124,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
     def step(
         self, task: LongJob, request: NewMapCoverage, progress: dict[str, Any]
     ) -> list[dict[str, Any]]:
-        """Query one frame; skip it where that cannot be done."""
+        """Query one frame; skip it if it was deleted or is damaged."""
         row, number = task.of_map, progress["frames"][progress["done"]]
         with self._store.database.read() as connection:
             stop = path_frames(connection, [number]).get(number)
@@ -134,29 +137,30 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
             return []
         item = outcome_of(answer, stop, request)
         with self._store.database.read() as connection:
-            found = [living_frame(connection, row.number, one) for one in item["look_alikes"]]
-        item["look_alikes"] = [frame.number for frame in found if frame is not None]
+            look_alikes = [living_frame(connection, row.number, one) for one in item["look_alikes"]]
+        item["look_alikes"] = [frame.number for frame in look_alikes if frame is not None]
         return [{"frame": number} | item]
 
     def _answer(self, row: MapRow, stop: PathFrame, request: NewMapCoverage) -> Answer:
-        """Return what a robot that sees a frame would be answered without the frames that are left
-        out. The query takes one core: the others are for robots that wait.
+        """Return the answer to a frame without the excluded frames.
+
+        The query uses one core; the other cores remain for queries of robots.
         """
         plain = Query(seed=request.seed, keep=False)
-        taken = QueryOrigin(stop.robot, stop.session, stop.captured_at)
+        origin = QueryOrigin(stop.robot, stop.session, stop.captured_at)
         left_out_s = request.not_within_s
-        if request.other_sessions:  # whole sessions, also of frames without a time
-            taken, left_out_s = replace(taken, captured_at=stop.captured_at or 0.0), _FOREVER_S
+        if request.other_sessions:  # excludes the whole session, even without times
+            origin, left_out_s = replace(origin, captured_at=stop.captured_at or 0.0), _FOREVER_S
         query = plain
-        if left_out_s > 0 and taken.session is not None and taken.captured_at is not None:
+        if left_out_s > 0 and origin.session is not None and origin.captured_at is not None:
             query = plain.model_copy(update={"filter": Filter(not_within_s=left_out_s)})
 
         def ask(rows: list[MapRow]) -> Answer:
-            self._context.signers(rows[0].model_id)  # while no connection is held
+            self._context.signers(rows[0].model_id)  # outside of a transaction, as loading is slow
             ready = prepare_stored(self._store, self._context.signers, row.name, stop.id, plain)
             if ready.frame is None or ready.frame[0] != stop.number:
                 raise UnknownFrame(f"Frame {stop.id} was deleted, and a new frame has its id.")
-            ready = replace(ready, taken=taken)
+            ready = replace(ready, origin=origin)
             return self._queries.answer(rows, ready, query, Deadline(None))
 
         return steadily(self._store, [row.name], ask)
@@ -165,17 +169,17 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         self, task: LongJob, request: NewMapCoverage, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Return plans and counts of all frames; the plans are items behind those of the frames."""
+        """Return the end of a job: counts, and plans as items after those of the frames."""
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
-            found = items_of(connection, task.job.number) + items
-            plans, cell_m = plans_of(connection, row, found, request.cell_m)
+            results = items_of(connection, task.job.number) + items
+            plans, cell_m = plans_of(connection, row, results, request.cell_m)
             states = count_states(connection, row.number)
             label = model_label(model_names(connection)[row.model_id], row.model_id)
-        counts = Counter(item["outcome"] for item in found)
+        counts = Counter(item["outcome"] for item in results)
         result = CoverageResult(
             **{name: counts[name] for name in COVERAGE_OUTCOMES},
-            frames=len(found), skipped=progress["skipped"],
+            frames=len(results), skipped=progress["skipped"],
             model=label, revision=progress["revision"], last_revision=row.revision,
             map_frames=states.get("indexed", 0), cell_m=cell_m,
         )  # fmt: skip
@@ -185,19 +189,19 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         )  # fmt: skip
 
     def details(self, connection: Connection, job: JobRow) -> dict[str, Any]:
-        """Return the plans of a job that has succeeded."""
+        """Return the plans of a succeeded job."""
         return {"plans": None if job.result is None else _plans(connection, job)}
 
     def frames(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
         outcome: CoverageOutcome | None = None,
     ) -> Page[CoverageFrame]:  # fmt: skip
-        """Return queried frames that still exist, also while more are queried.
+        """Return a page of queried frames that still exist, even while the job runs.
 
         Parameters
         ----------
         map_name, job_id, cursor, limit : see `page_of_items`
-        outcome : of the frames; default: of any
+        outcome : outcome of the frames; None selects all
         """
 
         def records(connection: Connection, block: list[dict[str, Any]]) -> list[CoverageFrame]:
@@ -217,13 +221,13 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
 
         Parameters
         ----------
-        map_name, job_id : of the coverage job
-        since : id of the earlier one
+        map_name, job_id : map and id of the later job
+        since : id of the earlier job
 
         Raises
         ------
-        UnknownMap, UnknownJob, NotIndexed : one of them does not exist, or did not succeed.
-        InvalidRequest : they cannot be compared.
+        UnknownMap, UnknownJob, NotIndexed : If a job does not exist or has not succeeded.
+        InvalidRequest : If the results cannot be compared.
         """
         with self._store.database.read() as connection:
             after = self._measured(connection, map_name, job_id)
@@ -239,14 +243,14 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
 
     def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
         job = self.find(connection, map_name, job_id)
-        found = self.require_success(job, "plans")
+        stored = self.require_success(job, "plans")
         request = NewMapCoverage.model_validate(job.data or {})
-        result = CoverageResult.model_validate(found)
+        result = CoverageResult.model_validate(stored)
         return _Measured(request, result, _plans(connection, job))
 
 
 def _require_comparable(before: _Measured, after: _Measured) -> None:
-    """Raise InvalidRequest where two results say different things about the same place."""
+    """Raise InvalidRequest unless two results have the same options, cells and axes."""
     names = [
         name
         for name in NewMapCoverage.model_fields
@@ -256,14 +260,14 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
         raise InvalidRequest(
             f"The two results cannot be compared: {', '.join(names)} of their requests differ. "
             "Measure again with the same options.",
-            (("since", "other options"),),
+            (("since", "different options"),),
         )
     if before.result.cell_m != after.result.cell_m:
         raise InvalidRequest(
             f"The two results cannot be compared: their cells are {before.result.cell_m:g} m and "
             f"{after.result.cell_m:g} m wide. Measure again with `cell_m` = "
             f"{before.result.cell_m:g}.",
-            (("since", "cells of another width"),),
+            (("since", "different width of cells"),),
         )
     axes = {plan.parent_frame: [*plan.x_axis, *plan.y_axis] for plan in before.plans}
     for plan in after.plans:
@@ -271,16 +275,16 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
         if not np.allclose(axes.get(plan.parent_frame, own), own, atol=1e-3):
             raise InvalidRequest(
                 f"The two results cannot be compared: the vertical of parent frame "
-                f"{plan.parent_frame!r:.80} was another. Give the map its `up`, and measure both "
+                f"{plan.parent_frame!r:.80} has changed. Set `up` of the map, and measure both "
                 "again.",
-                (("since", "another vertical"),),
+                (("since", "different vertical"),),
             )
 
 
 def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
-    """Return the plans of a job that has succeeded: the items behind those of its frames."""
-    found = items_of(connection, job.number, (job.result or {})["frames"])
-    return [CoveragePlan.model_validate(one) for one in found]
+    """Return the plans of a succeeded job, which are its items after those of the frames."""
+    items = items_of(connection, job.number, (job.result or {})["frames"])
+    return [CoveragePlan.model_validate(one) for one in items]
 
 
 def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> CoverageFrame:
@@ -296,29 +300,26 @@ def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> Coverage
     )  # fmt: skip
 
 
-# One answer judged.
-
-
 def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict[str, Any]:
-    """What became of a queried frame, as an item; its look-alikes by id.
+    """Return the item of a queried frame: its outcome, errors, and ids of look-alikes.
 
     Parameters
     ----------
-    answer : to the frame, without those that are left out
-    stop : the frame, with its own pose where that is known
-    request : with what counts as right
+    answer : answer to the frame, without the excluded frames
+    stop : queried frame
+    request : options with the tolerances of a correct pose
     """
     own = None if stop.pose is None else np.array(stop.pose)
-    there = None if answer.location is None else answer.location.pose
-    off = _difference(there, own, stop.parent)
+    location = None if answer.location is None else answer.location.pose
+    off = _difference(location, own, stop.parent)
     outcome: CoverageOutcome = "not_found"
     if answer.status == "found":
         outcome = "unchecked" if off is None else "found" if _is_within(off, request) else "wrong"
     elif answer.status == "ambiguous":
         outcome = "ambiguous"
     poses = [one.pose for one in answer.alternatives]
-    if outcome == "wrong" and there is not None:
-        poses = [there]
+    if outcome == "wrong" and location is not None:
+        poses = [location]
     elsewhere = [
         pose
         for pose in poses
@@ -335,7 +336,7 @@ def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict
 def _difference(
     pose: Transform | None, own: Floats | None, parent: str | None
 ) -> tuple[float, float] | None:
-    """Metres and radians between a found pose and a frame's own, if they can be compared."""
+    """Return metres and radians between two poses; None if they cannot be compared."""
     if pose is None or own is None or pose.parent_frame != parent:
         return None
     return pose_difference(np.array(pose.matrix), own)
@@ -345,13 +346,13 @@ def _is_within(off: tuple[float, float], request: NewMapCoverage) -> bool:
     return off[0] <= request.tolerance_m and math.degrees(off[1]) <= request.tolerance_deg
 
 
-#: How far the pose that a match suggests may be from one that an answer names, metres.
+#: Maximum distance between a pose of an answer and that of a match that suggests it, metres.
 _SAME_POSE_M = 1.0
 
 
 def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
-    """Of each pose the match that suggests it: ids, each once."""
-    found: list[str] = []
+    """Return the id of the match that suggests each pose, each once."""
+    frame_ids: list[str] = []
     for pose in poses:
         near = [
             (off[0], one.frame_id)
@@ -362,17 +363,14 @@ def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
             and off[0] <= _SAME_POSE_M
         ]  # fmt: skip
         if near:
-            found.append(min(near)[1])
-    return list(dict.fromkeys(found))
-
-
-# All items together: plans.
+            frame_ids.append(min(near)[1])
+    return list(dict.fromkeys(frame_ids))
 
 
 def plans_of(
     connection: Connection, row: MapRow, items: Sequence[dict[str, Any]], cell_m: float | None
 ) -> tuple[list[CoveragePlan], float]:
-    """Plans of the queried frames that have poses, and the width of their cells, metres."""
+    """Return the plans of queried frames with poses, and the width of their cells in metres."""
     outcomes = {item["frame"]: item["outcome"] for item in items}
     by_parent: dict[str, list[PathFrame]] = {}
     for stop in path_frames(connection, outcomes).values():

@@ -1,6 +1,6 @@
-"""The pose graph of an association, as a file for an optimiser.
+"""Pose graphs of associations, as files for optimisers.
 
-frames, edges that were kept, joins  --pose_graph-->  PoseGraph  --graph_text-->  g2o, TUM, JSON
+frames, edges, joins  --pose_graph-->  PoseGraph  --graph_text-->  g2o, TUM, JSON
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from sceneprint.store.frame_queries import PathFrame
 from sceneprint.types import Floats
 from sceneprint_client.api.sessions import Graph, GraphEdge, GraphFormat, Vertex
 
-#: Deviation of an edge without a covariance of its own, metres and radians.
-_UNTOLD = (0.05, math.radians(1.5))
-#: Of odometry between two frames: of a step, and a share of the way and of the turn.
+#: Deviations of an edge without a covariance, metres and radians.
+_DEVIATIONS = (0.05, math.radians(1.5))
+#: Deviations of odometry: a constant (metres, radians), plus a share of distance and rotation.
 _STEP, _SHARE = (0.005, math.radians(0.2)), 0.02
 
 MEDIA_TYPES = {"g2o": "text/x-g2o", "tum": "text/plain", "json": "application/json"}
@@ -32,15 +32,15 @@ MEDIA_TYPES = {"g2o": "text/x-g2o", "tum": "text/plain", "json": "application/js
 
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """Frames and what holds them together.
+    """A pose graph of frames.
 
     Parameters
     ----------
-    stops : the vertices, run after run in the order of time
-    poses : where each is; None where nothing tells
-    frames : which frame each pose is in
-    edges : between places of `stops`
-    kinds : association or odometry, of each edge
+    stops : vertices: the frames of each run in order of time
+    poses : pose of each vertex; None if unknown
+    frames : parent frame of each pose
+    edges : edges between indexes of `stops`
+    kinds : kind of each edge: association or odometry
     """
 
     stops: list[PathFrame]
@@ -54,22 +54,22 @@ def pose_graph(
     runs: Sequence[Sequence[PathFrame]], items: Sequence[Mapping[str, Any]],
     joins: Sequence[Mapping[str, Any]], *, odometry: bool,
 ) -> PoseGraph:  # fmt: skip
-    """Put an association's graph together.
+    """Return the pose graph of an association.
 
     Parameters
     ----------
-    runs : frames of each session, in the order of time
-    items : the edges, whose frames are all there
-    joins : of the association's result
-    odometry : whether to add an edge between each two consecutive frames with poses
+    runs : frames of each session, in order of time
+    items : items of the edges, whose frames must be in `runs`
+    joins : joins in the association's result
+    odometry : whether to add edges between consecutive frames with poses
     """
     stops = [stop for run in runs for stop in run]
     place = {stop.number: i for i, stop in enumerate(stops)}
     edges, kinds = [], []
     for item in items:
-        # T_to_from: the frame that was found is the first vertex
-        T, told = np.array(item["T"], float).reshape(4, 4), item["covariance"]
-        covariance = _diagonal(*_UNTOLD) if told is None else np.array(told).reshape(6, 6)
+        # T_to_from, so the matched frame is the first vertex
+        T, c = np.array(item["T"], float).reshape(4, 4), item["covariance"]
+        covariance = _diagonal(*_DEVIATIONS) if c is None else np.array(c).reshape(6, 6)
         ends = place[item["to"]], place[item["from"]]
         edges.append(PoseEdge(*ends, T, information_of(covariance, T)))
     kinds = ["association"] * len(edges)
@@ -82,7 +82,7 @@ def pose_graph(
 
 
 def _steps(run: Sequence[PathFrame], place: Mapping[int, int]) -> list[PoseEdge]:
-    found = []
+    edges = []
     for a, b in pairwise(run):
         if a.pose is None or b.pose is None or a.parent != b.parent:
             continue
@@ -90,8 +90,8 @@ def _steps(run: Sequence[PathFrame], place: Mapping[int, int]) -> list[PoseEdge]
         metres = _STEP[0] + _SHARE * float(np.linalg.norm(T[:3, 3]))
         radians = _STEP[1] + _SHARE * rotation_angle(T[:3, :3])
         information = information_of(_diagonal(metres, radians), T)
-        found.append(PoseEdge(place[a.number], place[b.number], T, information))
-    return found
+        edges.append(PoseEdge(place[a.number], place[b.number], T, information))
+    return edges
 
 
 def _diagonal(metres: float, radians: float) -> Floats:
@@ -101,7 +101,7 @@ def _diagonal(metres: float, radians: float) -> Floats:
 def _placed(
     stops: Sequence[PathFrame], edges: Sequence[PoseEdge], joins: Sequence[Mapping[str, Any]]
 ) -> tuple[list[Floats | None], list[str | None]]:
-    """Poses, moved into the frame of most by the joins; without a pose, by the first edge."""
+    """Return the poses, moved to the most common parent frame by joins, and their parent frames."""
     counted = Counter(stop.parent for stop in stops if stop.pose is not None)
     parents = sorted((name for name in counted if name), key=lambda name: (-counted[name], name))
     into: dict[str, tuple[str, Floats]] = {}  # T_root_parent, by parent
@@ -126,24 +126,24 @@ def _placed(
     return poses, frames
 
 
-def _joined(here: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, Floats]]:
-    """Frames that are joined to one, with T_here_there."""
-    found = []
+def _joined(parent: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, Floats]]:
+    """Return the parent frames that are joined to one, with T_parent_neighbour."""
+    neighbours = []
     for one in joins:
         if one["transform"] is None or one["from_parent"] == one["to_parent"] or one.get("undone"):
             continue
         T = np.array(one["transform"]["matrix"])
-        if one["to_parent"] == here:
-            found.append((one["from_parent"], T))
-        if one["from_parent"] == here:
-            found.append((one["to_parent"], inverse(T)))
-    return found
+        if one["to_parent"] == parent:
+            neighbours.append((one["from_parent"], T))
+        if one["from_parent"] == parent:
+            neighbours.append((one["to_parent"], inverse(T)))
+    return neighbours
 
 
 def _spread(
     poses: list[Floats | None], frames: list[str | None], edges: Sequence[PoseEdge]
 ) -> None:
-    """Give frames without a pose one by the edges that lead to them, nearest first."""
+    """Set poses of frames without one by breadth-first search along the edges."""
     near: dict[int, list[tuple[int, Floats]]] = {}
     for edge in edges:
         near.setdefault(edge.first, []).append((edge.second, edge.T))
@@ -159,10 +159,10 @@ def _spread(
 
 
 def graph_text(graph: PoseGraph, kind: GraphFormat) -> str:
-    """A graph as a file.
+    """Return a graph as the text of a file.
 
-    A trajectory has the vertices with a stamp whose poses are in the frame of most. In g2o, where
-    every vertex has a pose, one without stands at the origin.
+    A TUM trajectory contains the vertices with stamps and poses in the most common parent frame. In
+    g2o, vertices without a pose are at the origin.
     """
     if kind == "json":
         return _json(graph).model_dump_json()
@@ -172,7 +172,7 @@ def graph_text(graph: PoseGraph, kind: GraphFormat) -> str:
 
 
 def _main(graph: PoseGraph) -> str | None:
-    """The frame that most poses are in."""
+    """Return the most common parent frame of the poses."""
     counted = Counter(name for name in graph.frames if name is not None)
     return min(counted, key=lambda name: (-counted[name], name), default=None)
 
@@ -186,8 +186,8 @@ def _tum(graph: PoseGraph) -> str:
     ]
     comments = [
         f"poses of the sensors' frames in {main or 'no frame'}, metres",
-        f"{len(rows)} poses; {len(graph.stops) - len(rows)} frames left out, as they have no "
-        "stamp or are not joined to it",
+        f"{len(rows)} poses; {len(graph.stops) - len(rows)} frames without a stamp or a pose in "
+        "this frame left out",
         f"t: {stamped}" if rows else "empty: no frame with a stamp has a pose",
         "t tx ty tz qx qy qz qw",
     ]
@@ -195,8 +195,8 @@ def _tum(graph: PoseGraph) -> str:
 
 
 def _stamps(graph: PoseGraph) -> tuple[Sequence[float | None], str]:
-    """A stamp for each vertex, and what it is: its time; its place in the session where none has a
-    time and all have places of their own; else its number.
+    """Return a stamp for each vertex, and its meaning: times if any vertex has one, else distinct
+    places in the session, else numbers of vertices.
     """
     times = [stop.captured_at for stop in graph.stops]
     if any(at is not None for at in times):

@@ -1,8 +1,8 @@
-"""One mechanism for what jobs compute from a map.
+"""Base classes of the products that jobs compute from maps.
 
     request  --begin-->  queued job  --slices-->  items, files, result  --get | list_all-->  record
 
-A product adds its parameters, its steps and its result. Its job runs in slices; see `tasks`.
+A product defines its request, its steps and its result. Its job runs in slices; see `tasks`.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ Record = TypeVar("Record", bound=Product)
 
 
 class Numbered(Protocol):
-    """The record of an item, which knows its place among the items of its job."""
+    """The record of an item, with its number in the job."""
 
     number: int
 
 
 Item = TypeVar("Item", bound=Numbered)
 
-#: Below uploads and re-encodings: a worker does a slice when nothing else waits.
+#: Priority below uploads and re-encodings, so that slices run only when no other job waits.
 BACKGROUND = REENCODING_PRIORITY - 1
-#: Longest slice in seconds: an upload that arrives meanwhile waits for it.
+#: Maximum duration of a slice in seconds, for which an upload may have to wait.
 SLICE_S = 3.0
-#: Items that are read at once.
+#: Number of items to read at once.
 _BLOCK = 500
 
 
@@ -54,10 +54,10 @@ class Products(ABC, Generic[Request, Record]):
 
     Attributes
     ----------
-    kind : of the jobs, such as coverage
-    record : of the API
-    priority : of the jobs
-    item_count : field of a result that counts the items; what concludes a job follows them
+    kind : kind of the jobs, such as coverage
+    record : class of the API record
+    priority : priority of the jobs
+    item_count : field of a result with the number of items; other rows of the job follow them
     """
 
     kind: ClassVar[str]
@@ -68,39 +68,38 @@ class Products(ABC, Generic[Request, Record]):
     def __init__(self, context: Context) -> None:
         self._context, self._store = context, context.store
 
-    # what each product adds
-
     def start(self, connection: Connection, row: MapRow, request: Request) -> dict[str, Any]:
-        """Return the progress of a job that has done nothing yet, with `done` and `total`; raise
-        InvalidRequest if the map lacks what the request names.
+        """Return the initial progress of a job, with `done` and `total`.
+
+        Raises
+        ------
+        InvalidRequest : If the map lacks sessions or frames that the request names.
         """
         raise NotImplementedError
 
     @abstractmethod
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Do a slice of a job: some of its work, or the conclusion."""
+        """Run a slice of a job: some of its steps, or the conclusion."""
 
     def fields(self, job: JobRow) -> dict[str, Any]:
-        """Return the fields of a record that the request of a job fills."""
+        """Return the fields of a record that depend on the request of a job."""
         return {"request": job.data or {}}
 
     def details(self, connection: Connection, job: JobRow) -> dict[str, Any]:
-        """Return fields of a record that lists leave out."""
+        """Return the fields of a record that pages of records leave out."""
         del connection, job
         return {}
 
     def check_removal(self, connection: Connection, job: JobRow) -> None:
-        """Raise Conflict where a map depends on a job."""
+        """Raise Conflict if a map depends on a job."""
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
-        """Return whether files of a job show a frame that was deleted."""
+        """Return whether files of a job show a deleted frame."""
         del connection, job
         return False
 
-    # the mechanism
-
     def begin(self, map_name: str, request: Request) -> Record:
-        """Queue a job; raise UnknownMap if there is no such map, and InvalidRequest as `start`
+        """Queue a job; raise UnknownMap if the map does not exist, and InvalidRequest as `start`
         does.
         """
         with self._store.database.read() as connection:
@@ -108,28 +107,32 @@ class Products(ABC, Generic[Request, Record]):
         data = request.model_dump(mode="json", exclude_unset=True)
         bell = self._context.bell
         job, _ = queue_task(self._store, bell, self.kind, map_name, data, self.priority)
-        begun = self.get(map_name, job.job_id)
-        if begun.progress is None:
+        record = self.get(map_name, job.job_id)
+        if record.progress is None:
             total = Progress(done=0, total=progress["total"])
-            begun = begun.model_copy(update={"progress": total})
-        return begun
+            record = record.model_copy(update={"progress": total})
+        return record
 
     def restart(self, row: MapRow, request: Request) -> dict[str, Any]:
-        """Return what `start` returns for a map as it is now."""
+        """Return the result of `start` for the current row of a map."""
         with self._store.database.read() as connection:
             return self.start(connection, current_map(connection, row), request)
 
     def list_all(self, map_name: str, cursor: str | None = None, limit: int = 100) -> Page[Record]:
-        """Return a page of the jobs of a map, newest first. Raise UnknownMap, and InvalidRequest
-        for a cursor that was not issued.
+        """Return a page of the jobs of a map, newest first.
+
+        Raises
+        ------
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the service did not issue the cursor.
         """
         seals = self._store.seals
         before = seals.row("job", cursor)
         with self._store.database.read() as connection:
             find_map(connection, map_name)
-            found = queue.list_jobs(connection, before, limit + 1, None, self.kind, [map_name])
-        more = seals.next_cursor("job", [one.job.number for one in found], limit)
-        items = [self.record_of(one.job, map_name) for one in found[:limit]]
+            rows = queue.list_jobs(connection, before, limit + 1, None, self.kind, [map_name])
+        more = seals.next_cursor("job", [one.job.number for one in rows], limit)
+        items = [self.record_of(one.job, map_name) for one in rows[:limit]]
         return Page[self.record](items=items, next_cursor=more)  # type: ignore[name-defined]
 
     def get(self, map_name: str | None, job_id: str) -> Record:
@@ -139,9 +142,12 @@ class Products(ABC, Generic[Request, Record]):
             return self.record_of(job, map_name, **self.details(connection, job))
 
     def remove(self, map_name: str | None, job_id: str) -> None:
-        """Delete a job with its results, also while a worker runs it. Raise UnknownMap or
-        UnknownJob if it does not exist, and Conflict if the map depends on it (see
-        `check_removal`).
+        """Delete a job with its results, even while a worker runs it.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : If the job does not exist.
+        Conflict : If the map depends on the job; see `check_removal`.
         """
         with self._store.database.write() as connection:
             job = self.find(connection, map_name, job_id)
@@ -154,26 +160,26 @@ class Products(ABC, Generic[Request, Record]):
         collect_deleted_blobs(self._store, blobs)
 
     def forget(self) -> int:
-        """Delete the jobs whose files show deleted frames; return how many."""
+        """Delete the jobs whose files show deleted frames; return their number."""
         with self._store.database.read() as connection:
             jobs = queue.jobs_with_files(connection, self.kind)
-            gone = [job.id for job in jobs if self.shows_deleted(connection, job)]
-        for job_id in gone:
-            with suppress(UnknownJob):  # somebody else has deleted it
+            stale = [job.id for job in jobs if self.shows_deleted(connection, job)]
+        for job_id in stale:
+            with suppress(UnknownJob):  # another process deleted the job
                 self.remove(None, job_id)
-        return len(gone)
+        return len(stale)
 
     def find(self, connection: Connection, map_name: str | None, job_id: str) -> JobRow:
         """Return the row of a job.
 
         Parameters
         ----------
-        map_name : of its map; None for any
+        map_name : name of the map; None for any map
 
         Raises
         ------
-        UnknownMap : no such map.
-        UnknownJob : the map has no job of this kind and id.
+        UnknownMap : If the map does not exist.
+        UnknownJob : If the map has no job of this kind and id.
         """
         row = None if map_name is None else find_map(connection, map_name)
         with suppress(UnknownJob):
@@ -183,14 +189,14 @@ class Products(ABC, Generic[Request, Record]):
         raise self.unknown(job_id, "" if row is None else f" in map {row.name!r}")
 
     def unknown(self, job_id: str, where: str = "") -> UnknownJob:
-        """Return the error for a job that does not exist, or that the caller may not see."""
+        """Return the error for a job that does not exist or is not visible to the caller."""
         return UnknownJob(
             f"There is no {self.record.noun} {job_id!r:.80}{where}. See GET /v1/jobs for the jobs "
             "that exist."
         )
 
     def record_of(self, job: JobRow, map_name: str | None, **details: Any) -> Record:
-        """Return a job as the API describes it."""
+        """Return the API record of a job."""
         return self.record.model_validate(
             {
                 "job_id": job.id, "map": map_name, "state": job.state,
@@ -201,39 +207,51 @@ class Products(ABC, Generic[Request, Record]):
         )  # fmt: skip
 
     def require_success(self, job: JobRow, what: str) -> dict[str, Any]:
-        """Return the result of a job; raise NotIndexed, which names the part that is wanted, until
-        it has succeeded.
+        """Return the result of a job.
+
+        Parameters
+        ----------
+        what : name of the requested part, for the error
+
+        Raises
+        ------
+        NotIndexed : If the job has not succeeded.
         """
         if job.state != JobState.SUCCEEDED or job.result is None:
             why = "" if job.error is None else f" ({job.error})"
             raise NotIndexed(
-                f"{self.record.noun.capitalize()} {job.id} is {job.state}{why}. It has its {what} "
-                "once it has succeeded."
+                f"{self.record.noun.capitalize()} {job.id} is {job.state}{why}. Its {what} will be "
+                "available once it has succeeded."
             )
         return job.result
 
     def file(self, map_name: str | None, job_id: str, name: str) -> queue.JobFile:
-        """Return a file that a job has made. Raise UnknownMap or UnknownJob if the job does not
-        exist, NotIndexed if it did not succeed, and DamagedBlob if the file is lost.
+        """Return a result file of a job.
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : If the job does not exist.
+        NotIndexed : If the job has not succeeded.
+        DamagedBlob : If the file is lost.
         """
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)
             self.require_success(job, name)
-            found = queue.files_of(connection, job.number).get(name)
-        if found is None:
+            job_file = queue.files_of(connection, job.number).get(name)
+        if job_file is None:
             raise DamagedBlob(
-                f"The {name} of {self.record.noun} {job_id} are lost. Delete it and begin it again."
+                f"The {name} of {self.record.noun} {job_id} are lost. Delete it and start another."
             )
-        return found
+        return job_file
 
     def items(
         self, connection: Connection, job: JobRow, first: int, limit: int
     ) -> list[dict[str, Any]]:
-        """Return items of a job with their numbers, also while more are found."""
+        """Return items of a job with their numbers, even while the job runs."""
         if job.result is not None:
             limit = max(min(limit, job.result[self.item_count] - first), 0)
-        found = queue.items_of(connection, job.number, first, limit)
-        return [item | {"number": first + i} for i, item in enumerate(found)]
+        rows = queue.items_of(connection, job.number, first, limit)
+        return [item | {"number": first + i} for i, item in enumerate(rows)]
 
     def page_of_items(
         self, map_name: str, job_id: str, cursor: str | None, limit: int,
@@ -243,45 +261,45 @@ class Products(ABC, Generic[Request, Record]):
 
         Parameters
         ----------
-        records : returns the records of those items that pass a filter
+        records : function that returns the records of the items that pass a filter
 
         Raises
         ------
-        UnknownMap, UnknownJob : the job does not exist.
-        InvalidRequest : the service did not issue the cursor.
+        UnknownMap, UnknownJob : If the job does not exist.
+        InvalidRequest : If the service did not issue the cursor.
         """
         after = row_of(cursor)
         at = 0 if after is None else after + 1
-        found: list[Item] = []
+        page: list[Item] = []
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)
-            while len(found) <= limit:
+            while len(page) <= limit:
                 block = self.items(connection, job, at, _BLOCK)
-                found += records(connection, block)
+                page += records(connection, block)
                 at += len(block)
                 if len(block) < _BLOCK:
                     break
-        return found[:limit], str(found[limit - 1].number) if len(found) > limit else None
+        return page[:limit], str(page[limit - 1].number) if len(page) > limit else None
 
 
 class StepwiseProducts(Products[Request, Record]):
-    """Products whose jobs take one equal step after another, such as one for each frame."""
+    """Products whose jobs consist of equal steps, such as one for each frame."""
 
     @abstractmethod
     def step(
         self, task: LongJob, request: Request, progress: dict[str, Any]
     ) -> Sequence[dict[str, Any]]:
-        """Do one step, count in `progress` what it skipped, and return the items it found."""
+        """Run one step, count skipped frames in `progress`, and return the items of the step."""
 
     @abstractmethod
     def finish(
         self, task: LongJob, request: Request, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Conclude a job whose steps are done; `items` are those of the last slice."""
+        """Conclude a job whose steps are done; `items` are new in its last slice."""
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Do at least one step, and as many as time allows; after the last one, conclude."""
+        """Run at least one step, and as many as time allows; conclude after the last."""
         request: Request = self.record.request_type.model_validate(task.data)  # type: ignore[assignment]
         is_over = ends_within(is_over, SLICE_S)
         progress = dict(task.progress) or self.restart(task.of_map, request)

@@ -1,7 +1,6 @@
-"""Reconstructions: the accepted matches of an answer, fused to a surface by a worker.
+"""Reconstructions: surfaces that workers fuse from the accepted matches of an answer.
 
-StoredAnswer, NewReconstruction  --begin-->  job
-job  --_fuse, in a worker-->  mesh.ply, Coverage
+StoredAnswer, NewReconstruction  --begin_for-->  job  --fused, in a worker-->  mesh.ply, Coverage
 """
 
 from __future__ import annotations
@@ -62,21 +61,17 @@ from sceneprint_client.api.surface import (
     Reconstruction,
 )
 
-# Views of an answer fused: their depth out of the store, the surface, its figures, its files.
-#
-# data of a job, geometry of the query  --fused-->  coverage, PLY
-
 Source = Literal["upload", "geometry"]
 Strength = Literal["strong", "weak"]
 
 
 @dataclass(frozen=True, eq=False)
 class JobView:
-    """A match that is to be fused, as it stands in a job's data.
+    """A match to fuse, in the data of a job.
 
     Parameters
     ----------
-    rank, strength : of the answer; None of the query itself
+    rank, strength : rank and strength of the match; None for the query itself
     transform : (4, 4) T_query_match
     """
 
@@ -89,49 +84,49 @@ class JobView:
 
 def fused(
     store: Store, views: Sequence[JobView], query: Geometry | None, own: JobView | None,
-    wanted: NewReconstruction, model_id: str, parent_frame: str, asked_at: float,
+    request: NewReconstruction, model_id: str, parent_frame: str, as_of: float,
 ) -> tuple[Coverage, bytes]:  # fmt: skip
-    """Fuse the matches of an answer, and what the query saw.
+    """Fuse the matches of an answer and the query frame.
 
     Parameters
     ----------
-    store : with the matches' uploads and artifacts
-    views : at least one, in the order of the ranking
-    query : its own geometry; None where it is not known
-    own : the query, where it is a stored frame
-    model_id : whose artifacts stand in for uploads that are lost
-    parent_frame : what the query's camera frame is called
-    asked_at : when the answer was given, seconds since 1970
+    store : store with the matches' uploads and geometries
+    views : one or more matches in the order of the ranking
+    query : geometry of the query; None if it is not stored
+    own : view of the query if it is a stored frame
+    model_id : model whose geometries replace lost uploads
+    parent_frame : name of the query's sensor frame
+    as_of : time of the answer, seconds since 1970
 
     Returns
     -------
-    coverage : what became of the views
-    ply : surface or cloud, in the query's camera frame, coloured by view
+    coverage : figures of the surface and its views
+    ply : surface or cloud in the query's sensor frame, coloured by view
 
     Raises
     ------
-    MissingDependency : Open3D cannot be loaded.
-    UselessFrame : no match is left, or their depth makes no surface.
-    InvalidRequest : voxels too small for memory.
+    MissingDependency : If Open3D cannot be loaded.
+    UselessFrame : If no match can be fused, or their depth yields no surface.
+    InvalidRequest : If the voxels are too small for the memory.
     """
-    # before all the reading: where it is missing, that is what is to be told
+    # first, so that this error comes before those of unreadable views
     open3d("A reconstruction")
-    p = FusionParameters(voxel_m=wanted.voxel_m)
-    frames, told, left_out = list[DepthFrame](), list[FusedView](), list[LeftOut]()
-    # points of a cloud have no image that voxels could be carved with: it is explained, not fused
-    if query is not None and wanted.include_query and isinstance(query.surface.camera, Intrinsics):
-        frame, source = _own(store, query, own, model_id, asked_at)
+    p = FusionParameters(voxel_m=request.voxel_m)
+    frames, parts, left_out = list[DepthFrame](), list[FusedView](), list[LeftOut]()
+    # a cloud has no depth image to fuse, but its explained share is computed below
+    if query is not None and request.include_query and isinstance(query.surface.camera, Intrinsics):
+        frame, source = _own(store, query, own, model_id, as_of)
         frames.append(prepare_view(frame, p))
-        told.append(_fused_view(None, frames[-1], source))
+        parts.append(_fused_view(None, frames[-1], source))
     for view in views:
         try:
-            frame, source = _read(store, view, model_id, asked_at)
+            frame, source = _read(store, view, model_id, as_of)
         except (NotFound, FrameError, DamagedBlob, UnreadableGeometry) as error:
             left_out.append(LeftOut(frame_id=view.frame_id, map=view.map, reason=str(error)))
             continue
         frames.append(prepare_view(frame, p))
-        told.append(_fused_view(view, frames[-1], source))
-    others = [frame for frame, one in zip(frames, told, strict=True) if one.frame_id is not None]
+        parts.append(_fused_view(view, frames[-1], source))
+    others = [frame for frame, one in zip(frames, parts, strict=True) if one.frame_id is not None]
     if not others:
         raise UselessFrame(
             f"None of the {len(views)} matches can be fused: {left_out[0].reason} Use another "
@@ -141,10 +136,10 @@ def fused(
     first = first_views(mesh, frames, BAND * voxel)
     added = added_areas(mesh, first, len(frames)).tolist()
     volume, _ = observed_volume(frames)
-    as_mesh = wanted.output == "mesh"
+    as_mesh = request.output == "mesh"
     seen = None if query is None else query.surface.points[query.surface.valid].astype(np.float64)
     coverage = Coverage(
-        views=[one.model_copy(update={"added_m2": a}) for one, a in zip(told, added, strict=True)],
+        views=[one.model_copy(update={"added_m2": a}) for one, a in zip(parts, added, strict=True)],
         left_out=left_out,
         area_m2=float(sum(added)),
         observed_volume_m3=volume,
@@ -153,7 +148,7 @@ def fused(
         points=len(mesh.points),
         triangles=len(mesh.triangles) if as_mesh else 0,
     )
-    # a cloud keeps the axes of its sensor, whichever they are
+    # the axes of a cloud's sensor are unknown
     axes = ": x right, y down, z forward" if parent_frame.endswith(".optical") else ""
     comment = f"frame {parent_frame}{axes}, metres"
     colours = PALETTE[first % len(PALETTE)]
@@ -165,36 +160,40 @@ def fused(
 
 
 def _own(
-    store: Store, query: Geometry, own: JobView | None, model_id: str, asked_at: float
+    store: Store, query: Geometry, own: JobView | None, model_id: str, as_of: float
 ) -> tuple[DepthFrame, Source]:
-    """What the query saw, as fine as it is kept."""
+    """Return the query's depth at the finest stored resolution."""
     if own is not None:
         with suppress(NotFound, FrameError, DamagedBlob, UnreadableGeometry):
-            frame, source = _read(store, own, model_id, asked_at)
+            frame, source = _read(store, own, model_id, as_of)
             return replace(frame, name="query"), source
     return double_resolution(_frame(query, "query", np.eye(4))), "geometry"
 
 
-def _read(store: Store, view: JobView, model_id: str, asked_at: float) -> tuple[DepthFrame, Source]:
-    """Return a match's depth as it was sent; if that is lost, as validation compares it. Raise
-    NotFound if map or frame is gone, DamagedBlob or UnreadableGeometry if both are lost, and
-    FrameError if it is empty.
+def _read(store: Store, view: JobView, model_id: str, as_of: float) -> tuple[DepthFrame, Source]:
+    """Return a match's uploaded depth or, if the upload is lost, that of its geometry.
+
+    Raises
+    ------
+    NotFound : If the map or the frame was deleted.
+    DamagedBlob, UnreadableGeometry : If both are lost.
+    FrameError : If the frame is empty or not a depth image.
     """
     with store.database.read() as connection:
         row = find_map(connection, view.map)
         frame = living(row, find_frame(connection, row, view.frame_id))
-        if frame.received_at > asked_at:
+        if frame.received_at > as_of:
             raise UnknownFrame(
                 f"Frame {frame.id} of map {row.name!r} was deleted, and a new frame has its id."
             )
         blob = geometry_blobs(connection, [frame.number], model_id).get(frame.number)
-    if frame.kind == "cloud":  # before five million points are unpacked, if they can be here
+    if frame.kind == "cloud":  # before a large cloud is decoded
         raise _no_image(view.frame_id)
     T = np.array(view.transform)
     try:
-        found = read_stored(store.blobs.get(frame.blob), frame, store.decoders)
-        assert isinstance(found, DepthFrame)
-        return DepthFrame(found.depth, found.intrinsics, view.frame_id, T), "upload"
+        upload = read_stored(store.blobs.get(frame.blob), frame, store.decoders)
+        assert isinstance(upload, DepthFrame)
+        return DepthFrame(upload.depth, upload.intrinsics, view.frame_id, T), "upload"
     except DamagedBlob:
         if blob is None:
             raise
@@ -204,7 +203,7 @@ def _read(store: Store, view: JobView, model_id: str, asked_at: float) -> tuple[
 
 
 def _frame(geometry: Geometry, name: str, T: Floats) -> DepthFrame:
-    """The depth that an artifact keeps, with a pose."""
+    """Return the depth image of a geometry, with a pose."""
     surface = geometry.surface
     if not isinstance(surface.camera, Intrinsics):
         raise _no_image(name)
@@ -232,10 +231,10 @@ def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> Fuse
     )
 
 
-#: Files of such a job: what the query saw, until it is fused; and the surface.
+#: Names of a job's files: the geometry of the query, while the job runs, and the surface.
 QUERY, MESH = "query.geometry", "mesh.ply"
 MEDIA_TYPE = "application/ply"
-#: The query itself is where it is.
+#: Transform of the query to itself.
 _STILL = np.eye(4).tolist()
 
 
@@ -245,19 +244,19 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
     kind = "reconstruct"
     record = Reconstruction
 
-    def begin_for(self, stored: StoredAnswer, wanted: NewReconstruction) -> Reconstruction:
-        """Queue a reconstruction. All that it needs of the answer is copied: that may expire.
+    def begin_for(self, stored: StoredAnswer, request: NewReconstruction) -> Reconstruction:
+        """Queue a reconstruction, with a copy of the answer's data, since the answer may expire.
 
         Parameters
         ----------
-        wanted : which of its views, and to what
+        request : selection of the matches, and options of the surface
 
         Raises
         ------
-        InvalidRequest : the answer has no accepted match, or not the ones that are named.
-        UnknownMap : the map is gone.
+        InvalidRequest : If the answer lacks accepted matches or the requested frames.
+        UnknownMap : If the map does not exist any more.
         """
-        chosen = _matches_to_fuse(stored.answer.matches, wanted)
+        chosen = _matches_to_fuse(stored.answer.matches, request)
         views, own = [_view(match) for match in chosen], stored.answer.frame
         names = sorted({*(view.map for view in views), *([] if own is None else [own.map])})
         data = {
@@ -266,13 +265,13 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
             "parent_frame": chosen[0].transform.child_frame if chosen[0].transform else "",
             "model_id": stored.model_id,
             "asked_at": stored.at,
-            "request": wanted.model_dump(mode="json"),
+            "request": request.model_dump(mode="json"),
             "views": [asdict(view) for view in views],
             "own": None
             if own is None
             else asdict(JobView(own.map, own.frame_id, None, None, _STILL)),
         }
-        # of several maps: the job's own page would tell who may read one of them of the others
+        # a job of several maps belongs to none, since readers of one would see the others
         of = names[0] if len(names) == 1 else None
         self._store.database.require_writable()
         while True:
@@ -296,18 +295,18 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
         return {name: data[name] for name in ("request", "query_id", "maps", "parent_frame")}
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
-        """Return whether a view of a job was deleted, and cannot be restored."""
+        """Return whether a view of a job was deleted permanently."""
         return not _is_current(connection, job)
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Fuse the views, in one slice: at most 32 views of bounded size take seconds."""
+        """Fuse the views in one slice, which takes seconds for at most 32 views of bounded size."""
         del is_over
         data = task.data
-        wanted = NewReconstruction.model_validate(data["request"])
+        request = NewReconstruction.model_validate(data["request"])
         views = [JobView(**view) for view in data["views"]]
         own = None if data["own"] is None else JobView(**data["own"])
         coverage, ply = fused(
-            self._store, views, self._query_of(task), own, wanted, data["model_id"],
+            self._store, views, self._query_of(task), own, request, data["model_id"],
             data["parent_frame"], data["asked_at"],
         )  # fmt: skip
         files = [queue.JobFile(MESH, self._store.blobs.put(ply), len(ply), MEDIA_TYPE)]
@@ -320,38 +319,38 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
         )
 
     def _query_of(self, task: LongJob) -> Geometry | None:
-        """What the query saw; a reconstruction does without it where it is damaged."""
+        """Return the geometry of the query; None if it is not stored or damaged."""
         with self._store.database.read() as connection:
-            found = queue.files_of(connection, task.job.number).get(QUERY)
-        if found is not None:
+            file = queue.files_of(connection, task.job.number).get(QUERY)
+        if file is not None:
             with suppress(DamagedBlob, UnreadableGeometry):
-                return read_geometry(self._store.blobs.get(found.blob))
+                return read_geometry(self._store.blobs.get(file.blob))
         return None
 
 
-def _matches_to_fuse(matches: Sequence[Match], wanted: NewReconstruction) -> list[Match]:
-    """The matches to fuse, in the order of the ranking."""
+def _matches_to_fuse(matches: Sequence[Match], request: NewReconstruction) -> list[Match]:
+    """Return the matches to fuse, in the order of the ranking."""
     accepted = [m for m in matches if m.validation.status == "accepted" and m.transform is not None]
     if not accepted:
         raise InvalidRequest(
             "The answer has no accepted match, so there is nothing to fuse. Use an answer with "
             "the status `found`."
         )
-    if wanted.frames is not None:
-        known = {match.frame_id for match in accepted}
-        missing = [frame for frame in wanted.frames if frame not in known]
+    if request.frames is not None:
+        frame_ids = {match.frame_id for match in accepted}
+        missing = [frame for frame in request.frames if frame not in frame_ids]
         if missing:
             raise InvalidRequest(
                 f"Frame {missing[0]!r:.80} is not an accepted match of the answer. Choose from "
-                f"{', '.join(sorted(known))}, or leave `frames` out.",
+                f"{', '.join(sorted(frame_ids))}, or leave `frames` out.",
                 (("frames", "not an accepted match"),),
             )
-        accepted = [match for match in accepted if match.frame_id in wanted.frames]
-    if wanted.strength == "strong":
+        accepted = [match for match in accepted if match.frame_id in request.frames]
+    if request.strength == "strong":
         accepted = [match for match in accepted if match.validation.strength == "strong"]
         if not accepted:
             raise InvalidRequest(
-                "No match is accepted with strength `strong`. Use `any`.",
+                "No accepted match has the strength `strong`. Use `any`.",
                 (("strength", "leaves no match"),),
             )
     return sorted(accepted, key=lambda match: match.rank)[: MOST_VIEWS - 1]
@@ -365,11 +364,11 @@ def _view(match: Match) -> JobView:
 
 
 def _is_current(connection: Connection, job: JobRow) -> bool:
-    """Return whether all views of a job exist, or can be restored."""
+    """Return whether all views of a job exist or can be restored."""
     data = job.data or {}
     views = [*data["views"], *([] if data["own"] is None else [data["own"]])]
     places = {(one["map"], one["frame_id"]) for one in views}
-    there = (
+    statement = (
         select(maps.c.name, frames.c.id)
         .join(maps, maps.c.number == frames.c.map_number)
         .where(
@@ -379,4 +378,4 @@ def _is_current(connection: Connection, job: JobRow) -> bool:
             not_purged(),
         )
     )
-    return places <= {(row.name, row.id) for row in connection.execute(there)}
+    return places <= {(row.name, row.id) for row in connection.execute(statement)}

@@ -1,10 +1,10 @@
-"""Two sessions of a map compared: what is gone, and what is new.
+"""Differences of two sessions of a map: surfaces that disappeared, and new ones.
 
-    frames of both sessions  --add_views-->  cells of each  --frame_verdicts-->  their counts
+    frames of both sessions  --view_cells, merge_views-->  cells  --frame_verdicts-->  counts
     counts  --cell_states-->  same, gone, new, unseen
 
-A slice fuses some frames, or has some of them judge the cells of the other session, and stores how
-far it came in one file of the job.
+A slice of a job fuses some frames into cells, or compares some frames with the cells of the other
+session. The state is stored in a file of the job.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ from sceneprint_client.api import sessions as api
 from sceneprint_client.api.sessions import Difference, DifferenceResult, NewDifference
 from sceneprint_client.surface_encoding import NO_SESSION
 
-#: Cells of a session: with more, the job begins again with cells twice as wide.
+#: Maximum number of cells of a session; a job with more restarts with cells of twice the width.
 MOST_CELLS = 500_000
-#: Cells of views that are held before they are fused.
+#: Maximum number of cells of views in memory before they are merged.
 _HELD = 1_000_000
-#: Files of a job: how far it came, until it is over; and the points.
+#: Names of a job's files: the state of a running job, and the points.
 STATE, POINTS = "state.npz", "points"
 
 Side = Literal["before", "after"]
@@ -67,8 +67,11 @@ SIDES: tuple[Side, Side] = ("before", "after")
 
 
 def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -> str:
-    """Return the parent frame in which two sessions are compared; raise InvalidRequest if a session
-    has no poses, or they share no parent frame.
+    """Return the parent frame in which two sessions are compared.
+
+    Raises
+    ------
+    InvalidRequest : If a session has no poses, or the sessions share no parent frame.
     """
     counts = {}
     for side in SIDES:
@@ -86,7 +89,7 @@ def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -
         raise InvalidRequest(
             f"Sessions {request.before!r:.80} and {request.after!r:.80} do not both have poses in "
             f"parent frame {request.parent_frame!r:.80}. "
-            + (f"Choose from {', '.join(shared)!r:.300}." if shared else "They share none."),
+            + (f"Choose from {', '.join(shared)!r:.300}." if shared else "They share no frame."),
             (("parent_frame", "not of both sessions"),),
         )
     if not shared:
@@ -106,7 +109,7 @@ class Differences(Products[NewDifference, Difference]):
     record = Difference
 
     def start(self, connection: Connection, row: MapRow, request: NewDifference) -> dict[str, Any]:
-        """Choose the frames to compare, and their parent frame; see `shared_parent`."""
+        """Return the initial progress with the frames to compare and their parent frame."""
         parent = shared_parent(connection, row, request)
         frames = {
             side: _spread(
@@ -121,18 +124,18 @@ class Differences(Products[NewDifference, Difference]):
         }  # fmt: skip
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
-        """Return whether any frame that a job compares was deleted."""
+        """Return whether a frame of a job was deleted."""
         return any_purged(connection, _frames_of(job))
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Fuse at least one frame, or have one judge cells; the last slice concludes."""
+        """Fuse or compare at least one frame; conclude the job in its last slice."""
         is_over = ends_within(is_over, SLICE_S)
         request = NewDifference.model_validate(task.data)
         progress = dict(task.progress) or self.restart(task.of_map, request)
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
             file = queue.files_of(connection, task.job.number).get(STATE)
-        # while no connection is held
+        # outside of a transaction, since loading takes long
         parameters = self._context.signers(row.model_id).model.parameters
         progress.setdefault("cell_m", cell_width(parameters.cloud.voxel_size))
         state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))
@@ -148,7 +151,7 @@ class Differences(Products[NewDifference, Difference]):
         return self._conclude(row, progress, state)
 
     def _fuse(self, row: MapRow, progress: dict[str, Any], state: _State, is_over: IsOver) -> None:
-        """Add what frames saw to the cells of their sessions, as far as the time goes."""
+        """Merge views of frames into the cells of their sessions, while time allows."""
         views: dict[Side, list[SessionCells]] = {side: [] for side in SIDES}
         held = 0
         for side, number in _order(progress["frames"])[progress["done"] :]:
@@ -171,21 +174,21 @@ class Differences(Products[NewDifference, Difference]):
         self, row: MapRow, progress: dict[str, Any], state: _State, is_over: IsOver,
         p: OverlapParameters,
     ) -> None:  # fmt: skip
-        """Have frames judge the cells of the other session, as far as the time goes."""
+        """Compare frames with the cells of the other session, while time allows."""
         order = _order(progress["frames"])
         positions = {side: cell_positions(state.cells[side], progress["cell_m"]) for side in SIDES}
         for side, number in order[progress["done"] - len(order) :]:
             posed = self._posed(row, number, progress["parent"])
             if posed is not None:
                 other: Side = "after" if side == "before" else "before"
-                said = frame_verdicts(positions[other], posed[0].surface, posed[1], p)
-                state.counts[other].add(said)
+                verdicts = frame_verdicts(positions[other], posed[0].surface, posed[1], p)
+                state.counts[other].add(verdicts)
             progress["done"] += 1
             if is_over():
                 break
 
     def _posed(self, row: MapRow, number: int, parent: str) -> tuple[Geometry, Floats] | None:
-        """The artifact of a frame and its T_parent_sensor; None where it is lost or was edited."""
+        """Return a frame's geometry and T_parent_sensor; None if lost or in another parent frame."""
         with self._store.database.read() as connection:
             stop = path_frames(connection, [number]).get(number)
             blob = geometry_blobs(connection, [number], row.model_id).get(number)
@@ -200,7 +203,7 @@ class Differences(Products[NewDifference, Difference]):
         return queue.JobFile(name, self._store.blobs.put(data), len(data), MEDIA_TYPE)
 
     def _conclude(self, row: MapRow, progress: dict[str, Any], state: _State) -> SliceResult:
-        """Return counts, and the points of all cells by what they are."""
+        """Return the end of a job, with the counts and the points of all cells by state."""
         frames = progress["frames"]
         positions, states = {}, {}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
@@ -231,7 +234,7 @@ class Differences(Products[NewDifference, Difference]):
 
 
 class _State:
-    """Cells of both sessions, and what was said of them so far."""
+    """The cells of both sessions, with counts of the verdicts on them."""
 
     def __init__(self) -> None:
         self.cells: dict[Side, SessionCells] = {side: {} for side in SIDES}
@@ -239,7 +242,7 @@ class _State:
 
     @classmethod
     def read(cls, data: bytes) -> _State:
-        """What `data` wrote."""
+        """Return a state from the bytes of `data`."""
         state = cls()
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             for side in SIDES:
@@ -257,7 +260,7 @@ class _State:
         return state
 
     def data(self) -> bytes:
-        """As a file: the same bytes for the same cells."""
+        """Return the state as the bytes of a file; equal states have equal bytes."""
         arrays: dict[str, Any] = {}
         for side in SIDES:
             cells, counts = self.cells[side], self.counts[side]
@@ -272,18 +275,18 @@ class _State:
 
 
 def _order(frames: dict[Side, list[int]]) -> list[tuple[Side, int]]:
-    """Frames of both sessions in the order of the job."""
+    """Return side and number of the frames of both sessions, in the order of the job."""
     return [(side, number) for side in SIDES for number in frames[side]]
 
 
 def _frames_of(job: JobRow) -> list[int]:
-    """Numbers of the frames that a job compares."""
+    """Return the numbers of the frames that a job compares."""
     frames: dict[Side, list[int]] = (job.progress or {}).get("frames", {})
     return [number for _, number in _order(frames)] if frames else []
 
 
 def _spread(numbers: Sequence[int], most: int) -> list[int]:
-    """At most so many of some numbers, evenly."""
+    """Return at most `most` of some numbers, evenly spaced."""
     if len(numbers) <= most:
         return list(numbers)
     return [numbers[i * len(numbers) // most] for i in range(most)]

@@ -1,4 +1,4 @@
-"""What the log has of a query: a row with its outcome, and its answer as bytes.
+"""Entries of the query log: a row with the outcome, and the answer as bytes.
 
 SentQuery, Answer | error  --query_row-->  NewQuery;  QueryRow  --query_record-->  QueryRecord
 StoredAnswer  --encode_answer-->  bytes  --decode_answer-->  StoredAnswer
@@ -27,24 +27,22 @@ from sceneprint_client.api.base import Quaternion, Vector
 from sceneprint_client.api.results import QueryRecord, RecordedPose
 from sceneprint_client.errors import kebab_case
 
-# An answer as bytes.
-
 
 @dataclass(frozen=True, eq=False)
 class StoredAnswer:
-    """An answer with what looking at it, and asking again, requires.
+    """An answer with the data to inspect it and to repeat its query.
 
     Parameters
     ----------
-    answer, query : as the caller got and sent them
-    model_id : of the model that signed the query
-    vector : (D,) its signature
-    geometry : its artifact as bytes; None where the query was not validated
+    answer, query : answer and options of the query
+    model_id : id of the model that signed the query
+    vector : (D,) signature of the query
+    geometry : geometry of the query as bytes; None without validation
     ranked : numbers of the frames of R, in its order
-    at : when it was given, seconds since 1970
-    taken : who took an uploaded query, in which run and when
-    base : name of the robot's base, and T_base_query (4, 4); None where it is not known
-    up : (3,) unit vector in the query's sensor; None where it is not known
+    at : time of the answer, seconds since 1970
+    origin : robot, session and time of capture of an uploaded query
+    base : name of the robot's base frame, and T_base_query (4, 4); None if unknown
+    up : (3,) unit vector in the query's sensor frame; None if unknown
     """
 
     answer: Answer
@@ -54,14 +52,14 @@ class StoredAnswer:
     geometry: bytes | None
     ranked: tuple[int, ...] = ()
     at: float = field(default_factory=time.time)
-    taken: QueryOrigin = field(default_factory=lambda: QueryOrigin(None, None, None))
+    origin: QueryOrigin = field(default_factory=lambda: QueryOrigin(None, None, None))
     base: tuple[str, Floats] | None = None
     up: Floats | None = None
 
 
-#: Bytes of the head and of the signature; the geometry artifact follows them.
+#: Sizes of the head and the signature in bytes; the geometry follows them.
 _PARTS = struct.Struct("<II")
-#: What decoding raises where bytes are damaged.
+#: Errors of `decode_answer` if the bytes are damaged.
 DAMAGED = (ValueError, KeyError, TypeError, ValidationError, struct.error)
 
 
@@ -70,8 +68,8 @@ def encode_answer(one: StoredAnswer) -> bytes:
     head = json.dumps(
         {
             "answer": one.answer.model_dump(mode="json"),
-            # without the maps, which the answer has; only fields that were set, as the defaults of
-            # `validation` are those of the model
+            # without the maps, which the answer contains, and without unset fields, since defaults
+            # of `validation` depend on the model
             "query": one.query.model_dump(
                 mode="json", include=set(Query.model_fields), exclude_unset=True
             ),
@@ -79,7 +77,7 @@ def encode_answer(one: StoredAnswer) -> bytes:
             "geometry": one.geometry is not None,
             "ranked": one.ranked,
             "at": one.at,
-            "taken": asdict(one.taken),
+            "taken": asdict(one.origin),
             "base": None if one.base is None else [one.base[0], one.base[1].tolist()],
             "up": None if one.up is None else one.up.tolist(),
         }
@@ -89,7 +87,7 @@ def encode_answer(one: StoredAnswer) -> bytes:
 
 
 def decode_answer(data: bytes) -> StoredAnswer:
-    """Return an answer from its bytes; ValueError and others where they are damaged."""
+    """Return an answer from its bytes; raise one of DAMAGED if they are damaged."""
     head_bytes, vector_bytes = _PARTS.unpack_from(data)
     begin = _PARTS.size + head_bytes
     head, end = json.loads(data[_PARTS.size : begin]), begin + vector_bytes
@@ -102,27 +100,24 @@ def decode_answer(data: bytes) -> StoredAnswer:
         geometry=data[end:] if head["geometry"] else None,
         ranked=tuple(head["ranked"]),
         at=head["at"],
-        taken=QueryOrigin(**head["taken"]),
+        origin=QueryOrigin(**head["taken"]),
         base=None if base is None else (base[0], np.array(base[1])),
         up=None if up is None else np.array(up),
     )
 
 
-# The outcome of a query as a row.
-
-
 @dataclass(frozen=True)
 class SentQuery:
-    """A query as it came.
+    """The request of a query.
 
     Parameters
     ----------
-    maps : names of those to search, one or more
-    query : its options
-    robot, session : who sent it, in which run
-    key_id : of the key of the request
-    frame : the stored frame that is the query
-    at : when it came, seconds since 1970
+    maps : names of one or more maps to search
+    query : options
+    robot, session : origin of the frame
+    key_id : id of the caller's key
+    frame : stored frame that is the query; None for an upload
+    at : time of the request, seconds since 1970
     """
 
     maps: Sequence[str]
@@ -138,7 +133,7 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
     """Return the row of a query that was answered, or that failed with an error."""
     several, frame = len(sent.maps) > 1, sent.frame
     row = NewQuery(
-        # as exact as JSON, so that a time of the list finds the same rows
+        # rounded like times in JSON, so that filters by time match
         id=uuid.uuid4().hex, at=round(sent.at, 6), map=sent.maps[0],
         maps=tuple(sent.maps) if several else None, robot=sent.robot, session=sent.session,
         status="failed", cause=None, reason="", pose_parent=None, pose=None, confidence=None,
@@ -152,27 +147,31 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
     if isinstance(outcome, Exception):
         reason = "the service failed; its log has the traceback"
         return replace(row, cause="internal-error", reason=reason)
-    there = outcome.location
-    places = [there, *outcome.alternatives, *outcome.matches]
+    location = outcome.location
+    places = [location, *outcome.alternatives, *outcome.matches]
     own = next((one.map for one in places if one is not None and one.map is not None), None)
     row = replace(
         row, id=outcome.query_id, map=own if several and own else row.map, status=outcome.status,
         cause=outcome.cause, reason=outcome.reason, kind=outcome.kind,
         alternatives=len(outcome.alternatives),
     )  # fmt: skip
-    if there is None:
+    if location is None:
         best = next(iter(outcome.alternatives), None)
         return row if best is None else replace(row, confidence=best.confidence)
-    t, r = there.pose.translation, there.pose.rotation
+    t, r = location.pose.translation, location.pose.rotation
     return replace(
-        row, pose_parent=there.pose.parent_frame, pose=(t.x, t.y, t.z, r.x, r.y, r.z, r.w),
-        confidence=there.confidence, support=there.support,
+        row, pose_parent=location.pose.parent_frame, pose=(t.x, t.y, t.z, r.x, r.y, r.z, r.w),
+        confidence=location.confidence, support=location.support,
     )  # fmt: skip
 
 
 def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) -> QueryRecord:
-    """Return a row as JSON, with its expiry after `days`, and without names of maps that `may_read`
-    refuses.
+    """Return the API record of a row.
+
+    Parameters
+    ----------
+    days : days until the answer expires
+    may_read : function that returns whether the caller may read a map; other names are left out
     """
     frame = pose = None
     if row.frame_id is not None and row.frame_map is not None and may_read(row.frame_map):
@@ -196,7 +195,7 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
 
 
 def unknown_query(query_id: str) -> UnknownQuery:
-    """Return the error for an answer that is not there, or that the caller may not see."""
+    """Return the error for an answer that does not exist or is not visible to the caller."""
     return UnknownQuery(
         f"There is no answer {query_id!r:.80}: it never existed, or it expired. Send the query "
         "again, without `keep=false`."

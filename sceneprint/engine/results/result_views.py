@@ -1,11 +1,10 @@
-"""What one can look at after a query: its points and its ranking, the evidence of a match, and how
-it was sent.
+"""Views of stored answers: the request, points, similarities of the ranking, and match evidence.
 
 query id  --Inspection-->  Answer | StoredQuery | PLY | PNG | Similarities | MatchDetails
-query id, frame id  --Pairs-->  StoredPair  --opened-->  both geometries  --validated-->  Validation
+query id, frame id  --Pairs-->  StoredPair  --load-->  geometries  --validated-->  PairValidation
 frame | query | match  --PointClouds-->  Output
 
-A match is validated once more, with the seed and the options of the query: the same answer.
+A match is validated again with the seed and the options of the query, so the result is the same.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ from sceneprint.store.signatures import stored_signatures
 from sceneprint.store.tables import MapRow
 from sceneprint.types import Bytes, Floats, Floats32, Geometry
 from sceneprint_client.api import Answer, FrameState
-from sceneprint_client.api import Match as ToldMatch
+from sceneprint_client.api import Match as MatchRecord
 from sceneprint_client.api.query import FrameName
 from sceneprint_client.api.results import (
     MOST_POINTS,
@@ -76,8 +75,8 @@ from sceneprint_client.api.results import (
     View,
 )
 
-#: Validations that are remembered, some 1 kB each: a page requests several views of one match.
-_REMEMBERED = 64
+#: Number of cached validations of about 1 kB, since a page requests several views of one match.
+_CACHE_SIZE = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +85,15 @@ class StoredPair:
 
     Parameters
     ----------
-    stored, match : the answer, and the match of it
+    stored, match : answer and match
     sensor : name of the match's sensor frame
-    blob : of the match's geometry artifact
-    row, number : the match's map and number
-    ups : up in the query's and in the match's sensors, as far as it is known
+    blob : digest of the match's geometry
+    row, number : map and number of the match's frame
+    ups : up vectors in the sensors of query and match; None for unknown ones
     """
 
     stored: StoredAnswer
-    match: ToldMatch
+    match: MatchRecord
     sensor: str
     blob: str
     row: MapRow
@@ -107,12 +106,16 @@ class Pairs:
 
     def __init__(self, context: Context) -> None:
         self._store, self._signers, self._log = context.store, context.signers, context.query_log
-        self._remembered = _ValidationCache()
+        self._cache = _ValidationCache()
 
     def find(self, query_id: str, frame_id: str, map_name: str | None = None) -> StoredPair:
-        """Return a query with one of its matches. Raise UnknownQuery if the answer is not stored,
-        UnknownMap or UnknownFrame if it has no such match or the match was deleted, and NotIndexed
-        if the query ran without validation or the map has changed its model.
+        """Return a stored answer with one of its matches.
+
+        Raises
+        ------
+        UnknownQuery : If the answer is not stored.
+        UnknownMap, UnknownFrame : If the answer has no such match, or the match was deleted.
+        NotIndexed : If the query ran without validation, or the map has another model now.
         """
         stored = self._log.find(query_id)
         match = _match_of(stored, frame_id, map_name)
@@ -134,10 +137,13 @@ class Pairs:
             (stored.up, ups.get(frame.number)),
         )  # fmt: skip
 
-    def opened(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
-        """Return the geometry of the query and of the match; a damaged one of the match is made
-        again. Raise DamagedBlob if the upload is damaged too, and UnknownFrame if the match was
-        deleted.
+    def load(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
+        """Return the geometries of query and match; rebuild that of the match if it is damaged.
+
+        Raises
+        ------
+        DamagedBlob : If the match's upload is damaged too.
+        UnknownFrame : If the match was deleted.
         """
         query = geometry_of_query(pair.stored)
         try:
@@ -153,11 +159,11 @@ class Pairs:
         return query, read_geometry(artifact)
 
     def parameters(self, pair: StoredPair) -> ValidationParameters:
-        """Those of the model, by which evidence is counted."""
+        """Return the parameters of validation of the query's model."""
         return self._signers(pair.stored.model_id).model.parameters.validation
 
     def validated(self, pair: StoredPair, query: Geometry, match: Geometry) -> PairValidation:
-        """What comes of aligning them, as the query had it."""
+        """Return the validation of a match with the options of its query."""
         p = self.parameters(pair)
         seed, options = pair.stored.query.seed, thresholds(pair.stored.query.validation, p)
         key = pair.stored.answer.query_id, pair.blob
@@ -168,17 +174,17 @@ class Pairs:
                 guided = validate_guided(query, match, T, seed, options[0], pair.ups)
                 if guided is not None:
                     return guided
-            found = validate(query, match, seed, *options, ups=pair.ups)
-            if found.reason != pair.match.validation.reason and pair.stored.up is not None:
-                # nothing was accepted with `up`, and the surfaces were asked without it
-                return validate_without_up(query, match, seed, options[0], pair.ups) or found
-            return found
+            validation = validate(query, match, seed, *options, ups=pair.ups)
+            if validation.reason != pair.match.validation.reason and pair.stored.up is not None:
+                # the query validated it again without up vectors
+                return validate_without_up(query, match, seed, options[0], pair.ups) or validation
+            return validation
 
-        return self._remembered.get(key, make)
+        return self._cache.get(key, make)
 
 
 class _ValidationCache:
-    """The last few validations; who asks while one is made waits for it."""
+    """The most recent validations; concurrent requests for the same one wait for it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -191,7 +197,7 @@ class _ValidationCache:
             if found is None:
                 found = self._made[key] = Future()
             self._made.move_to_end(key)
-            while len(self._made) > _REMEMBERED:
+            while len(self._made) > _CACHE_SIZE:
                 self._made.popitem(last=False)
         if mine:
             try:
@@ -204,7 +210,7 @@ class _ValidationCache:
 
 
 def check_geometry(stored: StoredAnswer, needs: str = "the stage") -> bytes:
-    """Return the bytes of a query's artifact; NotIndexed where it was sent without validation."""
+    """Return the bytes of a query's geometry; raise NotIndexed if it ran without validation."""
     if stored.geometry is None:
         raise errors.NotIndexed(
             f"Query {stored.answer.query_id} ran without validation, so its points were not "
@@ -214,17 +220,17 @@ def check_geometry(stored: StoredAnswer, needs: str = "the stage") -> bytes:
 
 
 def geometry_of_query(stored: StoredAnswer) -> Geometry:
-    """Return a query's artifact; NotIndexed where it was sent without validation."""
+    """Return a query's geometry; raise NotIndexed if it ran without validation."""
     return read_geometry(check_geometry(stored))
 
 
-def _deleted(match: ToldMatch) -> errors.UnknownFrame:
+def _deleted(match: MatchRecord) -> errors.UnknownFrame:
     return errors.UnknownFrame(
         f"Frame {match.frame_id} of map {match.map!r} was deleted after the query matched it."
     )
 
 
-def _match_of(stored: StoredAnswer, frame_id: str, map_name: str | None) -> ToldMatch:
+def _match_of(stored: StoredAnswer, frame_id: str, map_name: str | None) -> MatchRecord:
     for one in stored.answer.matches:
         if one.frame_id == frame_id and map_name in (None, one.map):
             return one
@@ -236,20 +242,20 @@ def _match_of(stored: StoredAnswer, frame_id: str, map_name: str | None) -> Told
 
 
 class Inspection:
-    """Stored answers, and what they rest on."""
+    """Views of stored answers."""
 
     def __init__(self, context: Context) -> None:
         self._store, self._signers, self._log = context.store, context.signers, context.query_log
         self.pairs = Pairs(context)
 
     def answer(self, query_id: str) -> Answer:
-        """The answer again; UnknownQuery where it is not stored, or no longer."""
+        """Return a stored answer; raise UnknownQuery if it is not stored."""
         return self._log.find(query_id).answer
 
     def question(
         self, query_id: str, may_read: Callable[[str], bool] = lambda _: True
     ) -> StoredQuery:
-        """Return how a query was sent, without names of maps that `may_read` refuses; raise
+        """Return the request of a query, without names of maps that `may_read` refuses; raise
         UnknownQuery if its answer is not stored.
         """
         stored, record = self._log.find(query_id), self._log.record(query_id, may_read)
@@ -261,9 +267,13 @@ class Inspection:
         )
 
     def preview(self, query_id: str, view: View = "depth", width: int = 320) -> bytes:
-        """Return a picture of what the query saw as PNG; see `sceneprint.pictures`. Raise
-        UnknownQuery if its answer is not stored, NotIndexed if it was sent without validation, and
-        InvalidRequest for patches, which are not stored.
+        """Return a picture of the query frame as PNG.
+
+        Raises
+        ------
+        UnknownQuery : If the answer is not stored.
+        NotIndexed : If the query ran without validation.
+        InvalidRequest : If the view is `patches`, which are not stored.
         """
         stored = self._log.find(query_id)
         if view == "patches":
@@ -276,8 +286,8 @@ class Inspection:
         return picture(colours, width, {"view": view, "model": stored.answer.model, **text})
 
     def cloud(self, query_id: str) -> bytes:
-        """Return the query's points and normals as PLY, in its sensor's frame. Raise UnknownQuery
-        if its answer is not stored, and NotIndexed if it was sent without validation.
+        """Return the query's points and normals as PLY, in its sensor frame; see `preview` for
+        errors.
         """
         stored = self._log.find(query_id)
         points, normals = points_of(geometry_of_query(stored).surface)
@@ -288,49 +298,46 @@ class Inspection:
         return write_ply(points, normals, comments=comments)
 
     def similarities(self, query_id: str, limit: int = 50) -> Similarities:
-        """How alike the query and the first of its ranking are, each to each; UnknownQuery."""
+        """Return the pairwise similarities of the query and the first frames of its ranking."""
         stored = self._log.find(query_id)
-        wanted = stored.ranked[:limit]
+        numbers = stored.ranked[:limit]
         with self._store.database.read() as connection:
-            rows = frames_of(connection, wanted)
+            rows = frames_of(connection, numbers)
             vectors = stored_signatures(connection, rows, stored.model_id)
             names = {row.number: row.name for row in list_maps(connection)}
-        # a frame's number is used once, but its map may be one that the caller cannot know
-        there = [
-            n for n in wanted if n in vectors and names[rows[n].map_number] in stored.answer.maps
+        # without maps that were not searched, which the caller may not be allowed to read
+        known = [
+            n for n in numbers if n in vectors and names[rows[n].map_number] in stored.answer.maps
         ]
         stacked: Bytes = np.stack(
-            [stored.vector, *(np.frombuffer(vectors[n], np.uint8) for n in there)]
+            [stored.vector, *(np.frombuffer(vectors[n], np.uint8) for n in known)]
         )
         model = self._signers(stored.model_id).model
         shares = similarity(pairwise_distances(stacked, model.metric), model.unrelated_distance)
         return Similarities(
             query_id=query_id,
             model=stored.answer.model,
-            frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in there],
-            names=[rows[n].name for n in there],
+            frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in known],
+            names=[rows[n].name for n in known],
             similarity=shares.round(4).tolist(),
         )
 
     def match(self, query_id: str, frame_id: str, map_name: str | None = None) -> MatchDetails:
-        """One match, validated once more, with what its figures were counted on.
+        """Validate a match again, and return it with the points and patches behind its figures.
 
         Parameters
         ----------
-        query_id, frame_id : of an answer, and of one of its matches
-        map_name : where matches of several maps have that id; default: the first of them
+        query_id, frame_id : ids of the answer and of the match
+        map_name : map of the match; None selects the first match with this id
 
         Raises
         ------
-        UnknownQuery : its answer is not stored, or no longer.
-        UnknownMap, UnknownFrame : no match has that id, or it was deleted since.
-        NotIndexed : there are no points to validate it with: the query was asked without
-            validation, or the map has changed its model since.
-        DamagedBlob, UnreadableGeometry : the match's artifact is damaged; it is made again.
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `Pairs.find`.
+        DamagedBlob, UnreadableGeometry : If the match's geometry and upload are damaged.
         """
         pair = self.pairs.find(query_id, frame_id, map_name)
         stored, match, p = pair.stored, pair.match, self.pairs.parameters(pair)
-        query, other = self.pairs.opened(pair)
+        query, other = self.pairs.load(pair)
         v = self.pairs.validated(pair, query, other)
         names = pair.sensor, _sensor(stored)
         T, rival = v.T_match_query, v.T_rival
@@ -355,35 +362,33 @@ class Inspection:
         self, query_id: str, frame_id: str, map_name: str | None = None,
         colour: OverlayColour = "source", by: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
-        """The query's points and a match's as PLY, in the coordinates of the match's sensor; see
-        `match`.
+        """Return the points of a query and a match as PLY, in the sensor frame of the match.
 
         Parameters
         ----------
         query_id, frame_id, map_name : see `match`
-        colour : by where a point is from, by its normal, or by how far it is from the other's
-            surface
-        by : the transform that was found, its best rival, or none: both clouds as they are
+        colour : meaning of the colours: source, normal, or distance from the other surface
+        by : transform of the query's points: the aligned one, its best rival, or none
 
         Raises
         ------
-        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : see `match`.
-        InvalidRequest : there is no such transform.
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `match`.
+        InvalidRequest : If the match has no such transform.
         """
         pair = self.pairs.find(query_id, frame_id, map_name)
-        query, other = self.pairs.opened(pair)
+        query, other = self.pairs.load(pair)
         T = np.eye(4)
         if by != "none":
             v = self.pairs.validated(pair, query, other)
-            found = v.T_match_query if by == "aligned" else v.T_rival
-            if found is None:
+            chosen = v.T_match_query if by == "aligned" else v.T_rival
+            if chosen is None:
                 what = "no transform" if by == "aligned" else "no rival"
                 raise errors.InvalidRequest(
                     f"Frame {frame_id} has {what} with query {query_id}: {v.reason}. Use "
                     "transform=none to see both as they are.",
                     (("transform", f"there is {what}"),),
                 )
-            T = found
+            T = chosen
         p = self.pairs.parameters(pair).agreement
         points, normals, colours = overlay(query.surface, other.surface, T, colour, p)
         comments = [
@@ -436,7 +441,7 @@ class PointClouds:
     def frame(
         self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT
     ) -> Output[bytes]:
-        """Points, normals and patches of a frame; see `FrameFiles.cloud`."""
+        """Return points, normals and patches of a frame; see `FrameFiles.cloud`."""
         found = find_indexed(self._store, map_name, frame_id)
         name, matrix = placed(found.frame, within)
 
@@ -449,8 +454,12 @@ class PointClouds:
         return Output(tag, make)
 
     def query(self, query_id: str, limit: int = LIMIT) -> Output[bytes]:
-        """Return points of a query in its sensor's frame, with normals and patches. Raise
-        UnknownQuery if its answer is not stored, and NotIndexed if it was sent without validation.
+        """Return points, normals and patches of a query in its sensor frame.
+
+        Raises
+        ------
+        UnknownQuery : If the answer is not stored.
+        NotIndexed : If the query ran without validation.
         """
         stored = self._log.find(query_id)
         check_geometry(stored)
@@ -466,27 +475,27 @@ class PointClouds:
         self, query_id: str, frame_id: str, map_name: str | None = None,
         side: PointsSide = "query", by: OverlayTransform = "aligned", limit: int = LIMIT,
     ) -> Output[bytes]:  # fmt: skip
-        """Points of a query or of one of its matches, each in its own sensor's frame, with
-        normals, patches, and how far they are from the other's surface; without that where the
-        frames gave no transform.
+        """Return points, normals and patches of a query or a match in its own sensor frame.
+
+        With a transform, they include the distances of the points from the other surface.
 
         Parameters
         ----------
         query_id, frame_id, map_name : see `Pairs.find`
-        side : whose points
-        by : under which transform they are compared
-        limit : most points
+        side : frame whose points are returned
+        by : transform under which the distances are measured
+        limit : maximum number of points
 
         Raises
         ------
-        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed, DamagedBlob, UnreadableGeometry : see
-            `Pairs.find` and `Pairs.opened`.
-        InvalidRequest : there is no rival; raised when it is made.
+        UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `Pairs.find`.
+        DamagedBlob : See `Pairs.load`; raised when the output is computed.
+        InvalidRequest : If there is no rival; raised when the output is computed.
         """
         pair = self._pairs.find(query_id, frame_id, map_name)
 
         def make() -> bytes:
-            query, match = self._pairs.opened(pair)
+            query, match = self._pairs.load(pair)
             T: Floats | None = np.eye(4)
             if by != "none":
                 v = self._pairs.validated(pair, query, match)
@@ -511,7 +520,7 @@ class PointClouds:
 
 
 def _some(geometry: Geometry, limit: int) -> tuple[Floats32, int]:
-    """Points and normals (N, 6), at most so many, and of how many."""
+    """Return at most `limit` points with normals (N, 6), and the number of all points."""
     every = sample_points(geometry.surface, 1)
     return np.ascontiguousarray(every[thinned(len(every), limit)]), len(every)
 

@@ -1,6 +1,6 @@
-"""Answer a query: R, C, C_vld, the pose of the query, and its status.
+"""Answers to queries: the ranking R, the selections C and C_vld, the pose, and the status.
 
-signature, Geometry, Places  --answer-->  Answer
+PreparedQuery, SearchedMaps  --answer-->  Answer
 PoseEstimate, matches, counts  --answer_status-->  Outcome
 """
 
@@ -65,7 +65,7 @@ from sceneprint_client.api.query import Cause
 
 @dataclass
 class _Clock:
-    """Milliseconds of each stage; a stage that is resumed adds to its time."""
+    """Clock of the stages of a query, in milliseconds; times of a resumed stage add up."""
 
     spent: dict[str, float]
     _since: float = field(default_factory=time.perf_counter)
@@ -78,7 +78,7 @@ class _Clock:
 
 @dataclass(frozen=True, eq=False)
 class SequenceFrame:
-    """An earlier frame of a query, and where its sensor was: T_query_sensor (4, 4), by odometry."""
+    """An earlier frame of a sequence, with T_query_sensor (4, 4) by odometry."""
 
     prepared: PreparedQuery
     T: Floats
@@ -90,15 +90,15 @@ class _Attempt:
 
     Parameters
     ----------
-    searched : its R
-    selection : C, or None where it was not asked for
-    among, scales : distances within R, and what C was selected by
-    chosen : positions in R of the candidates: C, or the first of R
-    tried : validations of those candidates that the pose rests on, whatever `k` is
-    rows : of the frames that are shown, by number
-    matches : those that were tried and are still there
-    rivals : the same of frames beyond `chosen`, which show another place than the one found
-    late : whether the deadline came before the last of these
+    searched : R of the frame
+    selection : C; None if it was not requested
+    among, scales : distances within R, and parameters of the selection
+    chosen : positions in R of the candidates: C, or the first frames of R
+    tried : validations of the candidates that decide the pose, regardless of `k`
+    rows : rows of the frames in the answer, by number
+    matches : validated candidates that still exist
+    rivals : matches with frames beyond `chosen`, which show other places than the best pose
+    late : whether the deadline was reached before all rivals were validated
     """
 
     prepared: PreparedQuery
@@ -122,19 +122,19 @@ def answer(
 
     Parameters
     ----------
-    places : the maps, one or more of one model
-    model : of all of them
-    prepared, query : the frame, and the options of the query
+    places : one or more maps of one model
+    model : model of the maps
+    prepared, query : frame and options of the query
     earlier : earlier frames of the same sequence, which vote for the pose of `prepared`
 
     Raises
     ------
-    UnknownFrame : there is none of the id that is to be explained.
-    InvalidRequest, InvalidPose : the prior cannot be used.
+    UnknownFrame : If the frame to explain does not exist.
+    InvalidRequest, InvalidPose : If the prior cannot be used.
     """
     clock = _Clock({"prepare": round(prepared.prepare_ms, 2)})
     prior = prior_of(store, query, places)
-    # the last frame first: a deadline costs votes of the earlier ones, and not its own
+    # the last frame comes first, since a deadline should only cost votes of earlier frames
     last = _attempt(store, places, model, prepared, query, deadline, prior, clock)
     before = [
         _attempt(store, places, model, one.prepared, query, deadline, prior) for one in earlier
@@ -159,7 +159,7 @@ def answer(
 
 
 class _StoredDatabase:
-    """The frames that one query searches; `attempts` has all that was validated for `decide`."""
+    """Interface of `decide` to the store; it collects the validations in `attempts`."""
 
     def __init__(
         self, store: Store, attempts: Sequence[_Attempt], prior: PosePrior | None, model: Model,
@@ -226,7 +226,7 @@ def _attempt(
     store: Store, places: Sequence[SearchedMap], model: Model, prepared: PreparedQuery,
     query: Query, deadline: Deadline, prior: PosePrior | None, clock: _Clock | None = None,
 ) -> _Attempt:  # fmt: skip
-    """Look for one frame of a query, and validate its candidates."""
+    """Search the maps for one frame of a query, and validate its candidates."""
     clock = clock or _Clock({})
     searched = search_maps(store, places, prepared, query, model)
     for place in places:
@@ -249,7 +249,7 @@ def _attempt(
     shown = range(len(ranking)) if query.explain else chosen
     with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
-    matches = [one for one in tried.matches if one.index in rows]  # the rest was deleted meanwhile
+    matches = [one for one in tried.matches if one.index in rows]  # without deleted frames
     return _Attempt(prepared, searched, selection, among, scales, chosen, tried, rows, matches)
 
 
@@ -257,11 +257,11 @@ def _answer(
     store: Store, places: Sequence[SearchedMap], model: Model, last: _Attempt,
     estimate: PoseEstimate | None, query: Query, deadline: Deadline, clock: _Clock, earlier: int,
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
-    """Return the answer to the frame that was asked for."""
+    """Return the answer for the last frame of a query, and the numbers of the frames of R."""
     prepared, searched, p = last.prepared, last.searched, model.parameters.validation
     ranking, tried = searched.ranking, _all_tried(store, last, query, deadline, p)
     clock.stage("validate")
-    # what was rejected elsewhere is no match of anyone's
+    # rejected rivals are not matches
     rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
     matches = [*(one for one in tried.matches if one.index in last.rows), *rivals_left]
     names = {place.row.number: place.row.name for place in places}
@@ -318,7 +318,7 @@ def _answer(
 def _listed_matches(
     candidates: Candidates, last: _Attempt, tried: Validated, elsewhere: Sequence[PairMatch], k: int
 ) -> list[Match]:
-    """Return the first `k` accepted candidates and the others, and those elsewhere, as JSON."""
+    """Return the records of the candidates, of at most `k` accepted ones, and of the rivals."""
     shown = listed([one for one in tried.matches if one.index in last.rows], k)
     hidden = {one.index for one in tried.matches} - {one.index for one in shown}
     order = candidates.ranking.indices.tolist()
@@ -330,7 +330,7 @@ def _listed_matches(
 def _all_tried(
     store: Store, last: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
 ) -> Validated:
-    """Return what came of all candidates, after validating more where `k` asks for more matches."""
+    """Return the validations of all candidates, and validate more of them if `k` requires it."""
     tried = last.tried
     accepted = sum(one.validation.status == "accepted" for one in tried.matches)
     rest = [position for position in last.chosen if position not in tried.chosen]
@@ -348,7 +348,7 @@ def _selections(
 ) -> tuple[Ints64 | None, DiversityParameters | None, list[Selection | None]]:
     """Return distances within R, the scales, and C of each size; Sec. III-D.
 
-    A smaller C is a part of a larger one, as the selection is greedy.
+    The selection is greedy, so a larger C contains the smaller ones.
     """
     if "diversify" not in query.stages:
         return None, None, [None for _ in sizes]
@@ -376,7 +376,7 @@ def _counts(
     tried: Validated,
     matches: Sequence[PairMatch],
 ) -> Counts:
-    """Return how many frames of one of the maps each stage saw."""
+    """Return the number of frames of one map that reached each stage."""
     part, hits = searched.parts[i], searched.hits[i]
     number = part.place.row.number
     statuses = [
@@ -403,17 +403,15 @@ def _version(place: SearchedMap) -> int:
     return place.view.number
 
 
-# What came of a query: its status, why, and where nothing was found, the likeliest cause.
-
-#: Distinct planes that a frame must show at least to be told from others.
+#: Minimum number of distinct planes in a distinctive frame.
 _FEWEST_PLANES = 4.0
-#: Surfaces that lie so many times as far away as those of all candidates speak of a wrong scale.
+#: Ratio of distances to surfaces in the query and in its candidates that indicates a wrong scale.
 _OTHER_SCALE = 2.5
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The status of an answer, why, and the likeliest cause of `not_found`."""
+    """The status of an answer, its reason, and the most likely cause of `not_found`."""
 
     status: AnswerStatus
     reason: str
@@ -428,21 +426,21 @@ def answer_status(
 
     Parameters
     ----------
-    estimate : of `placed`; None where no match has a pose
-    tried : of `validated`
-    matches : those that were tried and are still there
-    counts : of all maps
-    geometry : of the query; None where it was not validated
+    estimate : result of `decide`; None if no match has a pose
+    tried : result of `validated`
+    matches : validated candidates that still exist
+    counts : sums over all maps
+    geometry : geometry of the query; None without validation
     posed : whether an accepted match has a pose in the map
     """
     if "validate" not in query.stages:
-        return Outcome("unvalidated", "validation was not asked for")
+        return Outcome("unvalidated", "validation was not requested")
     accepted = [one for one in matches if one.validation.status == "accepted"]
     if accepted and not posed:
         return Outcome(
             "found",
-            f"{len(accepted)} matches are accepted, but none has a pose in the map; `best` has the "
-            "transform to the first",
+            f"{len(accepted)} matches are accepted, but none has a pose in the map; `best` "
+            "contains the transform to the first match",
         )
     unsure = next((one for one in matches if one.validation.status == "ambiguous"), None)
     decided = estimate is not None and estimate.status == "found"
@@ -464,11 +462,11 @@ def _likeliest_cause(
     tried: Validated, matches: Sequence[PairMatch], counts: Counts, geometry: Geometry | None,
     p: ValidationParameters,
 ) -> tuple[Cause, str]:  # fmt: skip
-    """Return the likeliest cause that nothing was found, and what to do next."""
+    """Return the most likely cause of `not_found`, and the next step as a sentence."""
     if not counts.passed:
         if counts.map:
             return "no_frames", "no frame of the map passes the filter. Widen the filter"
-        return "no_frames", "the map has no frame to compare. Upload frames of the place"
+        return "no_frames", "the map has no indexed frames. Upload frames of the place"
     tilted = next((one for one in matches if one.validation.contradicts_up), None)
     if tilted is not None:
         return "gravity", tilted.validation.reason
@@ -480,27 +478,27 @@ def _likeliest_cause(
     nearest = f" (the nearest: {first})" if first else ""
     return (
         "nothing_alike",
-        f"none of {counts.validated} candidates is accepted{nearest}. Move on and ask again, or "
-        "add frames of this place to the map",
+        f"none of {counts.validated} candidates is accepted{nearest}. Move and send another "
+        "query, or add frames of this place to the map",
     )
 
 
 def _cause_in_view(
     geometry: Geometry, tried: Validated, p: ValidationParameters
 ) -> tuple[Cause, str] | None:
-    """Return the cause that lies in the frame itself, and what to do next, or None."""
+    """Return a cause in the query frame itself, and the next step; None if there is no such cause."""
     if len(geometry.patches) < p.minimum_patches:
         return (
             "too_little_in_view",
-            f"the frame has {len(geometry.patches)} surface patches, and {p.minimum_patches} are "
-            "needed. Turn towards more of the place and ask again",
+            f"the frame has {len(geometry.patches)} surface patches, but {p.minimum_patches} are "
+            "needed. Turn the sensor so that it sees more surfaces, and send another query",
         )
     planes = float(plane_weights(geometry.patches, PlaneParameters()).sum(dtype=float))
     if planes < _FEWEST_PLANES:
         return (
             "one_plane",
-            f"the frame shows {planes:.0f} planes, too few to tell places apart. Turn towards "
-            "furniture or a corner and ask again",
+            f"the frame shows {planes:.0f} planes, too few to distinguish places. Turn the sensor "
+            "towards furniture or a corner, and send another query",
         )
     others = list(tried.geometries.values())
     if not others:
@@ -508,15 +506,15 @@ def _cause_in_view(
     if all(type(one.surface.camera) is not type(geometry.surface.camera) for one in others):
         return (
             "other_sensor",
-            "the frame is of another kind of sensor than the map's. Ask a map of the same kind of "
-            "sensor",
+            "the frame and the map are from different kinds of sensors. Query a map of the same "
+            "kind of sensor",
         )
     ratio = _distance(geometry) / float(np.median([_distance(one) for one in others]))
     if not 1 / _OTHER_SCALE < ratio < _OTHER_SCALE:
         return (
             "scale",
-            f"surfaces of the frame lie {ratio:.2g} times as far away as those of the map. Check "
-            "`depth_scale`, or `units_per_metre` of a cloud",
+            f"the surfaces in the frame are {ratio:.2g} times as far away as those in the map. "
+            "Check `depth_scale`, or `units_per_metre` of a cloud",
         )
     return None
 

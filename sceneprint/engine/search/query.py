@@ -1,4 +1,4 @@
-"""Queries of an engine: sign the frame with the maps' model, and answer with that model.
+"""Queries: sign a frame with the model of the queried maps, and search the maps for it.
 
 upload | stored frame, names of maps  -->  Answer
 """
@@ -18,7 +18,7 @@ from sceneprint.engine.search.retrieval import (
     Deadline,
     PreparedQuery,
     SearchedMap,
-    check_taken,
+    check_origin,
     prepare_stored,
     prepare_upload,
 )
@@ -56,26 +56,24 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.query import MOST_MAPS, MOST_OF_SEQUENCE, LocalizationStatus
 
-# Queries that meet a map's switch to another model: answered wholly with one, or asked again.
-
 T = TypeVar("T")
 
-#: Times that a query is asked while its map switches from model to model.
+#: Maximum number of attempts of a query while its maps switch models.
 TRIES = 5
 
 
 def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]) -> T:
-    """Ask maps, and once more where one of them switched to another model meanwhile.
+    """Run a query, and repeat it if one of its maps switched to another model meanwhile.
 
     Parameters
     ----------
-    maps : their names
-    ask : signs the query with the model of the rows, and answers it from maps of that model
+    maps : names of the maps
+    ask : function that signs and answers the query with the model of the maps
 
     Raises
     ------
-    UnknownMap : one of them is none.
-    Busy : a map switched again and again.
+    UnknownMap : If a map does not exist.
+    Busy : If a map switched models during every attempt.
     """
     with store.database.read() as connection:
         rows = find_maps(connection, maps)
@@ -87,7 +85,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
             if now is None:
                 raise
         else:
-            # also where all went well: artifacts of the former model may have been missed
+            # artifacts of the former model may have been removed during a successful query
             now = _other_models(store, rows)
             if now is None:
                 return result
@@ -99,7 +97,7 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
 
 
 def check_model(one: str, other: str) -> None:
-    """Raise ModelMismatch unless signatures that are to be compared are of one model."""
+    """Raise ModelMismatch unless two ids of models are equal."""
     if one != other:
         raise ModelMismatch(
             f"Signatures of two models cannot be compared: {one[:12]} and {other[:12]}. Send the "
@@ -108,39 +106,35 @@ def check_model(one: str, other: str) -> None:
 
 
 def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
-    """Return the maps as they are now if one of them has another model, else None."""
+    """Return the current rows if a map has another model now, else None."""
     try:
         with store.database.read() as connection:
-            now = find_maps(connection, [row.name for row in rows])
+            rows_now = find_maps(connection, [row.name for row in rows])
     except UnknownMap:
         return None
-    pairs = list(zip(now, rows, strict=True))
+    pairs = list(zip(rows_now, rows, strict=True))
     if any(one.number != row.number for one, row in pairs):
         return None
-    return now if any(one.model_id != row.model_id for one, row in pairs) else None
+    return rows_now if any(one.model_id != row.model_id for one, row in pairs) else None
 
 
-# Two frames compared: their signatures, and whether they see one place.
-#
-# frame, frame  --compare-->  Similarity
-
-#: A frame that is stored, or sent: its bytes and what is known of it.
+#: A stored frame, or the bytes and metadata of an upload.
 Side = NamedFrame | tuple[bytes, FrameMeta]
 
 
 def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -> Similarity:
-    """Compare two frames; neither is kept.
+    """Compare two frames without storing them.
 
     Parameters
     ----------
-    a, b : the frames
-    how : whether they are aligned, and with what; the frames it names are `a` and `b`
+    a, b : frames
+    how : options of the comparison; its names of frames are ignored
 
     Raises
     ------
-    UnknownMap, UnknownFrame : there is none.
-    FrameError : an upload that cannot be used.
-    InvalidRequest : a stored frame is not indexed, or the models differ.
+    UnknownMap, UnknownFrame : If a stored frame does not exist.
+    FrameError : If an upload cannot be used.
+    InvalidRequest : If a stored frame is not indexed, or the models differ.
     """
     sides = (a, b)
     stages = ("retrieve", "validate") if how.aligned else ("retrieve",)
@@ -190,7 +184,7 @@ def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Compariso
 
 
 def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Comparison) -> Signer:
-    """Return the signer of uploads: that of the stored frames' model, if there are any."""
+    """Return the signer of the stored frames' model, or, without any, of the requested model."""
     if not rows:
         return signers.of(read_model(how.model or PRESETS[0]))
     with store.database.read() as connection:
@@ -204,7 +198,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
         )
     if how.model is not None and read_model(how.model).id != rows[0].model_id:
         raise InvalidRequest(
-            f"The stored frame is signed with another model than {how.model!r}: map {models[0]}. "
+            f"The stored frame was not signed with model {how.model!r}: map {models[0]}. "
             "Leave `model` out.",
             (("model", f"map {models[0]}"),),
         )
@@ -212,7 +206,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
 
 
 def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
-    """Return the names of both sensors' coordinates; `a` and `b` if their ids are equal."""
+    """Return the names of the sensors' frames, derived from `a` and `b` if the ids are equal."""
     ids = [x if one.frame is None else one.frame[1] for x, one in (("a", a), ("b", b))]
     if ids[0] == ids[1]:
         ids = ["a", "b"]
@@ -220,7 +214,7 @@ def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
 
 
 class Queries:
-    """Queries one or more maps of one model."""
+    """Queries to one or more maps of one model."""
 
     def __init__(self, context: Context) -> None:
         self._store, self._signers, self._readers = context.store, context.signers, context.readers
@@ -230,19 +224,19 @@ class Queries:
         self, maps: Sequence[str], data: bytes, meta: FrameMeta, query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Look a frame up that is not kept; see `prepare_upload`.
+        """Search maps for an uploaded frame, which is not stored; see `prepare_upload`.
 
         Parameters
         ----------
-        maps : their names, each once
-        query : how to ask
-        since : when the request came, by `time.perf_counter`; default: now
-        sent : the query as the log lists it; None: the log does not list it
+        maps : names of the maps, each once
+        query : options of the query
+        since : time of the request by `time.perf_counter`; None stands for the present
+        sent : entry of the query log; None leaves the query out of the log
 
         Raises
         ------
-        UnknownMap : one of them is none.
-        InvalidRequest : they are of several models.
+        UnknownMap : If a map does not exist.
+        InvalidRequest : If the maps have several models.
         """
         deadline = Deadline(query.deadline_ms, since)
 
@@ -258,19 +252,19 @@ class Queries:
         self, map_name: str, frames: Sequence[tuple[bytes, FrameMeta]], query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Look up the last of some frames of one run; the earlier ones vote for its pose too.
+        """Localise the last frame of a sequence; the earlier frames vote for its pose.
 
         Parameters
         ----------
-        frames : samples and meta of each in the order they were taken: their poses, in one parent
-            frame of any name, are the odometry
-        query : how to ask, for each of them
+        frames : uploads and metadata in order of capture, with odometry as poses in a common
+            parent frame
+        query : options of the query of each frame
         since, sent : see `upload`
 
         Raises
         ------
-        UnknownMap : there is none.
-        InvalidRequest : fewer than 2 frames, too many, or without odometry; or see `upload`.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If there are fewer than 2 frames or too many, or odometry is missing.
         """
         check_sequence([meta for _, meta in frames], query)
         deadline = Deadline(query.deadline_ms, since)
@@ -290,12 +284,12 @@ class Queries:
         self, maps: Sequence[str], frame: FrameName, query: Query, since: float | None = None,
         sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Look a stored frame up, which does not find itself; see `prepare_stored` and `upload`."""
+        """Search maps for a stored frame, excluding itself; see `prepare_stored` and `upload`."""
         deadline = Deadline(query.deadline_ms, since)
 
         def ask(rows: list[MapRow]) -> Answer:
             self._check_models(rows)
-            self._signers(rows[0].model_id)  # while no connection is held: a crowd would hold all
+            self._signers(rows[0].model_id)  # before a connection is in use, as loading takes long
             ready = prepare_stored(self._store, self._signers, frame.map, frame.frame_id, query)
             return self.answer(rows[: len(maps)], ready, query, deadline, sent=sent)
 
@@ -307,19 +301,19 @@ class Queries:
         self, maps: Sequence[str], stored: StoredAnswer, query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Repeat a query whose answer is stored, an upload without its file.
+        """Repeat a query whose answer is stored; an upload need not be sent again.
 
         Parameters
         ----------
         maps, query, since, sent : see `upload`
-        stored : the earlier answer
+        stored : earlier answer
 
         Raises
         ------
-        UnknownMap, UnknownFrame : a map, or the stored frame that was the query, is gone.
-        NotIndexed : it was an upload sent without validation, and this requests it; or a map has
-            another model than its signature.
-        InvalidRequest : see `prepare_upload` and `prepare_stored`.
+        UnknownMap, UnknownFrame : If a map or the query's stored frame no longer exists.
+        NotIndexed : If validation is requested, but the upload was sent without it; or if a map has
+            another model than the stored signature.
+        InvalidRequest : See `prepare_upload` and `prepare_stored`.
         """
         frame = stored.answer.frame
         if frame is not None:
@@ -333,7 +327,7 @@ class Queries:
                 )
             geometry = read_geometry(stored.geometry)
         prepared = PreparedQuery(
-            stored.model_id, stored.vector, geometry, check_taken(stored.taken, query), None, 0.0,
+            stored.model_id, stored.vector, geometry, check_origin(stored.origin, query), None, 0.0,
             base=stored.base, artifact=stored.geometry, kind=stored.answer.kind, up=stored.up,
         )  # fmt: skip
 
@@ -349,14 +343,14 @@ class Queries:
         return self._steadily(maps, ask)
 
     def answer(
-        self, asked_of: Sequence[MapRow], prepared: PreparedQuery, query: Query, deadline: Deadline,
+        self, expected: Sequence[MapRow], prepared: PreparedQuery, query: Query, deadline: Deadline,
         earlier: Sequence[SequenceFrame] = (), sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Answer from the maps as they are now; ModelMismatch where one has switched meanwhile."""
+        """Answer a prepared query from the current maps, and log it; see `answer`."""
         database = self._store.database
         with database.read() as connection:
-            rows = find_maps(connection, [one.name for one in asked_of])
-            for row, one in zip(rows, asked_of, strict=True):
+            rows = find_maps(connection, [one.name for one in expected])
+            for row, one in zip(rows, expected, strict=True):
                 if row.number != one.number:
                     raise UnknownMap(
                         f"Map {row.name!r} was deleted and created again during the query. Send "
@@ -369,14 +363,13 @@ class Queries:
             check_model(place.view.model_id, prepared.model_id)
         model = self._signers(prepared.model_id).model
         response, ranked = answer(self._store, places, model, prepared, query, deadline, earlier)
-        self._note(response, ranked, prepared, query, deadline, sent)
+        self._log_answer(response, ranked, prepared, query, deadline, sent)
         return response
 
-    def _note(
+    def _log_answer(
         self, response: Answer, ranked: Sequence[int], prepared: PreparedQuery, query: Query,
         deadline: Deadline, sent: SentQuery | None,
     ) -> None:  # fmt: skip
-        """Have the log store an answer."""
         listed = sent is not None and query.record
         if not (listed or query.keep):
             return
@@ -387,9 +380,9 @@ class Queries:
         if query.keep:
             stored = StoredAnswer(
                 response, query, prepared.model_id, prepared.vector, prepared.artifact,
-                tuple(ranked), taken=prepared.taken, base=prepared.base, up=prepared.up,
+                tuple(ranked), origin=prepared.origin, base=prepared.base, up=prepared.up,
             )  # fmt: skip
-            # explanations show the whole ranking
+
             shown = {ranked[one.rank - 1] for one in response.explanations or response.matches}
             shown |= set() if prepared.frame is None else {prepared.frame[0]}
         self._log.note(replace(row, listed=listed), stored, sorted(shown))
@@ -399,7 +392,7 @@ class Queries:
             return steadily(self._store, maps, ask)
 
     def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
-        """Compare two frames; see `compare`."""
+        """Compare two frames; see the function `compare`."""
         with self._cores.shared():
             return compare(self._store, self._signers, a, b, how)
 
@@ -410,13 +403,13 @@ class Queries:
 
         Parameters
         ----------
-        query : with their names, or `*` for all that may be read
-        may_read : whether the caller may; what it may not is not there
+        query : query with names of maps, or `*` for all readable ones
+        may_read : function that returns whether the caller may read a map
 
         Raises
         ------
-        UnknownMap : one of them is not there, or none is.
-        InvalidRequest : they are more than may be asked at once.
+        UnknownMap : If a map does not exist or is not readable, or there are no maps.
+        InvalidRequest : If there are more maps than a query can search.
         """
         if query.maps != "*":
             for name in query.maps:
@@ -426,7 +419,7 @@ class Queries:
         with self._store.database.read() as connection:
             names = [row.name for row in list_maps(connection) if may_read(row.name)]
         if not names:
-            raise UnknownMap("There is no map to search yet. Create one, or name an existing one.")
+            raise UnknownMap("There is no map to search. Create one, or check the key's grants.")
         if len(names) > MOST_MAPS:
             raise InvalidRequest(
                 f"There are {len(names)} maps, but a query can search at most {MOST_MAPS}. Name "
@@ -450,13 +443,13 @@ class Queries:
 
 
 def check_sequence(metas: Sequence[FrameMeta], query: Query) -> None:
-    """See that frames can be asked as a sequence; InvalidRequest where they cannot."""
+    """Raise InvalidRequest unless frames can be queried as a sequence."""
     check_localizes(query)
     if not 2 <= len(metas) <= MOST_OF_SEQUENCE:
         raise InvalidRequest(
-            f"A sequence of {len(metas)} frames. Send 2 to {MOST_OF_SEQUENCE}, the last one being "
-            "the frame to be placed.",
-            (("frame", f"{len(metas)} of them"),),
+            f"The sequence has {len(metas)} frames. Send 2 to {MOST_OF_SEQUENCE} frames, of which "
+            "the last is localised.",
+            (("frame", f"{len(metas)} frames"),),
         )
     without = [i for i, meta in enumerate(metas) if meta.pose is None]
     parents = {meta.pose.parent_frame for meta in metas if meta.pose is not None}
@@ -476,13 +469,8 @@ def _odometry(frame: PreparedQuery) -> Floats:
     return frame.pose
 
 
-# An answer to the one thing a robot wants: where it is.
-#
-# Answer  --localization_of-->  Localization
-
-
 def check_localizes(query: Query) -> None:
-    """See that a query comes to a pose; InvalidRequest where it does not."""
+    """Raise InvalidRequest unless a query includes validation, which a pose needs."""
     if "validate" not in query.stages:
         raise InvalidRequest(
             "A pose needs validated matches. Leave `stages` out, or include `validate`.",
@@ -491,32 +479,32 @@ def check_localizes(query: Query) -> None:
 
 
 def localization_of(answer: Answer) -> Localization:
-    """Return the pose of a validated query to one map with its confidence, as one record."""
+    """Return the pose and the confidence of a validated query to one map."""
     accepted = [one for one in answer.matches if one.validation.status == "accepted"]
     status: LocalizationStatus = "not_found"
     if answer.status in ("found", "ambiguous"):
         status = answer.status
-    there = answer.location
-    judged = there if there is not None else next(iter(answer.alternatives), None)
-    strength = there.strength if there is not None else None
-    if there is None and status == "found":  # of matches without a pose
+    location = answer.location
+    best_pose = location if location is not None else next(iter(answer.alternatives), None)
+    strength = location.strength if location is not None else None
+    if location is None and status == "found":  # the accepted matches have no poses
         strength = accepted[0].validation.strength
     return Localization(
         status=status,
         reason=answer.reason,
         cause=answer.cause,
         map=answer.maps[0],
-        pose=None if there is None else there.pose,
-        confidence=None if judged is None else judged.confidence,
-        evidence=None if judged is None else judged.evidence,
-        support=0 if there is None else there.support,
-        votes=0 if there is None else there.votes,
-        spread_m=None if there is None else there.spread_m,
-        spread_deg=None if there is None else there.spread_deg,
-        uncertainty=None if there is None else there.uncertainty,
-        base=None if there is None else there.base,
+        pose=None if location is None else location.pose,
+        confidence=None if best_pose is None else best_pose.confidence,
+        evidence=None if best_pose is None else best_pose.evidence,
+        support=0 if location is None else location.support,
+        votes=0 if location is None else location.votes,
+        spread_m=None if location is None else location.spread_m,
+        spread_deg=None if location is None else location.spread_deg,
+        uncertainty=None if location is None else location.uncertainty,
+        base=None if location is None else location.base,
         strength=strength,
-        verified_by=None if there is None else there.verified_by,
+        verified_by=None if location is None else location.verified_by,
         alternatives=answer.alternatives,
         best=accepted[0] if accepted and status == "found" else None,
         matches=[one.frame_id for one in accepted],

@@ -1,4 +1,4 @@
-"""Write matches as JSON, and explain why a frame is, or is not, among them.
+"""API records of matches and poses, and explanations of the ranking.
 
 Candidates, Validated  --match_records | explain-->  Match | Explanation of each
 frame id, Searched, Validated  --why-->  ExplainedFrame
@@ -63,19 +63,19 @@ from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Unc
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The candidates of a query, with all that their records say.
+    """The candidates of a query with the data of their records.
 
     Parameters
     ----------
-    maps : names of all that were asked, by number
+    maps : names of the queried maps, by number
     ranking : R, of frame numbers
-    selection : C, or None where diversification was not asked for
-    rows : frames of the candidates by number; those deleted in the meantime are not among them
-    unreadable : numbers of frames whose artifact cannot be read, and why
-    untried : why the other candidates were not tried
-    query_frame : what the coordinates of the query's sensor are called
-    covariance : of the model, by which a direction is told to be free
-    base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
+    selection : C; None if diversification was not requested
+    rows : rows of the candidates by number, without frames that were deleted during the query
+    unreadable : errors of unreadable artifacts, by frame number
+    untried : reason why the remaining candidates were not validated
+    query_frame : name of the query's sensor frame in transforms
+    covariance : parameters of the model that define free directions
+    base : name of the robot's base frame, and T_base_query (4, 4); None if unknown
     """
 
     maps: dict[int, str]
@@ -89,7 +89,7 @@ class Candidates:
     base: tuple[str, Floats] | None = None
 
     def base_of(self, T_parent_query: Floats | None, parent: str) -> Transform | None:
-        """Return the pose of the robot's base, by that of its camera."""
+        """Return the pose of the robot's base; None if the base or the query's pose is unknown."""
         if self.base is None or T_parent_query is None:
             return None
         name, T_base_query = self.base
@@ -97,7 +97,7 @@ class Candidates:
 
 
 def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
-    """Return matches in their order, without those accepted beyond the first `k`."""
+    """Return matches in their order, without accepted ones beyond the first `k`."""
     accepted = [one.index for one in matches if one.validation.status == "accepted"]
     return [one for one in matches if one.index not in accepted[k:]]
 
@@ -105,9 +105,7 @@ def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
 def match_records(
     candidates: Candidates, chosen: Sequence[int], matches: Sequence[PairMatch]
 ) -> list[MatchRecord]:
-    """Return the matches, the most trusted first, then the other chosen candidates in the order of
-    R.
-    """
+    """Return the records of the validated candidates in their order, then of the others by rank."""
     position = {int(candidates.ranking.indices[i]): i for i in chosen}
     tried = {match.index: match.validation for match in matches}
     order = [*tried, *(number for number in position if number not in tried)]
@@ -126,7 +124,7 @@ def match_records(
 
 
 def location_record(candidates: Candidates, estimate: PoseEstimate | None) -> LocationRecord | None:
-    """Return the query's pose, where it was found."""
+    """Return the pose of the query; None if none was found."""
     if estimate is None or estimate.average is None:
         return None
     average, (number, _, parent) = estimate.average, estimate.parent.partition(" ")
@@ -150,7 +148,7 @@ def location_record(candidates: Candidates, estimate: PoseEstimate | None) -> Lo
 def alternative_records(
     candidates: Candidates, estimate: PoseEstimate | None
 ) -> list[AlternativeRecord]:
-    """Return the poses that the evidence supports, where it does not decide."""
+    """Return the alternative poses of an ambiguous answer."""
     if estimate is None:
         return []
     number, _, parent = estimate.parent.partition(" ")
@@ -167,7 +165,7 @@ def alternative_records(
 
 
 def evidence_record(evidence: PlaceEvidence | None) -> EvidenceRecord | None:
-    """Return the evidence for a pose as JSON; shares are rounded to a tenth of 1 %."""
+    """Return the API record of the evidence for a pose, with numbers rounded to three decimals."""
     if evidence is None:
         return None
     rounded = {
@@ -231,7 +229,7 @@ def _match(
 def uncertainty_record(
     covariance: Floats | None, method: Method, p: CovarianceParameters
 ) -> Uncertainty | None:
-    """Return a covariance (6, 6) as JSON, with the directions that it leaves free."""
+    """Return the API record of a covariance (6, 6), with the directions that it leaves free."""
     if covariance is None:
         return None
     free = [
@@ -251,7 +249,7 @@ def _vector(v: Floats) -> Vector:
 
 
 def validation_record(v: PairValidation) -> ValidationRecord:
-    """Return the result of an alignment as JSON."""
+    """Return the API record of a validation."""
     residual = None
     if math.isfinite(v.residual_m):
         residual = Residual(translation_m=v.residual_m, rotation_deg=math.degrees(v.residual_rad))
@@ -273,22 +271,17 @@ def validation_record(v: PairValidation) -> ValidationRecord:
     )
 
 
-# Why each frame of a ranking came as far as it did.
-#
-# Candidates, Validated  --explain-->  Explanations
-
-
 def explain(
     candidates: Candidates, tried: Validated, among: Ints64 | None, p: DiversityParameters | None
 ) -> list[Explanation]:
-    """Return for each frame of R the last stage that it reached, and why.
+    """Return for each frame of R the last stage that it reached, and the reason.
 
     Parameters
     ----------
-    candidates : with the rows of all of R
-    tried : what came of the candidates
-    among : (R, R) distances within R; None where diversification was not asked for
-    p : that the selection was made with
+    candidates : candidates with the rows of all frames of R
+    tried : validations of the candidates
+    among : (R, R) distances within R; None if diversification was not requested
+    p : parameters of the selection
     """
     left = None
     if among is not None and len(candidates.ranking):
@@ -298,7 +291,7 @@ def explain(
 
 
 def figures(v: ValidationRecord) -> str:
-    """Return a validation in one line: its reason, and the numbers it rests on."""
+    """Return a validation as one line of text: status, reason and figures."""
     if v.residual is None:
         return f"{v.status}: {v.reason}"
     share = v.free_space_violations
@@ -349,11 +342,11 @@ def _each(
 def _not_selected(
     candidates: Candidates, tried: Validated, among: Ints64, position: int, gain: float
 ) -> str:
-    """Return which selected frame a frame resembles, and the gain that it would have added."""
+    """Return why a frame was not selected: its most similar selected frame, and its gain."""
     own = among[position, list(tried.chosen)]
     nearest = tried.chosen[int(np.argmin(own))]
     row = candidates.rows.get(int(candidates.ranking.indices[nearest]))
-    name = "a frame deleted since" if row is None else f"frame {row.id}"
+    name = "frame, which was deleted" if row is None else f"frame {row.id}"
     if gain <= DUPLICATE:
         return f"a duplicate of the selected {name}"
     return (
@@ -364,13 +357,7 @@ def _not_selected(
 
 @dataclass(frozen=True, eq=False)
 class ExplainedQuery:
-    """A query that was answered, for the explanation of one frame.
-
-    Parameters
-    ----------
-    searched, prepared, query, candidates, tried : of the query
-    deadline : no frame is validated for this after it
-    """
+    """An answered query, for the explanation of one frame."""
 
     store: Store
     searched: retrieval.Searched
@@ -382,12 +369,15 @@ class ExplainedQuery:
     deadline: retrieval.Deadline
 
 
-def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
-    """Explain at which stage a frame dropped out, and how it would align; raise UnknownFrame if no
-    queried map has it.
+def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
+    """Explain at which stage a frame dropped out, and how it would align.
+
+    Raises
+    ------
+    UnknownFrame : If no queried map has the frame.
     """
-    part, row = _locate_frame(asking, frame_id)
-    absent = _absent(asking, part, row)
+    part, row = _locate_frame(case, frame_id)
+    absent = _absent(case, part, row)
     name = part.place.row.name
     if absent is not None:
         return ExplainedFrame(
@@ -397,19 +387,19 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
         )  # fmt: skip
     view, number = part.place.view, np.array([row.number], np.int64)
     stored = view.signatures(number)
-    distance = distances(asking.prepared.vector, stored, view.metric)
-    rank = retrieval.rank_among_all(asking.searched, asking.prepared, row.number, int(distance[0]))
-    at = np.flatnonzero(asking.searched.ranking.indices == row.number).tolist()
+    distance = distances(case.prepared.vector, stored, view.metric)
+    rank = retrieval.rank_among_all(case.searched, case.prepared, row.number, int(distance[0]))
+    at = np.flatnonzero(case.searched.ranking.indices == row.number).tolist()
     passes = part.among is None or row.number in part.among
-    # an approximate index cannot be asked what it compared: what it should have ranked, it did not
-    missed = not at and passes and not asking.searched.exact and rank <= asking.searched.size
-    selected = bool(at) and at[0] in asking.tried.chosen
-    validation, T = _aligned(asking, part, row)
+    # an approximate index does not report which frames it compared
+    missed = not at and passes and not case.searched.exact and rank <= case.searched.size
+    selected = bool(at) and at[0] in case.tried.chosen
+    validation, T = _aligned(case, part, row)
     if missed:
         lost: Lost | None = "shortlist"
         reason = f"the index missed it, although its rank is {rank}; query with `exact`"
     else:
-        lost, reason = _lost(asking, row, rank, passes, bool(at), selected)
+        lost, reason = _lost(case, row, rank, passes, bool(at), selected)
     early = lost not in (None, "validation")
     if early and validation is not None and validation.status != "skipped":
         reason += f"; aligned only for this explanation, it is {figures(validation)}"
@@ -420,37 +410,37 @@ def why(asking: ExplainedQuery, frame_id: str) -> ExplainedFrame:
         state=row.state,
         passes_filter=passes,
         distance=int(distance[0]),
-        similarity=float(similarity(distance, asking.model.unrelated_distance)[0]),
+        similarity=float(similarity(distance, case.model.unrelated_distance)[0]),
         rank=rank,
-        of=sum(one.passed for one in asking.searched.parts),
+        of=sum(one.passed for one in case.searched.parts),
         shortlisted=not missed,
         ranked=bool(at),
         selected=selected,
         validation=validation,
         transform=(
             None if T is None
-            else transform(T, sensor_of(row), asking.candidates.query_frame)
+            else transform(T, sensor_of(row), case.candidates.query_frame)
         ),
         lost_at=lost,
         reason=reason,
     )  # fmt: skip
 
 
-def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSearch, FrameRow]:
-    """Return the frame, and the search of its map: the first with one that can be found."""
-    parts, own = asking.searched.parts, asking.prepared.frame
-    held, missing = [], None
-    with asking.store.database.read() as connection:
+def _locate_frame(case: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSearch, FrameRow]:
+    """Return the frame and the search of its map, preferring maps in which it can be found."""
+    parts, own = case.searched.parts, case.prepared.frame
+    candidates, missing = [], None
+    with case.store.database.read() as connection:
         for part in parts:
             try:
-                held.append((part, find_frame(connection, part.place.row, frame_id)))
+                candidates.append((part, find_frame(connection, part.place.row, frame_id)))
             except UnknownFrame as error:
                 missing = error
-    if missing is not None and not held:
+    if missing is not None and not candidates:
         raise missing
-    # another map may have had one of that id, or have the query itself under it
+    # another map may have a deleted frame with the same id, or the query itself
     return min(
-        held,
+        candidates,
         key=lambda one: (
             one[1].state != FrameState.INDEXED,
             own is not None and one[1].number == own[0],
@@ -459,10 +449,10 @@ def _locate_frame(asking: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapS
 
 
 def _absent(
-    asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
+    case: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[Lost, str] | None:
-    """Return why a frame is not searched at all; None where it is."""
-    view, prepared = part.place.view, asking.prepared
+    """Return why a frame is excluded from the search; None if it is included."""
+    view, prepared = part.place.view, case.prepared
     if prepared.frame is not None and prepared.frame[0] == row.number:
         return "query", "it is the query itself, which queries exclude"
     if row.state != FrameState.INDEXED:
@@ -476,10 +466,10 @@ def _absent(
 
 
 def _lost(
-    asking: ExplainedQuery, row: FrameRow, rank: int, passes: bool, ranked: bool, selected: bool
+    case: ExplainedQuery, row: FrameRow, rank: int, passes: bool, ranked: bool, selected: bool
 ) -> tuple[Lost | None, str]:
-    """Return the stage at which a frame dropped out, and why."""
-    size, tried = len(asking.searched.ranking), asking.tried
+    """Return the stage at which a frame dropped out, and the reason."""
+    size, tried = len(case.searched.ranking), case.tried
     if not passes:
         return "filter", "it does not pass the filter"
     if not ranked:
@@ -490,7 +480,7 @@ def _lost(
             "with more `candidates`, or with `explain` to see which candidate it resembles"
         )
     status = {match.index: match.validation for match in tried.matches}.get(row.number)
-    shown = {match.index for match in listed(tried.matches, asking.query.k)}
+    shown = {match.index for match in listed(tried.matches, case.query.k)}
     if status is not None and row.number not in shown:
         return "turn", (
             "more than `k` matches are accepted, and others are listed before it; "
@@ -500,7 +490,7 @@ def _lost(
         return None, f"it is a match, {figures(validation_record(status))}"
     if status is not None:
         return "validation", figures(validation_record(status))
-    if "validate" not in asking.query.stages:
+    if "validate" not in case.query.stages:
         return None, f"it is a match with rank {rank}; validation was not requested"
     if row.number in tried.unreadable:
         return "validation", tried.unreadable[row.number]
@@ -508,34 +498,34 @@ def _lost(
 
 
 def _aligned(
-    asking: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
+    case: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[ValidationRecord | None, np.ndarray | None]:
-    """Return the alignment of the query with a frame, also where the query did not try it."""
-    geometry = asking.prepared.geometry
+    """Return the validation of a frame and its transform; validate it now if the query did not."""
+    geometry = case.prepared.geometry
     if geometry is None:
         return None, None
-    known: dict[int, PairValidation] = {one.index: one.validation for one in asking.tried.matches}
-    aligned = known.get(row.number)
+    earlier: dict[int, PairValidation] = {one.index: one.validation for one in case.tried.matches}
+    aligned = earlier.get(row.number)
     if aligned is None:
-        if not asking.deadline.allows():
+        if not case.deadline.allows():
             return ValidationRecord(
                 status="skipped", reason="the deadline passed before it was validated"
             ), None
         model_id = part.place.row.model_id
-        with asking.store.database.read() as connection:
+        with case.store.database.read() as connection:
             blob = geometry_blobs(connection, [row.number], model_id).get(row.number)
-            ranked = asking.searched.ranking.indices.tolist()
+            ranked = case.searched.ranking.indices.tolist()
             up = known_ups(connection, [*ranked, row.number]).get(row.number)
         if blob is None:
             return ValidationRecord(
                 status="skipped", reason="it was deleted during the query"
             ), None
         try:
-            own = asking.store.geometries.read(blob)
+            own = case.store.geometries.read(blob)
         except (DamagedBlob, UnreadableGeometry) as error:
             return ValidationRecord(status="skipped", reason=str(error)), None
-        query = asking.query
-        p = asking.model.parameters.validation
+        query = case.query
+        p = case.model.parameters.validation
         options = thresholds(query.validation, p)
-        aligned = validate(geometry, own, query.seed, *options, ups=(asking.prepared.up, up))
+        aligned = validate(geometry, own, query.seed, *options, ups=(case.prepared.up, up))
     return validation_record(aligned), aligned.T_match_query

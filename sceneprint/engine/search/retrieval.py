@@ -1,6 +1,6 @@
-"""A query to R, one ranking over all maps that are asked: Sec. III-C.
+"""Retrieval: the ranking R of the frames of all queried maps, Sec. III-C.
 
-maps as of now  --Readers.view-->  IndexViews  --search_maps-->  Searched
+maps  --Readers.view-->  IndexViews  --search_maps-->  Searched
 """
 
 from __future__ import annotations
@@ -40,16 +40,14 @@ from sceneprint.types import Bytes, Floats, Geometry
 from sceneprint_client.api import Filter, FrameMeta, FrameName, Query
 from sceneprint_client.api.frames import Kind
 
-# The readers of all maps.
-
-#: Memory of all tails above which maps that were not asked for long are forgotten.
+#: Memory of all tails in bytes above which the readers of least recently queried maps are closed.
 HELD_BYTES = 1 << 30
-#: Seconds between two looks for maps that are held and no longer there.
+#: Seconds between two searches for readers of deleted maps.
 _TIDY_S = 10.0
 
 
 class Readers:
-    """The readers of all queried maps, whose indexes `place` has."""
+    """The readers of all queried maps, with indexes from `place`."""
 
     def __init__(self, signers: Signers, place: IndexPlace) -> None:
         self._signers, self._place = signers, place
@@ -59,7 +57,7 @@ class Readers:
         self._tidied = time.monotonic()
 
     def view(self, connection: Connection, row: MapRow) -> IndexView:
-        """A map as of the row's revision, or later, on this node."""
+        """Return a view of a map at the row's revision or later."""
         reader = self._reader(connection, row)
         if time.monotonic() - self._tidied >= _TIDY_S:
             self.tidy(connection)
@@ -67,17 +65,17 @@ class Readers:
 
     def _reader(self, connection: Connection, row: MapRow) -> Reader:
         with self._lock:
-            if self._history != self._database.history:  # revisions may be of other frames now
+            if self._history != self._database.history:  # a restored database reuses revisions
                 self._history = self._database.history
                 self._open.clear()
             held, reader = self._open.get(row.name, (None, None))
-            wanted = (row.number, row.model_id)
-            if reader is None or held != wanted:  # made anew, or signed with another model
+            key = (row.number, row.model_id)
+            if reader is None or held != key:  # a new map, or another model
                 model = self._signers(row.model_id).model
                 reader = Reader(connection, row, self._place.folder(row), model)
-                self._open[row.name] = (wanted, reader)
+                self._open[row.name] = (key, reader)
             self._open.move_to_end(row.name)
-            # the one that was asked longest ago first, and never the one that is asked now
+            # the least recently queried first, but never the current one
             held_bytes = sum(one.bytes_held for _, one in self._open.values())
             while len(self._open) > 1 and held_bytes > HELD_BYTES:
                 _, (_, oldest) = self._open.popitem(last=False)
@@ -87,12 +85,12 @@ class Readers:
         return reader
 
     def forget(self, name: str) -> None:
-        """Give up what is held of a map that was deleted."""
+        """Close the reader of a deleted map."""
         with self._lock:
             self._open.pop(name, None)
 
     def purge(self, connection: Connection) -> None:
-        """Hold nothing of deleted frames any more, beyond what the newest indexes have of them."""
+        """Remove deleted frames from memory, except those in the newest indexes."""
         self.tidy(connection)
         with self._lock:
             held = list(self._open.items())
@@ -103,50 +101,45 @@ class Readers:
                 reader.purge(connection, row)
 
     def tidy(self, connection: Connection) -> None:
-        """Give up what is held of maps that another process deleted, or gave another model.
+        """Close the readers of maps that another process deleted or switched to another model.
 
-        Their files are gone, but take room on the disk and a descriptor each while mapped.
+        Their deleted files occupy disk space and file descriptors while they are mapped.
         """
-        asked = select(maps.c.name, maps.c.number, maps.c.model_id)
-        there = {row.name: (row.number, row.model_id) for row in connection.execute(asked)}
+        statement = select(maps.c.name, maps.c.number, maps.c.model_id)
+        rows = {row.name: (row.number, row.model_id) for row in connection.execute(statement)}
         with self._lock:
             self._tidied = time.monotonic()
-            for name in [name for name, (held, _) in self._open.items() if there.get(name) != held]:
+            for name in [name for name, (held, _) in self._open.items() if rows.get(name) != held]:
                 del self._open[name]
             for name, (_, reader) in list(self._open.items()) if self._place.is_shared else ():
-                if reader.lost_index(IN_USE_S):  # to make room; its files take it while mapped
+                if reader.lost_index(IN_USE_S):  # mapped files still occupy disk space
                     del self._open[name]
-
-
-# A query made ready: its signature and, for validation, its geometry.
-#
-# upload | frame of the map  --prepare_upload | prepare_stored-->  PreparedQuery
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedQuery:
-    """A query made ready.
+    """A query frame with its signature and, for validation, its geometry.
 
     Parameters
     ----------
-    model_id : of the model that signed it
-    vector : (D,) its signature
-    geometry : its artifact; None where validation was not asked for
-    taken : by whom, in which run and when
-    frame : its number and id, if it is one of the map: it does not find itself
-    prepare_ms : what making it ready took
-    home : the map that frame is in
-    base : what the robot's base is called, and T_base_query (4, 4); None where it is not known
+    model_id : id of the model that signed it
+    vector : (D,) signature
+    geometry : geometry; None without validation
+    origin : robot, session and time of capture
+    frame : number and id of a stored frame, which queries exclude; None for an upload
+    prepare_ms : duration of the preparation
+    home : map of the stored frame
+    base : name of the robot's base frame, and T_base_query (4, 4); None if unknown
     artifact : `geometry` as bytes
-    kind : of the frame
-    up : (3,) unit vector in its sensor; None where it is not known
-    pose : (4, 4) T_parent_sensor that came with an upload, of a sequence's odometry
+    kind : kind of the frame
+    up : (3,) unit vector in the sensor frame; None if unknown
+    pose : (4, 4) T_parent_sensor of an upload, which is the odometry of a sequence
     """
 
     model_id: str
     vector: Bytes
     geometry: Geometry | None
-    taken: QueryOrigin
+    origin: QueryOrigin
     frame: tuple[int, str] | None
     prepare_ms: float
     home: MapRow | None = None
@@ -158,7 +151,7 @@ class PreparedQuery:
 
     @property
     def name(self) -> FrameName | None:
-        """Map and id of the frame, if it is one of the map."""
+        """Map and id of a stored frame; None for an upload."""
         if self.frame is None or self.home is None:
             return None
         return FrameName(map=self.home.name, frame_id=self.frame[1])
@@ -167,31 +160,30 @@ class PreparedQuery:
 def prepare_upload(
     data: bytes, meta: FrameMeta, signer: Signer, query: Query, decoders: Decoders
 ) -> PreparedQuery:
-    """Make an uploaded frame ready.
+    """Decode and sign an uploaded frame.
 
     Raises
     ------
-    FrameError : see `read_upload`; UselessFrame where nothing in it can be signed; InvalidPose
-        where T_base_sensor is none.
-    InvalidRequest : the filter asks for distance from its session, and `meta` lacks it or a time;
-        or see `read_upload`.
+    FrameError : See `read_upload`; UselessFrame if the frame has too few surfaces to sign.
+    InvalidRequest : If the filter needs the session and the time of the frame, and `meta` lacks
+        one; or see `read_upload`.
     """
     start = time.perf_counter()
     at = None if meta.captured_at is None else meta.captured_at.timestamp()
-    taken = check_taken(QueryOrigin(meta.robot, meta.session, at), query)
+    origin = check_origin(QueryOrigin(meta.robot, meta.session, at), query)
     read = read_upload(data, meta, decoders)
     kind, base = read.kind, read.base
     up = None if meta.up is None else np.array(meta.up.unit)
     if "validate" not in query.stages:
         vector = sign(read.frame, signer).vector
         return PreparedQuery(
-            signer.model.id, vector, None, taken, None, _since(start), base=base, kind=kind, up=up
+            signer.model.id, vector, None, origin, None, _since(start), base=base, kind=kind, up=up
         )
     signature, seen = prepare(read.frame, signer)
-    # as it would be read back: the same answer as when the frame is in the map
+    # read back from its artifact, so that a stored frame gets the same answer
     artifact = write_geometry(seen)
     return PreparedQuery(
-        signature.model_id, signature.vector, read_geometry(artifact), taken, None, _since(start),
+        signature.model_id, signature.vector, read_geometry(artifact), origin, None, _since(start),
         base=base, artifact=artifact, kind=kind, up=up, pose=read.frame.pose,
     )  # fmt: skip
 
@@ -199,14 +191,14 @@ def prepare_upload(
 def prepare_stored(
     store: Store, signers: Signers, map_name: str, frame_id: str, query: Query
 ) -> PreparedQuery:
-    """Make a frame of the map ready; what is damaged of it is made again from its upload.
+    """Load a stored frame; rebuild a damaged signature or artifact from its upload.
 
     Raises
     ------
-    UnknownMap, UnknownFrame : there is none.
-    InvalidRequest : the frame has no signature, or not yet; or the filter asks for distance from
-        its session, and it has none, or no time.
-    DamagedBlob : what was made of it is damaged, and its upload too.
+    UnknownMap, UnknownFrame : If the map or the frame does not exist.
+    InvalidRequest : If the frame has no signature; or if the filter needs the session and the time
+        of the frame, and it lacks one.
+    DamagedBlob : If a damaged frame cannot be rebuilt because its upload is damaged too.
     """
     start = time.perf_counter()
     with store.database.read() as connection:
@@ -225,8 +217,8 @@ def prepare_stored(
             "can be a query.",
             (("frame_id", f"is {frame.state}"),),
         )
-    taken = check_taken(QueryOrigin(frame.robot, frame.session, frame.captured_at), query)
-    asked, geometry, artifact, base = np.frombuffer(vector, np.uint8), None, None, None
+    origin = check_origin(QueryOrigin(frame.robot, frame.session, frame.captured_at), query)
+    signature, geometry, artifact, base = np.frombuffer(vector, np.uint8), None, None, None
     if frame.base is not None:
         base = str(frame.base_frame), np.array(frame.base)
     validates = "validate" in query.stages
@@ -243,20 +235,20 @@ def prepare_stored(
             damaged = True
     if damaged:
         resign_frames(store, row, [frame.number], row.model_id)
-        asked, made = rebuild_frame(store, signers(row.model_id), frame)
+        signature, rebuilt = rebuild_frame(store, signers(row.model_id), frame)
         if validates:
-            artifact, geometry = made, read_geometry(made)
+            artifact, geometry = rebuilt, read_geometry(rebuilt)
     own = (frame.number, frame.id)
     return PreparedQuery(
-        row.model_id, asked, geometry, taken, own, _since(start), row, base, artifact, frame.kind,
-        up,
+        row.model_id, signature, geometry, origin, own, _since(start), row, base, artifact,
+        frame.kind, up,
     )  # fmt: skip
 
 
-def check_taken(taken: QueryOrigin, query: Query) -> QueryOrigin:
-    """What is known of a query, if it is enough for the filter."""
+def check_origin(origin: QueryOrigin, query: Query) -> QueryOrigin:
+    """Return the origin of a query; raise InvalidRequest if its filter needs more."""
     if query.filter is not None and query.filter.not_within_s is not None:
-        missing = [name for name in ("session", "captured_at") if getattr(taken, name) is None]
+        missing = [name for name in ("session", "captured_at") if getattr(origin, name) is None]
         if missing:
             raise errors.InvalidRequest(
                 "The filter has `not_within_s`, but the query frame has no "
@@ -264,26 +256,24 @@ def check_taken(taken: QueryOrigin, query: Query) -> QueryOrigin:
                 "`not_within_s` out.",
                 tuple((name, "needed by filter.not_within_s") for name in missing),
             )
-    return taken
+    return origin
 
 
 def _since(start: float) -> float:
     return 1e3 * (time.perf_counter() - start)
 
 
-# When a query must be answered, and whether there is time for one more candidate.
-
-#: Seconds that the first candidate is expected to take; the next ones, as long as the longest.
+#: Expected seconds to validate the first candidate; for later ones, the longest time so far.
 FIRST_S = 0.03
 
 
 class Deadline:
-    """A point in time after which nothing more is begun.
+    """The time limit of a query.
 
     Parameters
     ----------
-    milliseconds : after `since`; None for no deadline
-    since : when the request came, by `time.perf_counter`; default: now
+    milliseconds : duration from `since`; None for no deadline
+    since : time of the request by `time.perf_counter`; None stands for the present
     """
 
     def __init__(self, milliseconds: int | None, since: float | None = None) -> None:
@@ -293,7 +283,7 @@ class Deadline:
         self.reached: bool | None = None if milliseconds is None else False
 
     def allows(self) -> bool:
-        """Whether one more candidate would likely be over in time; ask before each."""
+        """Return whether another candidate can probably be validated in time; call it for each."""
         if self._ends is None:
             return True
         now = time.perf_counter()
@@ -306,7 +296,7 @@ class Deadline:
 
 @dataclass(frozen=True, eq=False)
 class SearchedMap:
-    """A map that is asked: its row, and its frames as of one revision."""
+    """A queried map: its row, and a view of its frames at one revision."""
 
     row: MapRow
     view: IndexView
@@ -314,13 +304,13 @@ class SearchedMap:
 
 @dataclass(frozen=True, eq=False)
 class MapSearch:
-    """What is searched of one map.
+    """The search of one map.
 
     Parameters
     ----------
-    dead : frames that may not be found: deleted ones, and the query itself
-    among : frames that pass the filter; None without one
-    size : frames that can be found
+    dead : excluded frames: deleted ones, and the query itself
+    among : frames that pass the filter; None without a filter
+    size : number of searchable frames
     """
 
     place: SearchedMap
@@ -330,21 +320,21 @@ class MapSearch:
 
     @property
     def passed(self) -> int:
-        """How many pass the filter; all without one."""
+        """Number of frames that pass the filter."""
         return self.size if self.among is None else len(self.among)
 
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """R, and where it is from.
+    """The ranking R and its sources.
 
     Parameters
     ----------
-    parts : of each map
-    hits : of each map, in the same order
+    parts : searches of the maps
+    hits : results of the searches, in the same order
     ranking : R, of frame numbers
-    owners : (r,) which part each of R is of
-    size : that R was to have
+    owners : (r,) indexes into `parts` of the frames of R
+    size : requested length of R
     """
 
     parts: tuple[MapSearch, ...]
@@ -355,80 +345,80 @@ class Searched:
 
     @property
     def exact(self) -> bool:
-        """Every frame that passes was compared."""
+        """Whether every frame that passes the filter was compared."""
         return all(one.exact for one in self.hits)
 
     def signatures(self) -> Bytes:
-        """Stored signatures (r, D) of R."""
+        """Return the stored signatures (r, D) of the frames of R."""
         keys = self.ranking.indices.astype(np.int64)
         first = self.parts[0].place.view
         if len(self.parts) == 1 or not len(keys):
             return first.signatures(keys)
         order = np.argsort(self.owners, kind="stable")
         edges = np.searchsorted(self.owners[order], np.arange(len(self.parts) + 1))
-        found: list[Bytes] = [
+        blocks: list[Bytes] = [
             self.parts[i].place.view.signatures(keys[order[a:b]])
             for i, (a, b) in enumerate(pairwise(edges.tolist()))
             if a < b
         ]
-        rows = np.empty((len(keys), found[0].shape[1]), np.uint8)
-        rows[order] = np.concatenate(found)
+        rows = np.empty((len(keys), blocks[0].shape[1]), np.uint8)
+        rows[order] = np.concatenate(blocks)
         return rows
 
 
 def search_maps(
-    store: Store, places: Sequence[SearchedMap], asked: PreparedQuery, query: Query, model: Model
+    store: Store, places: Sequence[SearchedMap], prepared: PreparedQuery, query: Query, model: Model
 ) -> Searched:
-    """The frames of all maps that are nearest to a query.
+    """Return the ranking of the nearest frames of all maps.
 
     Parameters
     ----------
-    places : the maps, one or more of one model
-    asked, query : what is sought, and how
-    model : of all of them
+    places : one or more maps of one model
+    prepared, query : frame and options of the query
+    model : model of the maps
     """
-    parts = tuple(_part(store, place, asked, query) for place in places)
+    parts = tuple(_part(store, place, prepared, query) for place in places)
     size = ranking_size(sum(part.passed for part in parts))
     hits = tuple(
         part.place.view.search(
-            asked.vector, size, dead=part.dead, among=part.among, exact=query.exact
+            prepared.vector, size, dead=part.dead, among=part.among, exact=query.exact
         )
         for part in parts
     )
     keys = np.concatenate([one.keys for one in hits])
-    found = np.concatenate([one.distances for one in hits])
+    all_distances = np.concatenate([one.distances for one in hits])
     owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
-    first = np.lexsort((keys, found))[:size]  # equal distances in the order in which frames came
-    distances = found[first]
+    first = np.lexsort((keys, all_distances))[:size]  # equal distances in the order of uploads
+    distances = all_distances[first]
     shares = similarity(distances, model.unrelated_distance)
     return Searched(parts, hits, Ranking(keys[first].astype(np.intp), distances, shares),
                     owners[first], size)  # fmt: skip
 
 
-def rank_among_all(searched: Searched, asked: PreparedQuery, number: int, distance: int) -> int:
-    """The rank, from 1, of a distance among all frames that pass, each compared exactly."""
+def rank_among_all(searched: Searched, prepared: PreparedQuery, number: int, distance: int) -> int:
+    """Return the exact rank, from 1, of a frame among all frames that pass the filter."""
     return 1 + sum(
-        part.place.view.nearer(asked.vector, number, distance, dead=part.dead, among=part.among)
+        part.place.view.nearer(prepared.vector, number, distance, dead=part.dead, among=part.among)
         for part in searched.parts
     )
 
 
-def _part(store: Store, place: SearchedMap, asked: PreparedQuery, query: Query) -> MapSearch:
-    view, own = place.view, asked.frame
+def _part(store: Store, place: SearchedMap, prepared: PreparedQuery, query: Query) -> MapSearch:
+    view, own = place.view, prepared.frame
     dead = view.dead if own is None else view.dead | {own[0]}
-    itself = asked.home is not None and asked.home.number == place.row.number
-    size = max(view.size - itself, 0)  # it may just have been deleted
+    itself = prepared.home is not None and prepared.home.number == place.row.number
+    size = max(view.size - itself, 0)  # the view may lack the query, if it was just deleted
     among = None
     if query.filter is not None:
-        among = _among(store, place, dead, asked, query.filter)
+        among = _among(store, place, dead, prepared, query.filter)
     return MapSearch(place, dead, among, size)
 
 
 def _among(
-    store: Store, place: SearchedMap, dead: frozenset[int], asked: PreparedQuery, wanted: Filter
+    store: Store, place: SearchedMap, dead: frozenset[int], prepared: PreparedQuery, filters: Filter
 ) -> Keys:
-    """Frames of a view that pass a filter; the database may be newer or older than the view."""
+    """Return the frames of a view that pass a filter; the database may be newer than the view."""
     view = place.view
     with store.database.read() as connection:
-        numbers = passing_frames(connection, place.row.number, wanted, asked.taken)
+        numbers = passing_frames(connection, place.row.number, filters, prepared.origin)
     return numbers[view.has(numbers) & ~np.isin(numbers, list(dead))]

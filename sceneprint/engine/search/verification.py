@@ -1,9 +1,9 @@
-"""Validate candidates of R, and find the pose of the query by its matches and the map's frames.
+"""Validation of candidates, and the pose of the query from its matches and nearby frames.
 
 query Geometry, candidates  --validated-->  Validated  --placed-->  PoseEstimate
 
-Candidates are validated, C_vld first, until enough are accepted or time is up: Sec. III-E. The
-poses that they suggest are compared on the frames of the map that were taken near them.
+Candidates are validated in order until enough are accepted or the deadline is reached, Sec. III-E.
+The poses that they suggest are checked against the frames of the map near these poses.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from sceneprint_client.api import Prior, Query, ValidationOptions
 from sceneprint_client.api.frames import VIRTUAL
 from sceneprint_client.api.query import FARTHEST_PRIOR, LEAST_DEVIATION, MOST_DEVIATION
 
-#: Candidates that are validated for the pose of a query, unless it gives a number: more cost time.
+#: Default number of candidates to validate for the pose of a query.
 CANDIDATES = 10
-#: Limits that take the place of another one where nothing is known of free space, or where the
-#: frames share little: a limit that the caller sets holds in each of its places.
+#: Limits that also apply when a caller sets another one: those for frames without known free
+#: space, and for frames with little overlap.
 _ALSO_SET = {
     "residual_m": ("apart_m",),
     "residual_rad": ("apart_rad",),
@@ -55,7 +55,7 @@ _ALSO_SET = {
     "plane_overlap": ("blind_plane_overlap", "sparse_plane_overlap", "apart_plane_overlap"),
     "ambiguous_share": ("blind_ambiguous_share",),
 }
-#: Why no candidate was tried where validation was not asked for.
+#: Reason why no candidate was validated in a query without validation.
 NOT_ASKED = "not requested"
 
 
@@ -66,11 +66,11 @@ class Validated:
     Parameters
     ----------
     chosen : positions in R of the candidates
-    matches : those that were tried, of `associate`
-    unreadable : numbers of frames whose artifact cannot be read, and why
-    untried : why the others were not tried
-    late : whether the deadline came before the last of them; None without a deadline
-    geometries : of the first candidates that were tried, by frame number
+    matches : results of `associate` for the validated candidates
+    unreadable : errors of unreadable artifacts, by frame number
+    untried : reason why the other candidates were not validated
+    late : whether the deadline was reached before all were validated; None without a deadline
+    geometries : geometries of the first validated candidates, by frame number
     """
 
     chosen: Sequence[int]
@@ -84,7 +84,7 @@ class Validated:
 def thresholds(
     options: ValidationOptions | None, p: ValidationParameters
 ) -> tuple[ValidationParameters, Mode]:
-    """Return the parameters and the mode of a validation: the model's `p` with the query's own."""
+    """Return the model's parameters with the options of a query, and the mode of validation."""
     if options is None:
         return p, "full"
     own = options.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
@@ -105,11 +105,11 @@ def validated(
     Parameters
     ----------
     chosen : positions in R of the candidates
-    geometry : of the query; None where validation was not asked for
-    up : (3,) in the query's sensor, where it is known
-    known : validations of an earlier pass, by number
-    k : accepted matches after which to stop
-    guided : whether the transforms of later candidates may follow from earlier matches
+    geometry : geometry of the query; None without validation
+    up : (3,) up vector in the query's sensor frame; None if unknown
+    known : validations of an earlier pass, by frame number
+    k : number of accepted matches after which to stop
+    guided : whether earlier matches may predict the transforms of later candidates
     retry : see `associate`
     """
     if geometry is None:
@@ -121,18 +121,18 @@ def validated(
         viewpoints = viewpoints_among(connection, list(blobs)) if guided else []
     posed = {one.number: (parent_key(one), one.pose) for one in viewpoints}
     unreadable: dict[int, str] = {}
-    opened: dict[int, Geometry] = {}
+    loaded: dict[int, Geometry] = {}
 
     def open_geometry(number: int) -> Geometry | None:
-        if number not in blobs:  # deleted in the meantime
+        if number not in blobs:  # the frame was deleted during the query
             return None
-        try:  # when its turn comes: 200 at once would be 125 MB
+        try:  # one at a time, since 200 geometries take 125 MB
             geometry_of = store.geometries.read(blobs[number])
-        except (DamagedBlob, UnreadableGeometry) as error:  # one frame must not cost the answer
+        except (DamagedBlob, UnreadableGeometry) as error:  # the other frames suffice for an answer
             unreadable[number] = str(error)
             return None
-        if len(opened) < CANDIDATES:
-            opened[number] = geometry_of
+        if len(loaded) < CANDIDATES:
+            loaded[number] = geometry_of
         return geometry_of
 
     matches = associate(
@@ -150,18 +150,17 @@ def validated(
         if late
         else "enough matches were accepted before it"
     )
-    return Validated(chosen, matches, unreadable, untried, late, opened)
+    return Validated(chosen, matches, unreadable, untried, late, loaded)
 
 
-#: Frames that are looked for about each pose that a candidate suggests: first close by, as a map
-#: may hold thousands, and farther off where that gives too few.
+#: Maximum number of frames near each suggested pose; the search radius grows if there are fewer.
 _NEAR_FRAMES = 48
-#: Places that are looked about, at most.
+#: Maximum number of places around which frames are searched.
 _MOST_PLACES = 24
 
 
 def numbers_of(model: Model, query: Query) -> LocalizationParameters:
-    """Return the numbers of an answer: those of the model, and what a query asks of an answer."""
+    """Return the model's parameters of localisation with the options of a query."""
     p = LocalizationParameters.of(model.answer)
     p = replace(p, confidence=query.confidence, voted_only=query.validation is not None)
     return replace(p, rivals=0) if _is_paper(query) else p
@@ -176,20 +175,20 @@ def placed(
     rows: Mapping[int, FrameRow],
     query_frames: Sequence[QueryFrame], prior: PosePrior | None, model: Model, query: Query,
 ) -> PoseEstimate | None:  # fmt: skip
-    """Return where the query was taken, by its matches and the frames of the map about the poses.
+    """Return the pose of a query by its matches and the map's frames near the suggested poses.
 
     Parameters
     ----------
-    geometries : of candidates, by number, as far as they are open
-    rows : of the candidates, by number; those without a pose suggest none
+    geometries : loaded geometries of candidates, by frame number
+    rows : rows of the candidates, by frame number
     query_frames : frames of the query with their matches
-    prior : what the robot believed before; its parent as `parent_key` writes it
-    query : where it asks for anything of a match, a pose needs the vote of one; in mode `paper` the
-        map's frames are not asked
+    prior : prior pose of the robot, with a parent from `parent_key`
+    query : options of the query; with options of validation, a pose needs the vote of a match, and
+        the mode `paper` ignores the map's other frames
 
     Returns
     -------
-    estimate : None where no match has a pose, and there is no prior
+    estimate : None if no match has a pose and there is no prior
     """
     poses = {number: np.array(row.pose) for number, row in rows.items() if row.pose is not None}
     parents = {number: parent_key(rows[number]) for number in poses}
@@ -199,24 +198,24 @@ def placed(
     own_p, agreement = numbers_of(model, query), model.parameters.validation.agreement
 
     def views_of(parent: str, at: Floats) -> MapViews:
-        known = {number for number in geometries if parents.get(number) == parent}
+        loaded = {number for number in geometries if parents.get(number) == parent}
         near = _near_frames(store, searched, parent, at, own_p.map)
-        numbers = sorted({*known, *near})
-        at_poses = [poses[n] if n in known else near[n].pose for n in numbers]
-        ahead = [rows[n].cloud is None if n in known else not near[n].is_cloud for n in numbers]
-        rendered = [VIRTUAL in (rows[n] if n in known else near[n]).tags for n in numbers]
+        numbers = sorted({*loaded, *near})
+        at_poses = [poses[n] if n in loaded else near[n].pose for n in numbers]
+        ahead = [rows[n].cloud is None if n in loaded else not near[n].is_cloud for n in numbers]
+        rendered = [VIRTUAL in (rows[n] if n in loaded else near[n]).tags for n in numbers]
 
         def open_view(i: int) -> Geometry | None:
             number = numbers[i]
-            if number in known:
+            if number in loaded:
                 return geometries[number]
             try:
                 return store.geometries.read(near[number].geometry)
             except (DamagedBlob, UnreadableGeometry):
-                return None  # one frame of many: the others tell the poses apart
+                return None  # the other frames suffice
 
         stack = np.array(at_poses).reshape(-1, 4, 4)
-        first = [i for i, number in enumerate(numbers) if number in known]
+        first = [i for i, number in enumerate(numbers) if number in loaded]
         return MapViews(stack, open_view, own_p.map, agreement, first, ahead, rendered)
 
     asks_map = None if _is_paper(query) else views_of
@@ -224,7 +223,7 @@ def placed(
 
 
 def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
-    """Return the prior of a query; InvalidRequest or InvalidPose where it cannot be used."""
+    """Return the prior of a query; raise InvalidRequest or InvalidPose if it cannot be used."""
     prior = query.prior
     if prior is None:
         return None
@@ -235,38 +234,38 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
         )
     if len(places) > 1:
         raise InvalidRequest(
-            "A prior is a pose in one map. Ask that map alone, or leave `prior` out.",
-            (("prior", "of several maps"),),
+            "A prior is a pose in one map. Query only that map, or leave `prior` out.",
+            (("prior", "with several maps"),),
         )
     covariance = _prior_covariance(prior)
     T = pose_matrix(prior.pose, "The prior")
     if np.abs(T[:3, 3]).max() > FARTHEST_PRIOR:
         raise InvalidRequest(
             f"The prior lies more than {FARTHEST_PRIOR:,.0f} m from the origin of its parent "
-            "frame. Give the pose in metres, or leave `prior` out.",
-            (("prior.pose", "too far off"),),
+            "frame. Send the pose in metres, or leave `prior` out.",
+            (("prior.pose", "too far from the origin"),),
         )
     row, name = places[0].row, str(prior.pose.parent_frame)
     with store.database.read() as connection:
         joined = find_joins(connection, row.number).get(name)
-        if joined is not None:  # the map's poses are in its root
+        if joined is not None:  # stored poses are relative to the root frame
             name, T = joined.root, joined.T @ T
             covariance = transform_covariance(covariance, joined.T[:3, :3], np.zeros(3))
         if not has_parent_frame(connection, row.number, name):
             raise InvalidRequest(
                 f"No frame of map {row.name!r} has a pose in the parent frame {name!r} of the "
-                "prior. Give the pose in one that the map has; `sceneprint frames` shows them.",
+                "prior. Use a parent frame of the map; `sceneprint frames` lists them.",
                 (("prior.pose.parent_frame", "not of this map"),),
             )
     return PosePrior(f"{row.number} {name}", T, covariance)
 
 
-#: Least eigenvalue of a covariance once its deviations are 1: what is less is rounding.
+#: Minimum eigenvalue of a correlation matrix; smaller ones are rounding errors.
 _LEAST_EIGENVALUE = 1e-12
 
 
 def _prior_covariance(prior: Prior) -> Floats:
-    """Return the covariance (6, 6) of a prior; InvalidRequest where it is not valid."""
+    """Return the covariance (6, 6) of a prior; raise InvalidRequest if it is not valid."""
     if prior.covariance is None:
         metres, radians = prior.deviation_m, math.radians(prior.deviation_deg)
         return np.diag(np.square([metres] * 3 + [radians] * 3))
@@ -274,17 +273,17 @@ def _prior_covariance(prior: Prior) -> Floats:
     variances = np.diag(covariance)
     if (variances > 0).all():
         deviations = np.sqrt(variances)
-        # a little more, as a square that is rounded has another root
+        # with a tolerance, since the root of a rounded square differs
         within = LEAST_DEVIATION * (1 - 1e-9), MOST_DEVIATION * (1 + 1e-9)
         if deviations.min() < within[0] or deviations.max() > within[1]:
             raise InvalidRequest(
-                f"The deviations of the prior reach from {deviations.min():.3g} to "
-                f"{deviations.max():.3g}, and can be from {LEAST_DEVIATION} to "
-                f"{MOST_DEVIATION:.0f}, metres and radians. The diagonal of its covariance has "
-                "their squares: give others, or leave `prior` out.",
+                f"The deviations of the prior are between {deviations.min():.3g} and "
+                f"{deviations.max():.3g}, but must be between {LEAST_DEVIATION} and "
+                f"{MOST_DEVIATION:.0f} (metres and radians). Check the diagonal of the "
+                "covariance, which has their squares, or leave `prior` out.",
                 (("prior.covariance", "deviations out of range"),),
             )
-        # no entry of a covariance is above the largest variance, and no product overflows then
+        # no entry may exceed the largest variance; this also prevents overflows below
         if np.abs(covariance).max() <= variances.max():
             correlation = covariance / np.outer(deviations, deviations)
             if (
@@ -293,8 +292,8 @@ def _prior_covariance(prior: Prior) -> Floats:
             ):
                 return covariance
     raise InvalidRequest(
-        "The covariance of the prior is not one: it must be symmetric with eigenvalues "
-        "above 0. Send the 36 numbers row by row, or `deviation_m` and `deviation_deg`.",
+        "The covariance of the prior is not valid: it must be symmetric with positive "
+        "eigenvalues. Send its 36 numbers row by row, or `deviation_m` and `deviation_deg`.",
         (("prior.covariance", "not positive definite"),),
     )
 
@@ -302,7 +301,7 @@ def _prior_covariance(prior: Prior) -> Floats:
 def nearest_first(
     store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior, p: MapParameters
 ) -> list[int]:
-    """Return candidates, as positions in R, those that were taken near a prior first."""
+    """Return candidates (positions in R), those near a prior first."""
     with store.database.read() as connection:
         viewpoints = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
     posed = {one.number: one for one in viewpoints}
@@ -315,14 +314,14 @@ def nearest_first(
 
 
 def parent_key(row: FrameRow | FrameViewpoint) -> str:
-    """Return a name of a parent frame that no other map has: the map's number and its own name."""
+    """Return a unique key of a parent frame: the map's number, a space and the frame's name."""
     return f"{row.map_number} {row.pose_parent}"
 
 
 def _near_frames(
     store: Store, searched: Searched, parent: str, at: Floats, p: MapParameters
 ) -> dict[int, PlacedFrame]:
-    """Return frames of a parent frame about poses (n, 4, 4) that the query may find, by number."""
+    """Return searchable frames in a parent frame near poses (n, 4, 4), by number."""
     number, _, name = parent.partition(" ")
     part = next(one for one in searched.parts if one.place.row.number == int(number))
     cells = np.unique(np.round(at[:, :3, 3] / p.cell), axis=0, return_index=True)[1]
