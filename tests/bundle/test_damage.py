@@ -124,17 +124,20 @@ def test_manifests_that_lie(copy, place, refused):
 
     rewrite(copy, lambda one: None)
     assert verify_bundle(str(copy)) == verify_bundle(place)
-    lies(lambda one: one.update(version=3), "a bundle of version 3", BundleError)
+    lies(lambda one: one.update(version=3), "version 3 of a bundle", BundleError)
     lies(lambda one: one.update(schema_revision="9999"), "9999", NewerSchema)
     for other in ({"format": "other"}, {"more": 1}, {"maps": "1"}):
         lies(lambda one, other=other: one.update(other), "the manifest of the bundle is damaged")
     lies(lambda one: one.update(maps=2), "its rows")
     lies(lambda one: one["frames"].update(indexed=3), "its rows")
     lies(lambda one: one.update(blobs=8), "its blobs")
-    lies(lambda one: one["parts"][0].update(digest="../../../../etc/passwd"), "no manifest")
+    lies(
+        lambda one: one["parts"][0].update(digest="../../../../etc/passwd"),
+        "manifest of the bundle",
+    )
     lies(lambda one: one["parts"][0].update(rows=99), "its rows of table")
     without = [one for one in record["parts"] if one["kind"] != "rows/maps"]
-    lies(lambda one: one.update(parts=without), "refers to one of maps|the rows that it holds")
+    lies(lambda one: one.update(parts=without), "refers to one of maps|its rows")
 
 
 def test_rows_that_are_none_of_ours(copy, place, refused):

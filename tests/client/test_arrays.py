@@ -160,7 +160,7 @@ def test_the_pose_of_the_base_is_stored_as_that_of_the_sensor(
         checked(FrameMeta, "The frame", **{**told, "T_base_sensor": None})
     with pytest.raises(InvalidRequest, match="pose of the sensor"):
         checked(Prior, "The prior", pose=told["pose"])
-    with pytest.raises(InvalidRequest, match="that of the base"):
+    with pytest.raises(InvalidRequest, match="the pose of the base"):
         client.edit_frame(map_name, added.frame_id, {"pose": {"of": "base"}})
 
 

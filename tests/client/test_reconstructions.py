@@ -141,7 +141,7 @@ def test_refusals(client: Client, answered: Answer) -> None:
     [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.attempts) == ("failed", 1)
     assert "Request 0.005 m or more" in str(job.error)
-    with pytest.raises(NotIndexed, match=r"is failed \(.*It has its mesh\.ply once"):
+    with pytest.raises(NotIndexed, match=r"is failed \(.*Its mesh\.ply will be"):
         client.reconstruction_mesh(made.job_id)
     client.delete_product(Reconstruction, None, made.job_id)
     with pytest.raises(UnknownJob):

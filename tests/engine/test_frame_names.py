@@ -195,7 +195,7 @@ def test_an_empty_trajectory_says_why(empty: Engine, uploads: Any, tmp_path: Pat
     assert count == 0
     assert why == (
         f"none of its 2 frames has a pose in {uploads[1].room!r} with `captured_at` or `sequence`; "
-        "`clock=received` orders them as they came"
+        "`clock=received` orders them by upload"
     )
     assert told(clock="received") == (1, None)
     send(empty, uploads[2], session="s", sequence=7)

@@ -390,7 +390,7 @@ def test_what_in_view_is_no_help_is_the_cause(prepared: Prepared) -> None:
     few = Patches(*(one[:9] for one in vars(seen.patches).values()))
     told = came_of(replace(seen, patches=few), "rejected", others=[other])
     assert (told.status, told.cause) == ("not_found", "too_little_in_view")
-    assert "the frame has 9 surface patches, and 10 are needed" in told.reason
+    assert "the frame has 9 surface patches, but 10 are needed" in told.reason
     cloud = replace(other, surface=replace(other.surface, camera=None))
     for others, cause in (
         ([cloud], "other_sensor"), ([cloud, cloud], "other_sensor"), ([], "nothing_alike"),

@@ -141,7 +141,7 @@ def test_one_call_edits_so_many(
 
 
 def test_too_many_tags_are_refused(empty: Engine, ids: list[str]) -> None:
-    with pytest.raises(InvalidRequest, match="33 tags, and a frame has at most 32"):
+    with pytest.raises(InvalidRequest, match="33 tags, but a frame can have at most 32"):
         edit(empty, frame_ids=ids[:1], add_tags=[f"t{i}" for i in range(32)])
     assert known(empty)[ids[0]] == ("a", "r1", ["x"])
 

@@ -186,14 +186,14 @@ def test_what_has_come_again_is_not_restored(full: Engine, uploads: Any) -> None
     assert full.uploads.add("hall", put)[0].taken.frame_id == second
     (left,) = full.tombstones.list_all("hall", None, 9).items
     assert left.frames == 2
-    with pytest.raises(Conflict, match=f"uploaded again, as frame {again.frame_id}"):
+    with pytest.raises(Conflict, match=f"uploaded again as frame {again.frame_id}"):
         full.tombstones.restore_one("hall", first)
     with pytest.raises(UnknownFrame):
         full.tombstones.restore_one("hall", second)
     done = restore(full, deletion)
     assert (done.frames, done.remaining) == (1, 0)
     reasons = {one.frame_id: one.reason for one in done.refused}
-    assert reasons == {first: f"it was uploaded again, as frame {again.frame_id}"}
+    assert reasons == {first: f"it was uploaded again as frame {again.frame_id}"}
     assert third in frames(full)
     assert full.get_frame("hall", second).name == "other"
     assert full.tombstones.purge(everything=True) == 2
@@ -267,7 +267,7 @@ def test_after_its_time_a_deletion_is_for_good(full: Engine) -> None:
     blobs = len(list(full.store.blobs.digests()))
     assert full.tombstones.purge() == 0
     end_undo(full)
-    with pytest.raises(UnknownDeletion, match="its time is over"):
+    with pytest.raises(UnknownDeletion, match="has expired"):
         restore(full, deletion)
     with pytest.raises(UnknownFrame, match="cannot be restored any more"):
         full.tombstones.restore_one("hall", names[0])

@@ -1,12 +1,11 @@
-"""One map in a robot's own store, as it is in the service: found alike, and renewed by what is new.
+"""Copies of single maps in a robot's own store, updated by what is new in the service.
 
-    parts of the copy  --MapCopies.bundle-->  head of the map, and the parts that the robot lacks
-    rows of these      ------------------->  artifacts that are not here
-    --pull_map-->  all of it in one transaction
+    digests of the copy's parts  --MapCopies.bundle-->  head of the map, and missing parts
+    rows of these parts          -------------------->  missing artifacts
+    --pull_map-->  one transaction
 
-A part of rows is the same bytes in the service and in the copy. Whoever is killed before that
-transaction leaves the copy as it was, and the artifacts that it had: the next one goes on from
-there.
+Parts of rows have the same bytes in the service and in the copy. A pull that is killed leaves the
+copy unchanged, and the next one reuses the artifacts that it fetched.
 """
 
 from __future__ import annotations
@@ -50,9 +49,9 @@ from sceneprint_client.api.copies import CopyPart, MapCopy
 if TYPE_CHECKING:
     from sceneprint_client import Client
 
-#: Times that a map is asked for without any part that is new: its artifacts are away then.
+#: Maximum number of consecutive requests without a new part, after which artifacts count as lost.
 ROUNDS = 10
-#: Bytes of parts in one answer, and what one part has over it.
+#: Size in bytes after which no further part is added to a response.
 MOST_BYTES = 32 << 20
 _NAMES = [one.name for one in COLUMNS]
 
@@ -65,25 +64,25 @@ def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes
 
 
 class MapCopies:
-    """What a service tells of its maps to those who copy one."""
+    """The service's side of copies."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def bundle(self, map_name: str, have: Collection[str]) -> bytes:
-        """Return a map at one moment: a line with its `MapCopy`, and the bytes of its parts.
+        """Return a consistent state of a map: a line with its `MapCopy`, and the bytes of parts.
 
         Parameters
         ----------
-        have : digests of parts that the caller has; of the others some 32 MB follow the line
+        have : digests of the caller's parts; about 32 MB of the other parts follow the line
 
         Raises
         ------
-        UnknownMap : there is none of that name.
+        UnknownMap : If the map does not exist.
         """
         parts, sent, size = list[CopyPart](), list[bytes](), 0
         with self._store.database.read() as connection:
-            allow(connection, 0)  # the rows of a large map take a while to put in order
+            allow(connection, 0)  # sorting the rows of a large map takes long
             row = find_map(connection, map_name)
             name, _ = model_of(connection, row.model_id)
             for digest, data, count in copy_parts(connection, row):
@@ -99,38 +98,39 @@ class MapCopies:
         return b"".join((head.model_dump_json().encode(), b"\n", *sent))
 
     def artifact(self, map_name: str, digest: str) -> bytes:
-        """Return the artifact of an indexed frame. Raise UnknownMap or NotFound if no frame of the
-        map has it, and DamagedBlob if it is damaged or was just removed.
+        """Return the artifact of an indexed frame.
+
+        Raises
+        ------
+        UnknownMap, NotFound : If no frame of the map has the artifact.
+        DamagedBlob : If the artifact is damaged or was just removed.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
             if not has_artifact(connection, row, digest):
                 raise NotFound(
                     f"No indexed frame of map {map_name!r} has an artifact {digest[:80]!r}. List "
-                    "the map again."
+                    "the parts of the map again."
                 )
         return self._store.blobs.get(digest)
 
     def model(self, map_name: str) -> bytes:
-        """The file of the map's model; UnknownMap where there is no such map."""
+        """Return the file of the map's model; raise UnknownMap if the map does not exist."""
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
             return model_of(connection, row.model_id)[1]
 
 
-# The robot's side.
-
-
 @dataclass(frozen=True)
 class PulledMap:
-    """What came of a pull.
+    """The result of a pull.
 
     Parameters
     ----------
-    revision : of the map in the service
-    frames : that the copy has now
-    written, removed : frames that are new or changed, and that are gone
-    artifacts, bytes : that were fetched
+    revision : revision of the map in the service
+    frames : number of frames in the copy
+    written, removed : numbers of new or changed frames, and of removed ones
+    artifacts, bytes : number and size of the fetched artifacts
     """
 
     revision: int
@@ -141,20 +141,18 @@ class PulledMap:
     bytes: int
 
 
-#: Says in a data folder that its maps are copies, and that `pull_map` may change them.
+#: Name of the file that marks a data folder with copies, which `pull_map` may change.
 _MARK = "map-copy.json"
 
 
 def claim_folder(folder: Path) -> None:
-    """Mark a data folder as one for copies of maps; raise InvalidRequest if it holds something
-    else.
-    """
+    """Mark a data folder as one for copies of maps; raise InvalidRequest if it has other files."""
     if (folder / _MARK).is_file():
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InvalidRequest(
-            f"{folder} is not empty, and no folder that maps were pulled into. Nothing was "
-            "changed. Name another folder with --data."
+            f"{folder} has files, but is not a folder of pulled maps. Nothing was changed. Pass "
+            "another folder with --data."
         )
     make_folder(folder)
     write_durable(folder / _MARK, b"{}", folder_is_new=False)
@@ -162,12 +160,12 @@ def claim_folder(folder: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Pull:
-    """What is known of a map while it is pulled.
+    """The state of a pull.
 
     Parameters
     ----------
-    own : rows that the copy has, as a part has them, by part and by id
-    fetched : rows that came, likewise
+    own : encoded rows of the copy, by digest of the part and id
+    fetched : encoded rows from the service, by digest of the part and id
     """
 
     own: dict[str, dict[str, Row]]
@@ -183,28 +181,28 @@ def pull_map(
     client: Client, store: Store, map_name: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> PulledMap:  # fmt: skip
-    """Bring a map of a store to one state that it had in the service during this call.
+    """Update the copy of a map to a state that the map had in the service during this call.
 
-    Queries of the store go on meanwhile, of the map as it was.
+    Queries of the copy see its former state meanwhile.
 
     Parameters
     ----------
-    client : of the service; its key may read the map
-    progress : called with the frames that were fetched, and those to fetch
+    client : client of the service, with a key that may read the map
+    progress : callback with the numbers of fetched frames, and of all frames to fetch
 
     Raises
     ------
-    UnknownMap : the service has none of that name, or the key may not read it.
-    Conflict : it became another map meanwhile, or its artifacts are away; or frames were uploaded
-        into the copy.
-    DamagedBlob : the service sent other bytes than it named.
+    UnknownMap : If the map does not exist in the service, or the key may not read it.
+    Conflict : If the map was replaced or lost artifacts meanwhile, or frames were uploaded into the
+        copy.
+    DamagedBlob : If the service sent damaged bytes.
     """
     pull = _Pull(_own_parts(store, map_name), {})
     artifacts = size = idle = 0
     while True:
         head, parts = client.map_copy(map_name, [*pull.own, *pull.fetched])
         if pull.own and not _is_copy_of(store, head):
-            pull.own.clear()  # of another map: its rows are not those of this one
+            pull.own.clear()  # these rows belong to another map
             continue
         before = len(pull.fetched)
         for digest, data in parts.items():
@@ -219,9 +217,9 @@ def pull_map(
                 continue
             pull.fetched[digest] = rows
             if progress is not None:
-                wanted = sum(one.rows for one in head.parts if one.digest not in pull.own)
+                total = sum(one.rows for one in head.parts if one.digest not in pull.own)
                 done = sum(one.rows for one in head.parts if one.digest in pull.fetched)
-                progress(done, wanted)
+                progress(done, total)
         if all(one.digest in pull.own or one.digest in pull.fetched for one in head.parts):
             break
         idle = 0 if len(pull.fetched) > before else idle + 1
@@ -236,7 +234,7 @@ def pull_map(
 
 
 def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
-    """Return the rows of a map in the store, by part and id; none where there is no such map."""
+    """Return the rows of a map in the store, by part and id; none if it does not exist."""
     with store.database.read() as connection:
         row = next((one for one in list_maps(connection) if one.name == map_name), None)
         if row is None:
@@ -249,45 +247,44 @@ def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
 
 def _is_copy_of(store: Store, head: MapCopy) -> bool:
     with store.database.read() as connection:
-        return _here(connection, head) is not None
+        return _find_copy(connection, head) is not None
 
 
 def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
     if hashlib.sha256(data).hexdigest() != digest:
         raise DamagedBlob(
-            f"A part of map {map_name!r} came with other bytes than it has. Nothing was changed. "
-            "Pull again."
+            f"A part of map {map_name!r} arrived damaged. Nothing was changed. Pull the map again."
         )
     rows = list(read_rows(data, _NAMES))
-    for _ in decoded_rows(COLUMNS, rows):  # raises where a value is of another type
+    for _ in decoded_rows(COLUMNS, rows):  # raises if a value has another type
         pass
     return {one[0]: one for one in rows}
 
 
 def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) -> int:
-    """Fetch an artifact, store it durably, and return its bytes; raise DamagedBlob if the service
-    sent others.
+    """Fetch a missing artifact, store it durably, and return the number of fetched bytes; raise
+    DamagedBlob if it arrived damaged.
     """
     if store.blobs.holds(digest):
         return 0
     data = client.copied_artifact(map_name, digest)
     if store.blobs.put(data) != digest:
         raise DamagedBlob(
-            f"The artifact {digest[:12]} of map {map_name!r} came with other bytes than it has. "
-            "Nothing was changed. Pull again."
+            f"The artifact {digest[:12]} of map {map_name!r} arrived damaged. Nothing was changed. "
+            "Pull the map again."
         )
     return len(data)
 
 
 def _changed(map_name: str) -> Conflict:
     return Conflict(
-        f"Map {map_name!r} was created again, came to another model, or lost artifacts while it "
-        "was pulled. The copy is as it was. Pull again."
+        f"Map {map_name!r} was created again, switched its model, or lost artifacts during the "
+        "pull. The copy has not changed. Pull the map again."
     )
 
 
-def _here(connection: Connection, head: MapCopy) -> MapRow | None:
-    """The map in the store, if it is a copy of this one, and not of one of before."""
+def _find_copy(connection: Connection, head: MapCopy) -> MapRow | None:
+    """Return the copy of a map in the store; None if it is missing or copies a former map."""
     row = next((one for one in list_maps(connection) if one.name == head.name), None)
     if row is None or (row.created_at, row.model_id) != (head.created_at, head.model_id):
         return None
@@ -297,75 +294,73 @@ def _here(connection: Connection, head: MapCopy) -> MapRow | None:
 def _write(
     store: Store, head: MapCopy, pull: _Pull, rows: dict[str, Row], model: bytes
 ) -> tuple[int, int]:
-    """Bring the map in the store to a state of the service, all of it or nothing.
-
-    Returns
-    -------
-    frames that are new or changed, and that are gone
-    """
+    """Update the copy in one transaction; return the numbers of written and of removed frames."""
     before = {name: row for part in pull.own.values() for name, row in part.items()}
     written = [_copied(head, row) for name, row in rows.items() if before.get(name) != row]
     blobs: list[str] = []
     with store.blobs.kept(), store.database.write() as connection:
         store_model(connection, head.model_id, head.model, model)
-        row = _prepared(store, connection, head, blobs)
-        there = living_rows(connection, row)
-        gone = [one for name, one in there.items() if name not in rows]
+        row = _prepare_map(store, connection, head, blobs)
+        existing = living_rows(connection, row)
+        deleted = [one for name, one in existing.items() if name not in rows]
         renewed = [
-            there[one.id] for one in written
-            if one.id in there and there[one.id].content_id != one.values["content_id"]
+            existing[one.id] for one in written
+            if one.id in existing and existing[one.id].content_id != one.values["content_id"]
         ]  # fmt: skip
-        for some in numbers_in_blocks([*gone, *renewed]):
+        for some in numbers_in_blocks([*deleted, *renewed]):
             blobs += delete_frames(connection, row, some)
-        kept = there.keys() - {one.id for one in renewed}
+        remaining = existing.keys() - {one.id for one in renewed}
         for one in written:
             if not store.blobs.holds(one.made.geometry):
                 raise DamagedBlob(
-                    f"The artifact {one.made.geometry[:12]} was removed meanwhile. Pull again."
+                    f"The artifact {one.made.geometry[:12]} was just removed. Pull the map again."
                 )
-            if one.id in kept:
-                edit_copied(connection, row, there[one.id], one)
-        new = [one for one in written if one.id not in kept]
+            if one.id in remaining:
+                edit_copied(connection, row, existing[one.id], one)
+        new = [one for one in written if one.id not in remaining]
         for first in range(0, len(new), BLOCK):
             add_copied(connection, row, new[first : first + BLOCK])
     collect_deleted_blobs(store, blobs)
-    return len(written), len(gone)
+    return len(written), len(deleted)
 
 
 def _copied(head: MapCopy, row: Row) -> CopiedFrame:
-    """A frame from its row in a part."""
-    ((name, *found),) = decoded_rows(COLUMNS, [row])
+    """Return a frame from its encoded row."""
+    ((name, *cells),) = decoded_rows(COLUMNS, [row])
     values: dict[str, Any] = {
         column.name: json.loads(x) if isinstance(column.type, JSON) and x is not None else x
-        for column, x in zip(COLUMNS[1:], found, strict=True)
+        for column, x in zip(COLUMNS[1:], cells, strict=True)
     }
     own = (values[one] for one in ("vector", "geometry", "n_patches", "n_pairs"))
-    made = StoredSignature(head.model_id, *own)
-    return CopiedFrame(name, {one: values[one] for one in COPIED}, made)
+    signature = StoredSignature(head.model_id, *own)
+    return CopiedFrame(name, {one: values[one] for one in COPIED}, signature)
 
 
-def _prepared(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:
-    """Return the map in the store, created where missing; an earlier copy is replaced. Raise
-    Conflict if the map has frames that were uploaded here, and exist nowhere else.
+def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:
+    """Return the copy, which is created if it is missing or copies a former map.
+
+    Raises
+    ------
+    Conflict : If the copy has uploaded frames, which exist nowhere else.
     """
     rows = {one.name: one for one in list_maps(connection)}
-    before, row = rows.get(head.name), _here(connection, head)
+    before, row = rows.get(head.name), _find_copy(connection, head)
     if before is not None:
         _require_copied(store, living_rows(connection, before).values(), head.name)
     if before is not None and row is None:
         blobs += remove_map(connection, before)
     if row is None:
-        made = add_map(connection, head.name, head.title, head.model_id)
-        row = date_map(connection, made, head.created_at)
+        added = add_map(connection, head.name, head.title, head.model_id)
+        row = date_map(connection, added, head.created_at)
     return write_map(connection, row, {"title": head.title, "up": head.up})
 
 
-def _require_copied(store: Store, found: Iterable[FrameRow], map_name: str) -> None:
-    """See that no frame was uploaded here: of a copied one the upload is not there."""
-    own = [one.id for one in found if store.blobs.holds(one.blob)]
+def _require_copied(store: Store, rows: Iterable[FrameRow], map_name: str) -> None:
+    """Raise Conflict if a frame was uploaded into the copy; copied frames have no uploads."""
+    own = [one.id for one in rows if store.blobs.holds(one.blob)]
     if own:
         raise Conflict(
             f"Map {map_name!r} has {len(own)} frames that were uploaded into the copy, such as "
-            f"{own[0]}, and nothing was changed. Upload them to the service, delete them here, "
-            "and pull again."
+            f"{own[0]}. Nothing was changed. Upload them to the service, delete them here, and "
+            "pull the map again."
         )

@@ -1,7 +1,4 @@
-"""What a map holds, for people and dashboards: frames by their metadata, sessions, trajectories.
-
-Each is read in one transaction, and a part at a time.
-"""
+"""Views of a map's content: frames, sessions, trajectories, and data derived from frames."""
 
 from __future__ import annotations
 
@@ -53,9 +50,7 @@ from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
 from sceneprint_client.formats import BYTES, format_at
 
-# An indexed frame as it was found, with what its map's model made of it.
-
-#: Of all that is made of frames: raise it when the same frame comes to give other bytes.
+#: Version of derived data in entity tags; raise it when the same frame yields other bytes.
 FORM = 1
 
 
@@ -69,13 +64,17 @@ class IndexedFrame:
     artifact: str
 
     def tag(self, what: str, *options: object) -> str:
-        """An entity tag of something that is made of it."""
+        """Return the entity tag of data that is derived from the frame."""
         return tag_of(what, FORM, self.frame.content_id, self.row.model_id, *options)
 
 
 def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
-    """Return an indexed frame. Raise UnknownMap or UnknownFrame if there is no such frame, and
-    NotIndexed if it is not indexed.
+    """Return an indexed frame.
+
+    Raises
+    ------
+    UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+    NotIndexed : If the frame is not indexed.
     """
     with store.database.read() as connection:
         row = find_map(connection, map_name)
@@ -91,15 +90,19 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
 
 
 def living(row: MapRow, frame: FrameRow) -> FrameRow:
-    """The frame; UnknownFrame where it was deleted."""
+    """Return the frame; raise UnknownFrame if it was deleted."""
     if frame.state == FrameState.DELETED:
         raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted.")
     return frame
 
 
 def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry:
-    """Return the geometry of a frame; a damaged artifact is made again from the upload. Raise
-    DamagedBlob if both are lost or damaged, and see `check_unchanged`.
+    """Return the geometry of a frame; rebuild a damaged one from the upload.
+
+    Raises
+    ------
+    DamagedBlob : If the upload is damaged too.
+    UnknownFrame, NotIndexed, Busy : See `check_unchanged`.
     """
     try:
         return read_geometry(store.blobs.get(found.artifact))
@@ -111,34 +114,42 @@ def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry
 
 
 def check_unchanged(store: Store, found: IndexedFrame) -> None:
-    """Check that a frame is still as it was found. Raise UnknownFrame or NotIndexed if it was
-    deleted or lost its artifact, and Busy if its map has changed its model.
+    """Check that a frame has not changed since it was read.
+
+    Raises
+    ------
+    UnknownFrame, NotIndexed : If the frame was deleted or lost its geometry.
+    Busy : If the frame was signed with another model.
     """
     now = find_indexed(store, found.row.name, found.frame.id)
     if (now.frame.number, now.artifact) != (found.frame.number, found.artifact):
         raise errors.Busy(
-            f"Frame {found.frame.id} was signed with another model in the meantime. Try again."
+            f"Frame {found.frame.id} was signed with another model meanwhile. Try again."
         )
 
 
-#: Most poses of one trajectory: more are asked for in parts.
+#: Maximum number of poses in one trajectory.
 MOST_POSES = 100_000
-#: Most parent frames, and most tags, that are told of a session.
+#: Maximum numbers of parent frames and of tags in the record of a session.
 _MOST_NAMES = 20
 
 
 def list_frames(
     store: Store, map_name: str, wanted: FrameListing, cursor: str | None, limit: int
 ) -> Page[Frame]:
-    """Return a page of frames, newest first, or in the order they were taken. Raise UnknownMap, and
-    InvalidRequest for a cursor that was not issued.
+    """Return a page of frames, newest first or in the requested order.
+
+    Raises
+    ------
+    UnknownMap : If the map does not exist.
+    InvalidRequest : If the service did not issue the cursor.
     """
     beyond = _position_of(store, cursor, wanted)
     with store.database.read() as connection:
         row = find_map(connection, map_name)
-        found = frame_queries.list_frames(connection, row.number, beyond, limit + 1, wanted)
-        items = frame_records(connection, row, found[:limit])
-    more = _position_cursor(store, found[limit - 1], wanted) if len(found) > limit else None
+        rows = frame_queries.list_frames(connection, row.number, beyond, limit + 1, wanted)
+        items = frame_records(connection, row, rows[:limit])
+    more = _position_cursor(store, rows[limit - 1], wanted) if len(rows) > limit else None
     return Page[Frame](items=items, next_cursor=more)
 
 
@@ -150,7 +161,7 @@ def get_frame(store: Store, map_name: str, frame_id: str) -> Frame:
 
 
 def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
-    """The cursor of the page after a frame; where it was taken is in it, as it may be deleted."""
+    """Return the cursor of the page after a frame, with its sort key, since it may be deleted."""
     sealed = store.seals.seal("frame", last.number)
     if wanted.order != "taken":
         return sealed
@@ -158,21 +169,21 @@ def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
 
 
 def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> TakenPosition | None:
-    """The last frame of the page before; InvalidRequest for a cursor of no such list."""
+    """Return the position in a cursor; raise InvalidRequest if the service did not issue it."""
     if cursor is None:
         return None
     if wanted.order != "taken":
         number = store.seals.row("frame", cursor)
         return None if number is None else TakenPosition(number, None, None)
-    sealed, _, told = cursor.partition("~")
+    sealed, _, values = cursor.partition("~")
     number = store.seals.row("frame", sealed)
     try:
-        at, sequence = _unpacked(told)
+        at, sequence = _unpacked(values)
         is_time = at is None or (isinstance(at, float) and math.isfinite(at))
         is_place = sequence is None or (
             isinstance(sequence, int) and 0 <= sequence <= MOST_SEQUENCE
         )
-    except (ValueError, TypeError, RecursionError):  # whatever somebody may think up
+    except (ValueError, TypeError, RecursionError):  # a forged cursor
         is_time = is_place = False
     if number is None or not (is_time and is_place):
         raise invalid_cursor(cursor)
@@ -181,31 +192,39 @@ def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> Take
 
 def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:
     """Return a page of sessions by name and robot; frames without a session come first, as one.
-    Raise UnknownMap, and InvalidRequest for a cursor that was not issued.
+
+    Raises
+    ------
+    UnknownMap : If the map does not exist.
+    InvalidRequest : If the service did not issue the cursor.
     """
     after = None if cursor is None else _names_of(cursor)
     with store.database.read() as connection:
         row = find_map(connection, map_name)
-        found = list_runs(connection, row.number, after, limit + 1)
-    more = len(found) > limit
-    items = [_session(run) for run in found[:limit]]
-    last = found[limit - 1] if more else None
+        runs = list_runs(connection, row.number, after, limit + 1)
+    more = len(runs) > limit
+    items = [_session(run) for run in runs[:limit]]
+    last = runs[limit - 1] if more else None
     cursor = None if last is None else _packed([last.session or "", last.robot or ""])
     return Page[Session](items=items, next_cursor=cursor)
 
 
 def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
-    """Return the poses of one run by their stamps; of equal stamps the first that was taken. Raise
-    UnknownMap, and InvalidRequest if robot or parent frame are ambiguous, or there are more than
-    MOST_POSES.
+    """Return the poses of one run by their stamps; of equal stamps, only the first.
+
+    Raises
+    ------
+    UnknownMap : If the map does not exist.
+    InvalidRequest : If robot or parent frame are ambiguous, or there are more than MOST_POSES
+        frames.
     """
     with store.database.read() as connection:
         row = find_map(connection, map_name)
-        counted = count_run(connection, row.number, run)
-        robot = _only("robot", run.robot, {one for one, _, _ in counted}, run.session)
-        parents = {one for _, one, _ in counted if one is not None}
+        counts = count_run(connection, row.number, run)
+        robot = _only("robot", run.robot, {one for one, _, _ in counts}, run.session)
+        parents = {one for _, one, _ in counts if one is not None}
         parent = _only("parent_frame", run.parent_frame, parents, run.session)
-        total = sum(count for _, _, count in counted)
+        total = sum(count for _, _, count in counts)
         if run.most is None and total > MOST_POSES:
             raise errors.InvalidRequest(
                 f"Session {run.session!r:.140} has {total} frames, but a trajectory has at most "
@@ -215,26 +234,26 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
             )
         only = run.model_copy(update={"robot": robot, "parent_frame": parent})
         stamps = None if parent is None else stamps_of_run(connection, row.number, only)
-        kept: list[tuple[str, float, list[list[float]]]] = []
+        selected: list[tuple[str, float, list[list[float]]]] = []
         posed = 0
         if stamps is not None:
-            kept, posed = poses_of_run(connection, row.number, only, stamps)
+            selected, posed = poses_of_run(connection, row.number, only, stamps)
     return Trajectory(
         map=row.name,
         session=run.session,
         robot=robot,
         parent_frame=parent,
-        frame_ids=[frame_id for frame_id, _, _ in kept],
-        poses=[trajectory_row(at, np.array(pose)) for _, at, pose in kept],
+        frame_ids=[frame_id for frame_id, _, _ in selected],
+        poses=[trajectory_row(at, np.array(pose)) for _, at, pose in selected],
         posed=posed,
-        left_out=total - len(kept),
-        stamps=stamps if kept else None,
-        reason=None if kept else _why_empty(only, total, posed=bool(parents)),
+        left_out=total - len(selected),
+        stamps=stamps if selected else None,
+        reason=None if selected else _why_empty(only, total, posed=bool(parents)),
     )
 
 
 def _why_empty(run: Run, total: int, *, posed: bool) -> str:
-    """Why a trajectory has no pose."""
+    """Return the reason why a trajectory is empty."""
     if not total:
         part = run.captured_after is not None or run.captured_before is not None
         return f"the map has no frame of session {run.session!r:.140}{' in that time' * part}"
@@ -242,13 +261,13 @@ def _why_empty(run: Run, total: int, *, posed: bool) -> str:
         return f"none of its {total} frames has a pose; send `pose` with uploads, or edit them"
     where = "" if run.parent_frame is None else f" in {run.parent_frame!r:.140}"
     lacking = {
-        "taken": " with `captured_at` or `sequence`; `clock=received` orders them as they came",
+        "taken": " with `captured_at` or `sequence`; `clock=received` orders them by upload",
         "captured": " with `captured_at`", "sequence": " with `sequence`", "received": "",
     }[run.clock]  # fmt: skip
     return f"none of its {total} frames has a pose{where}{lacking}"
 
 
-#: What the stamps of a file are, for people.
+#: Meaning of the stamps, for comments in a file.
 _STAMPS = {
     "captured": "captured_at, seconds since 1970",
     "received": "when it was received, seconds since 1970",
@@ -256,33 +275,33 @@ _STAMPS = {
 }
 
 
-def trajectory_file(told: Trajectory) -> str:
-    """A trajectory as a TUM file, which says in comments what its poses are of."""
-    robot = "" if told.robot is None else f", robot {told.robot}"
-    told_of = f"{len(told.poses)}"
-    if told.posed > len(told.poses):
-        told_of += f" of {told.posed}, evenly spaced"
+def trajectory_file(track: Trajectory) -> str:
+    """Return a trajectory as the text of a TUM file with comments on its origin."""
+    robot = "" if track.robot is None else f", robot {track.robot}"
+    number = f"{len(track.poses)}"
+    if track.posed > len(track.poses):
+        number += f" of {track.posed}, evenly spaced"
     comments = [
-        f"map {told.map}, session {told.session}{robot}",
-        f"poses of the sensors' frames in {told.parent_frame or 'no frame'}, metres",
-        f"poses: {told_of}; frames left out: {told.left_out}",
-        f"empty: {told.reason}" if told.stamps is None else f"t: {_STAMPS[told.stamps]}",
+        f"map {track.map}, session {track.session}{robot}",
+        f"poses of the sensors' frames in {track.parent_frame or 'no frame'}, metres",
+        f"poses: {number}; frames left out: {track.left_out}",
+        f"empty: {track.reason}" if track.stamps is None else f"t: {_STAMPS[track.stamps]}",
         "t tx ty tz qx qy qz qw",
     ]
-    return trajectory_text(told.poses, comments)
+    return trajectory_text(track.poses, comments)
 
 
-def _only(what: str, asked: str | None, found: Iterable[str | None], session: str) -> str | None:
-    """The name that was asked for, or the only one that there is."""
-    if asked is not None:
-        return asked
-    names = sorted(set(found), key=lambda name: name or "")
+def _only(what: str, wanted: str | None, names: Iterable[str | None], session: str) -> str | None:
+    """Return the requested name, else the only existing one; raise InvalidRequest for several."""
+    if wanted is not None:
+        return wanted
+    names = sorted(set(names), key=lambda name: name or "")
     if len(names) > 1:
-        told = ", ".join("none" if name is None else repr(name)[:60] for name in names[:5])
+        shown = ", ".join("none" if name is None else repr(name)[:60] for name in names[:5])
         raise errors.InvalidRequest(
-            f"Session {session!r:.140} has frames with {len(names)} values of `{what}` ({told}), "
+            f"Session {session!r:.140} has frames with {len(names)} values of `{what}` ({shown}), "
             f"but a trajectory covers one. Choose it with `{what}`.",
-            ((what, "required, as there are several"),),
+            ((what, "required, since there are several"),),
         )
     return names[0] if names else None
 
@@ -304,9 +323,9 @@ def _names_of(cursor: str) -> tuple[str, str]:
     try:
         session, robot = _unpacked(cursor)
         if isinstance(session, str) and isinstance(robot, str):
-            f"{session}{robot}".encode()  # half of a pair of surrogates is no text
+            f"{session}{robot}".encode()  # raises for a lone surrogate
             return session, robot
-    except (ValueError, TypeError, RecursionError):  # whatever else somebody may think up
+    except (ValueError, TypeError, RecursionError):  # a forged cursor, too
         pass
     raise invalid_cursor(cursor)
 
@@ -319,10 +338,6 @@ def _unpacked(text: str) -> Any:
     return json.loads(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)))
 
 
-# Something that can be made of a frame, and how it is told.
-#
-# patches --level_of--> JSON;  signature --npy_of--> NPY file;  upload --upload_type--> media type
-
 T = TypeVar("T")
 
 PLY, PNG, NPY, JSON = "application/ply", "image/png", "application/x-npy", "application/json"
@@ -330,13 +345,13 @@ PLY, PNG, NPY, JSON = "application/ply", "image/png", "application/x-npy", "appl
 
 @dataclass(frozen=True, eq=False)
 class Output(Generic[T]):
-    """Something that can be made of a frame.
+    """Data that is derived from a frame on demand.
 
     Parameters
     ----------
-    tag : the same as long as what is made is the same, and another otherwise
-    make : makes it; takes some 100 ms at most
-    blob : that it is, where it is not made but lies in the store
+    tag : entity tag, which changes with the data
+    make : function that computes the data, which takes at most about 100 ms
+    blob : digest of the blob if the data is stored instead
     """
 
     tag: str
@@ -345,15 +360,15 @@ class Output(Generic[T]):
 
 
 def upload_type(data: bytes) -> tuple[str, str]:
-    """Return the media type of an upload, and the suffix of its name."""
-    found = format_at(data, "depth", "cloud")
-    if found is None:  # a KITTI scan
+    """Return the media type and the file name suffix of an upload."""
+    kind = format_at(data, "depth", "cloud")
+    if kind is None:  # a KITTI scan
         return BYTES, ".bin"
-    return found.media_type, next(iter(found.suffixes), ".bin")
+    return kind.media_type, next(iter(kind.suffixes), ".bin")
 
 
 def level_of(patches: Patches) -> PatchLevel:
-    """Patches as JSON tells them."""
+    """Return the API record of patches."""
     return PatchLevel(
         mean=[(x, y, z) for x, y, z in patches.means.round(4).tolist()],
         normal=[(x, y, z) for x, y, z in patches.normals.round(4).tolist()],
@@ -367,31 +382,25 @@ def npy_of(vector: bytes) -> bytes:
     return encode_npy(np.frombuffer(vector, np.uint8))
 
 
-# What a frame is made of, out of the store: cloud, picture, patches, signature, upload.
-#
-# frame  --FrameFiles-->  Output: a tag that stands for the content, and how to make it
-
-
 class FrameFiles:
-    """What frames are made of."""
+    """Clouds, pictures, patches, signatures and uploads of frames."""
 
     def __init__(self, store: Store, signers: Signers) -> None:
         self._store, self._signers = store, signers
 
     def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> Output[bytes]:
-        """Points and normals of a frame's surface as PLY.
+        """Return points and normals of a frame's surface as PLY.
 
         Parameters
         ----------
-        map_name, frame_id : of an indexed frame
-        within : the coordinates: of the camera, of the parent frame of its pose, of the robot's
-            base
+        map_name, frame_id : map and id of an indexed frame
+        within : coordinate frame: that of the sensor, the parent frame, or the robot's base
 
         Raises
         ------
-        UnknownMap, UnknownFrame : there is none, or it was deleted.
-        NotIndexed : nothing has been made of it, or not yet.
-        InvalidRequest : its pose, or where the sensor sits on its base, is not known.
+        UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+        NotIndexed : If the frame is not indexed.
+        InvalidRequest : If the frame's pose or base is not known.
         """
         found = find_indexed(self._store, map_name, frame_id)
         frame, optical = found.frame, sensor_of(found.frame)
@@ -414,8 +423,12 @@ class FrameFiles:
     def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = 320
     ) -> Output[bytes]:
-        """Return a picture of a frame as PNG; see `sceneprint.pictures`. Errors as for `cloud`; for
-        patches also DamagedBlob if the upload is lost.
+        """Return a picture of a frame as PNG; see `sceneprint.pictures`.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame, NotIndexed : See `cloud`.
+        DamagedBlob : If the upload, which pictures of patches need, is lost.
         """
         found = find_indexed(self._store, map_name, frame_id)
 
@@ -425,13 +438,13 @@ class FrameFiles:
             else:
                 surface = geometry_of(self._store, self._signers, found).surface
                 colours, text = (depth_view if view == "depth" else normals_view)(surface)
-            told = {"view": view, "frame": sensor_of(found.frame), "model": found.label}
-            return picture(colours, width, {**told, **text})
+            metadata = {"view": view, "frame": sensor_of(found.frame), "model": found.label}
+            return picture(colours, width, {**metadata, **text})
 
         return Output(found.tag("preview", found.frame.id, view, width), make)
 
     def patches(self, map_name: str, frame_id: str) -> Output[FramePatches]:
-        """The patches of a frame. Errors as of `preview`."""
+        """Return the patches of a frame; see `preview` for errors."""
         found = find_indexed(self._store, map_name, frame_id)
 
         def make() -> FramePatches:
@@ -447,8 +460,12 @@ class FrameFiles:
         return Output(found.tag("patches", found.frame.id, found.row.name), make)
 
     def signature(self, map_name: str, frame_id: str) -> Output[FrameSignature]:
-        """Return the signature of a frame; errors as for `cloud`. Raise DamagedSignature if its
-        bytes are damaged; the frame is then signed again.
+        """Return the signature of a frame.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame, NotIndexed : See `cloud`.
+        DamagedSignature : If the signature is damaged; the frame is then signed again.
         """
         found = find_indexed(self._store, map_name, frame_id)
 
@@ -468,7 +485,7 @@ class FrameFiles:
         return Output(found.tag("signature", found.frame.id, found.row.name), make)
 
     def vector(self, map_name: str, frame_id: str, media_type: str = BYTES) -> Output[bytes]:
-        """The bytes of a signature, as they are or as an NPY file. Errors as of `signature`."""
+        """Return the bytes of a signature, raw or as an NPY file; see `signature` for errors."""
         found = find_indexed(self._store, map_name, frame_id)
 
         def make() -> bytes:
@@ -478,9 +495,13 @@ class FrameFiles:
         return Output(found.tag("vector", media_type), make)
 
     def upload(self, map_name: str, frame_id: str) -> Output[bytes]:
-        """Return a frame's upload, byte for byte as it came. Raise UnknownMap or UnknownFrame if
-        there is no such frame, NotIndexed if it was redundant and not kept, and DamagedBlob if it
-        is lost.
+        """Return the unchanged bytes of a frame's upload.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+        NotIndexed : If the frame is redundant, so its upload is not stored.
+        DamagedBlob : If the upload is lost.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -494,7 +515,7 @@ class FrameFiles:
         return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
 
     def _hierarchy(self, found: IndexedFrame) -> tuple[Surface, Hierarchy]:
-        """As it was signed: of the upload, as the artifact's points are rounded."""
+        """Return the hierarchy of the upload, since points of the stored geometry are rounded."""
         p = self._signers(found.row.model_id).model.parameters
         frame = read_stored(
             self._store.blobs.get(found.frame.blob), found.frame, self._store.decoders
@@ -503,7 +524,7 @@ class FrameFiles:
         return seen, hierarchy_of(seen, p, found.frame.id)
 
     def _labels(self, found: IndexedFrame) -> Ints32:
-        """The finest patches as an image; those of a cloud are of points in no order."""
+        """Return the finest patches as an image, onto which points of a cloud are projected."""
         seen, hierarchy = self._hierarchy(found)
         labels = hierarchy.labels[0]
         if isinstance(seen.camera, Intrinsics):
@@ -530,8 +551,8 @@ class FrameFiles:
 
 
 def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]:
-    """Return the name of a coordinate frame, and the (4, 4) transform to it from the frame's
-    sensor; raise InvalidRequest if the pose or the base of the frame is not known.
+    """Return the name of a coordinate frame, and T_name_sensor (4, 4); raise InvalidRequest if the
+    pose or the base of the frame is not known.
     """
     optical = sensor_of(frame)
     name, matrix = {

@@ -1,10 +1,9 @@
-"""Maps made, edited and re-encoded, and the models that they can be signed with.
+"""Creation, editing, deletion and re-encoding of maps, and the models for them.
 
     begin_reencoding  -->  jobs  -->  a second signature of each frame  --Reencodings.run-->  switch
 
-While a map is re-encoded, queries go on with the model that it has. The switch is one commit, made
-when no frame lacks the next model's signature; whoever is killed in between leaves what the next
-one goes on with.
+While a map is re-encoded, queries use its current model. The switch is one commit after all frames
+have signatures of the next model. Another process continues a re-encoding that was interrupted.
 """
 
 from __future__ import annotations
@@ -62,39 +61,39 @@ from sceneprint_client.api.admin import ModelInfo
 from sceneprint_client.api.base import ROS_NAMES, record_of
 from sceneprint_client.api.listing import FrameEdit, MapEdit
 
-#: Fields of a new map that say what it may hold, and for how long.
+#: Fields of a new map with its quotas and its retention.
 LIMITS = frozenset(("quota_frames", "quota_bytes", "retention_days"))
 
 
 def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
-    """Make a map, or find that it is there as wanted.
+    """Create a map, or return an existing one with the same properties.
 
     Returns
     -------
-    made : the map
-    new : False where it was there
+    record : the map
+    new : whether it was created
 
     Raises
     ------
-    MapExists : there is one of that name with another title, model, quota, retention or up.
+    MapExists : If a map of this name has another title, model, quota, retention or up vector.
     """
     model = read_model(new.model)
     limits: dict[str, Any] = new.model_dump(include=set(LIMITS & new.model_fields_set))
     if new.up is not None:
         limits["up"] = new.up.unit
     with store.database.write() as connection:
-        there = {row.name: row for row in list_maps(connection)}.get(new.name)
-        if there is None:
+        existing = {row.name: row for row in list_maps(connection)}.get(new.name)
+        if existing is None:
             store_model(connection, model.id, model.name, write_model(model))
             row = add_map(connection, new.name, new.title, model.id, limits)
             return map_record(connection, row), True
-        other = any(getattr(there, name) != value for name, value in limits.items())
-        if other or (there.title, there.model_id) != (new.title, model.id):
+        differs = any(getattr(existing, name) != value for name, value in limits.items())
+        if differs or (existing.title, existing.model_id) != (new.title, model.id):
             raise errors.MapExists(
                 f"Map {new.name!r} already exists with a different title, model, limits or up. Use "
                 "it as it is, delete it, or choose another name."
             )
-        return map_record(connection, there), False
+        return map_record(connection, existing), False
 
 
 def get_maps(store: Store) -> list[Map]:
@@ -104,26 +103,22 @@ def get_maps(store: Store) -> list[Map]:
 
 
 def get_map(store: Store, name: str) -> Map:
-    """Return a map; raise UnknownMap if there is none of that name."""
+    """Return a map; raise UnknownMap if it does not exist."""
     with store.database.read() as connection:
         return map_record(connection, find_map(connection, name))
 
 
 def delete_map(context: Context, name: str) -> None:
-    """Delete a map with all that is in it; raise UnknownMap if there is none of that name."""
+    """Delete a map with its content; raise UnknownMap if it does not exist."""
     store = context.store
-    context.query_log.remove_of_map(name)  # most of them, while other writers get their turns
+    context.query_log.remove_of_map(name)  # in blocks, between which others write
     with store.database.write() as connection:
         blobs = remove_map(connection, find_map(connection, name))
     context.readers.forget(name)
     collect_deleted_blobs(store, blobs)
 
 
-# Metadata of frames and maps, edited by a JSON merge patch (RFC 7396).
-#
-# frame, patch  --edited-->  its columns as they shall be  --edit_frame-->  frame
-
-#: Columns of each field that can be edited.
+#: Columns of each editable field.
 _COLUMNS = {
     "robot": ("robot",),
     "session": ("session",),
@@ -138,7 +133,7 @@ _COLUMNS = {
 _CONTENT = (
     "intrinsics", "depth_scale", "depth_along_ray", "viewpoint", "units_per_metre", "format",
 )  # fmt: skip
-#: Ways to give a transform.
+#: Fields that define a transform.
 _WAYS = ("translation", "rotation", "matrix", *ROS_NAMES)
 
 
@@ -146,20 +141,20 @@ def edit_frame(
     store: Store, map_name: str, frame_id: str, patch: Mapping[str, Any],
     if_match: Collection[str] | None = None,
 ) -> Frame:  # fmt: skip
-    """Change the metadata of a frame; filters see it at once.
+    """Edit the metadata of a frame by a JSON merge patch (RFC 7396).
 
     Parameters
     ----------
-    map_name, frame_id : of the frame, in whatever state
-    patch : fields of FrameEdit: what is left out stays, None removes
-    if_match : tags of `frame_tag`; None to change it however it is by now
+    map_name, frame_id : map and id of a frame in any state
+    patch : fields of FrameEdit; None removes a value
+    if_match : entity tags from `frame_tag`; None skips the check
 
     Raises
     ------
-    UnknownMap, UnknownFrame : there is none, or it was deleted.
-    InvalidRequest : a field is unknown, cannot be edited, or is not as it should be.
-    InvalidPose : no rigid transform.
-    PreconditionFailed : it has been edited meanwhile.
+    UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+    InvalidRequest : If a field is unknown, not editable or not valid.
+    InvalidPose : If a transform is not rigid.
+    PreconditionFailed : If the frame has none of the entity tags.
     """
     _check_fields(patch)
     with store.database.write() as connection:
@@ -169,7 +164,7 @@ def edit_frame(
             raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
         _check_tag(f"Frame {frame.id}", frame_tag(frame), if_match)
         values = edited(frame, patch)
-        if "pose_parent" in values:  # it is sent anew, in a parent frame that may be joined
+        if "pose_parent" in values:  # the new parent frame may be joined to another
             values = {"sent_parent": None, "sent_pose": None, **values}
             values |= root_columns(connection, replace(frame, **values))
         now = write_frame(connection, row, frame, values)
@@ -180,10 +175,10 @@ def edit_map(
     store: Store, map_name: str, patch: Mapping[str, Any],
     if_match: Collection[str] | None = None, *, dry_run: bool = False,
 ) -> Map:  # fmt: skip
-    """Change title, limits and up of a map; parameters and errors as of `edit_frame`.
+    """Edit title, limits and up vector of a map; see `edit_frame` for parameters and errors.
 
-    Who may set a quota, the caller has seen to. With `dry_run` nothing is changed, and the map told
-    as it would be.
+    The caller checks the permission to set quotas. With `dry_run`, return the edited map without
+    storing it.
     """
     change = record_of(MapEdit, dict(patch), "The edit of the map")
     values = change.model_dump(include=change.model_fields_set)
@@ -204,22 +199,22 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
     meta = _merged(frame, patch)
     if meta.pose is not None and meta.pose.of != "sensor":
         raise errors.InvalidRequest(
-            "The edited pose is that of the base. Give that of the sensor, and leave `of` out.",
+            "An edit cannot set the pose of the base. Send that of the sensor, without `of`.",
             (("pose.of", "an edited pose is that of the sensor"),),
         )
     pose = None if meta.pose is None else frame_decoder.pose_matrix(meta.pose)
-    known = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
-    found = {name: known[name] for field in patch for name in _COLUMNS[field]}
+    columns_after = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
+    values = {name: columns_after[name] for field in patch for name in _COLUMNS[field]}
     for field, column in (("pose", "pose"), ("T_base_sensor", "base")):
-        given = patch.get(field)
-        if given is not None and not any(way in given for way in _WAYS):
-            del found[column]  # only its frame is renamed: not a digit changes
-    return found
+        change = patch.get(field)
+        if change is not None and not any(way in change for way in _WAYS):
+            del values[column]  # only the name of its frame changes
+    return values
 
 
 def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
-    """What would be uploaded to have the frame as it is wanted."""
-    now = {
+    """Return the metadata of an upload that would create the edited frame."""
+    values = {
         "robot": frame.robot,
         "session": frame.session,
         "captured_at": when(frame.captured_at),
@@ -230,11 +225,11 @@ def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
         "name": frame.name,
         "sequence": frame.sequence,
     }
-    for field, given in patch.items():
-        is_transform = field in ("pose", "T_base_sensor") and isinstance(given, Mapping)
-        now[field] = _with(now[field], given) if is_transform else given
-    wanted = {name: value for name, value in now.items() if value is not None}
-    return record_of(FrameMeta, {"intrinsics": frame.intrinsics, **wanted}, "The edit of the frame")
+    for field, change in patch.items():
+        is_transform = field in ("pose", "T_base_sensor") and isinstance(change, Mapping)
+        values[field] = _with(values[field], change) if is_transform else change
+    fields = {name: value for name, value in values.items() if value is not None}
+    return record_of(FrameMeta, {"intrinsics": frame.intrinsics, **fields}, "The edit of the frame")
 
 
 def _relative_transform(
@@ -243,14 +238,14 @@ def _relative_transform(
     return None if matrix is None else {name: frame, "matrix": matrix}
 
 
-def _with(now: Mapping[str, Any] | None, given: Mapping[str, Any]) -> dict[str, Any]:
-    """A transform after a patch; it is given in one way, so the other one goes."""
-    given = {ROS_NAMES.get(name, name): value for name, value in given.items()}
-    kept = dict(now or {})
-    if "matrix" in kept and ("translation" in given or "rotation" in given):
-        T = transform(np.array(kept.pop("matrix")), "", "")
-        kept |= {"translation": T.translation.model_dump(), "rotation": T.rotation.model_dump()}
-    merged = {**kept, **given}
+def _with(now: Mapping[str, Any] | None, change: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a transform after a patch, in only one of its two notations."""
+    change = {ROS_NAMES.get(name, name): value for name, value in change.items()}
+    old = dict(now or {})
+    if "matrix" in old and ("translation" in change or "rotation" in change):
+        T = transform(np.array(old.pop("matrix")), "", "")
+        old |= {"translation": T.translation.model_dump(), "rotation": T.rotation.model_dump()}
+    merged = {**old, **change}
     return {name: value for name, value in merged.items() if value is not None}
 
 
@@ -278,46 +273,44 @@ def _check_tag(what: str, tag: str, if_match: Collection[str] | None) -> None:
         )
 
 
-# Re-encoding of a map: its frames are signed again with another model, then the map switches.
-
 log = logging.getLogger(__name__)
 
-#: Seconds that a worker removes former signatures before it looks for frames to sign again.
+#: Maximum number of seconds to remove signatures of former models in one call.
 TIDY_S = 2.0
 
 
 def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Path | Model) -> Map:
-    """Have a map signed with another model; where that is under way, try again what broke down.
+    """Start the re-encoding of a map with another model, or retry its failed jobs.
 
     Parameters
     ----------
-    model : a preset or a model file, or one that was read
+    model : name of a preset, model file, or loaded model
 
     Raises
     ------
-    UnknownMap : no such map.
-    UnreadableModel : no such model.
-    Conflict : it is the map's model, or the map is being signed with a third one.
+    UnknownMap : If the map does not exist.
+    UnreadableModel : If the model does not exist or cannot be read.
+    Conflict : If the map has this model already, or is switching to another one.
     """
-    wanted = model if isinstance(model, Model) else read_model(model)
+    next_model = model if isinstance(model, Model) else read_model(model)
     with store.database.write() as connection:
         row = find_map(connection, map_name)
-        if row.next_model_id not in (None, wanted.id):
+        if row.next_model_id not in (None, next_model.id):
             label = model_label(model_names(connection)[row.next_model_id], row.next_model_id)
             raise errors.Conflict(
                 f"Map {row.name!r} is already switching to {label}. Wait until it has switched, "
                 f"or cancel with `sceneprint reencode {row.name} --cancel`."
             )
-        if row.next_model_id is None and row.model_id == wanted.id:
+        if row.next_model_id is None and row.model_id == next_model.id:
             raise errors.Conflict(
-                f"Map {row.name!r} is already signed with {wanted.label}. There is nothing to do."
+                f"Map {row.name!r} is already signed with {next_model.label}. Nothing to do."
             )
         if row.next_model_id is None:
-            store_model(connection, wanted.id, wanted.name, write_model(wanted))
-            stored.begin_reencoding(connection, row, wanted.id)
+            store_model(connection, next_model.id, next_model.name, write_model(next_model))
+            stored.begin_reencoding(connection, row, next_model.id)
             row = find_map(connection, row.name)
         else:
-            record_change(connection, "map.reencoding_retried", row.name, model=wanted.id)
+            record_change(connection, "map.reencoding_retried", row.name, model=next_model.id)
     _enqueue(store, row, again=True)
     bell.ring()
     with store.database.read() as connection:
@@ -325,8 +318,12 @@ def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Pat
 
 
 def cancel_reencoding(store: Store, map_name: str) -> Map:
-    """Cancel the switch to another model, and remove what was made for it. Raise UnknownMap if
-    there is no such map, and Conflict if no switch is in progress.
+    """Cancel a re-encoding, and remove its signatures.
+
+    Raises
+    ------
+    UnknownMap : If the map does not exist.
+    Conflict : If the map is not switching to another model.
     """
     with store.database.write() as connection:
         row = find_map(connection, map_name)
@@ -343,32 +340,30 @@ def cancel_reencoding(store: Store, map_name: str) -> Map:
 
 
 class Reencodings:
-    """Switches maps to their next models, whose indexes `upkeep` publishes first, and removes what
-    the previous models left.
-    """
+    """Switches of maps to their next models, whose indexes `upkeep` publishes first."""
 
     def __init__(self, store: Store, upkeep: Upkeep) -> None:
         self._store, self._upkeep = store, upkeep
-        self._tidied: dict[int, tuple[str, ...]] = {}  # the models that a map is known to have
+        self._tidied: dict[int, tuple[str, ...]] = {}  # models of maps without stale data
 
     def run(self) -> None:
-        """One look at all maps; what goes wrong with one is logged, and costs no other."""
+        """Continue the re-encodings of all maps; log errors of single maps."""
         with self._store.database.read() as connection:
             rows = list_maps(connection)
         for row in rows:
             try:
                 models = stored.models_of(row)
-                if row.next_model_id is not None and self._go_on(row):
+                if row.next_model_id is not None and self._continue(row):
                     models = (row.next_model_id,)
                 if self._tidied.get(row.number) != models and _tidy(self._store, row, TIDY_S):
                     self._tidied[row.number] = models
             except errors.UnknownMap:
-                pass  # deleted in the meantime
+                pass  # the map was deleted meanwhile
             except errors.SceneprintError as error:
                 log.error("map not reencoded", extra={"map": row.name, "error": str(error)})
 
-    def _go_on(self, row: MapRow) -> bool:
-        """Do what can be done now; whether the map has switched."""
+    def _continue(self, row: MapRow) -> bool:
+        """Continue a re-encoding, and return whether the map has switched."""
         with self._store.database.read() as connection:
             if stored.is_pending(connection, row):
                 return False
@@ -376,23 +371,23 @@ class Reencodings:
             return False
         with self._store.database.read() as connection:
             if not stored.is_complete(connection, row):
-                return False  # jobs that broke down: somebody must say what is to become of them
+                return False  # failed jobs wait for a retry or a cancellation by the operator
         try:
             version = self._upkeep.ahead(row)
         except errors.BusyIndex:
-            return False  # next time
+            return False  # a later call tries again
         return self._switch(row, version)
 
     def _switch(self, row: MapRow, version: IndexVersion | None) -> bool:
         with self._store.database.write() as connection:
             now = find_map(connection, row.name)
             if not _still(now, row) or not stored.is_complete(connection, now):
-                return False  # a frame was indexed meanwhile, or somebody was first
-            found = trusted(connection, now, version)
-            if found is not None:
-                # what was signed after the index was published, and had a revision before it
-                signed = stored.frames_signed_by(connection, now, found.revision)
-                stored.raise_revisions(connection, now, np.setdiff1d(signed, found.keys).tolist())
+                return False  # a frame was indexed, or another process switched the map
+            usable = trusted(connection, now, version)
+            if usable is not None:
+                # frames that were signed later, but whose revision precedes that of the index
+                signed = stored.frames_signed_by(connection, now, usable.revision)
+                stored.raise_revisions(connection, now, np.setdiff1d(signed, usable.keys).tolist())
             rejected = stored.switch_model(connection, now)
         log.info(
             "map reencoded",
@@ -402,10 +397,10 @@ class Reencodings:
 
 
 def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
-    """Queue a job for each frame that lacks the next model's signature; returns how many."""
+    """Queue jobs for all frames without the next model's signature; return their number."""
     after, queued = 0, 0
     while True:
-        with store.database.read() as connection:  # most often there is nothing: no lock
+        with store.database.read() as connection:  # usually no frame lacks one, so no lock
             if not stored.unqueued_frames(connection, row, after, again=again):
                 return queued
         with store.database.write() as connection:
@@ -418,7 +413,7 @@ def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
 
 
 def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
-    """Cancel and remove what is of neither model of a map, a little at a time; whether all is."""
+    """Remove jobs and signatures of former models of a map; return whether none are left."""
     start = time.monotonic()
     while True:
         with store.database.read() as connection:
@@ -440,7 +435,7 @@ def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
             now = find_map(connection, row.name)
             for number, model_id in signatures.stale_signatures(connection, now, after):
                 blobs += signatures.remove_signature(connection, number, model_id)
-                after = number - 1  # a frame may have several
+                after = number - 1  # a frame may have several signatures
         collect_blobs(store, blobs)
 
 
@@ -448,27 +443,27 @@ def _still(now: MapRow, row: MapRow) -> bool:
     return (now.number, now.next_model_id) == (row.number, row.next_model_id)
 
 
-# The models that a map can be signed with: those of the store, and the presets that ship.
-
-
 class Catalogue:
-    """Models by their ids; each is read once a process, as it never changes."""
+    """The presets and the models of a store, with a cache of parsed models."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._known: dict[str, Model] = {}
 
     def tell(self, may_read: Callable[[str], bool]) -> list[ModelInfo]:
-        """Return all readable models, presets first, then by label; name only maps that `may_read`
-        allows.
+        """Return the records of all models, presets first, then by label.
+
+        Parameters
+        ----------
+        may_read : function that returns whether the caller may read a map; other names are left out
         """
         with self._database.read() as connection:
-            found = {model.id: model for model in self._stored(connection)}
+            by_id = {model.id: model for model in self._stored(connection)}
             rows = list_maps(connection)
         shipped = [_preset(name) for name in PRESETS]
-        found |= {model.id: model for model in shipped}
+        by_id |= {model.id: model for model in shipped}
         ids = [model.id for model in shipped]
-        rest = sorted((one for one in found.values() if one.id not in ids), key=lambda m: m.label)
+        rest = sorted((one for one in by_id.values() if one.id not in ids), key=lambda m: m.label)
         return [
             _model_record(
                 model,
@@ -483,33 +478,33 @@ class Catalogue:
         ]
 
     def find(self, name: str, may_read: Callable[[str], bool] | None = None) -> Model:
-        """A model by the name of a preset, or by id or label.
+        """Return a model by its id or label, or by the name of a preset.
 
         Parameters
         ----------
-        name : see above
-        may_read : whether a map may be named: a model that only others have is not there; default:
-            all are
+        name : name of a preset, or id or label of a model
+        may_read : function that returns whether the caller may read a map, which hides models of
+            other maps; None hides none
 
         Raises
         ------
-        InvalidRequest : there is none.
+        InvalidRequest : If the model does not exist.
         """
         if name in PRESETS:
             return _preset(name)
         with self._database.read() as connection:
             rows = list_maps(connection)
-            known = [*(_preset(one) for one in PRESETS), *self._stored(connection)]
+            every = [*(_preset(one) for one in PRESETS), *self._stored(connection)]
         if may_read is not None:
-            of = [(row.model_id, row.next_model_id) for row in rows if may_read(row.name)]
-            seen = {model_id for pair in of for model_id in pair}
-            known = [one for i, one in enumerate(known) if i < len(PRESETS) or one.id in seen]
-        for model in known:
+            pairs = [(row.model_id, row.next_model_id) for row in rows if may_read(row.name)]
+            visible = {model_id for pair in pairs for model_id in pair}
+            every = [one for i, one in enumerate(every) if i < len(PRESETS) or one.id in visible]
+        for model in every:
             if name in (model.id, model.label):
                 return model
         raise errors.InvalidRequest(
-            f"There is no model {name!r:.80} here. Give {' or '.join(PRESETS)}, or the id of one "
-            "that GET /v1/models lists; `sceneprint reencode --model FILE` adds a new one.",
+            f"There is no model {name!r:.80}. Use {' or '.join(PRESETS)}, or an id that GET "
+            "/v1/models lists; `sceneprint reencode --model FILE` adds a new model.",
             (("model", "no such model"),),
         )
 
@@ -521,7 +516,7 @@ class Catalogue:
                     content = model_content(connection, model_id)
                     self._known[model_id] = parse_model(content, f"model {model_id[:12]}")
                 except errors.UnreadableModel:
-                    continue  # another version stored it; `sceneprint fsck` says so
+                    continue  # another version stored it, which `sceneprint fsck` reports
         return [self._known[model_id] for model_id in ids if model_id in self._known]
 
 

@@ -1,9 +1,9 @@
-"""Maps seen from above: plans of their coverage, compared, and pictures of their surface.
+"""Plans of maps: coverage by cells, comparison of coverage, and pictures of surfaces.
 
 positions, queried frames  --coverage_plans-->  CoveragePlan of each parent frame
-plans before, plans after  --plan_changes-->  cells that became better or worse
+plans before, plans after  --plan_changes-->  cells with their trends
 axes, box  --plan_frame-->  PlanFrame
-PlanFrame, points  --surface_picture-->  PNG, transparent where nothing is
+PlanFrame, points  --surface_picture-->  PNG
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,17 +28,14 @@ from sceneprint_client.api.coverage import (
     PlanChanges,
 )
 
-if TYPE_CHECKING:
-    pass
-
-#: Cells along the longer side of a plan, about.
+#: Approximate number of cells along the longer side of a plan.
 _CELLS_ALONG = 20
-#: Least width of cells that nobody asked for, metres.
+#: Minimum width of cells unless the request sets it, metres.
 _LEAST_CELL_M = 0.25
-#: Most cells of all plans together: wider ones are taken where there would be more.
+#: Maximum number of cells in all plans; larger plans get wider cells.
 MOST_CELLS = 10_000
 
-#: Farthest column and row: JSON has numbers beyond that no longer exactly.
+#: Largest column and row: JSON does not represent larger integers exactly.
 _FARTHEST_CELL = 2**52
 
 #: Column and row of a cell.
@@ -48,52 +44,52 @@ Place = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class QueriedPosition:
-    """Where a queried frame was taken, (3,) in its parent frame, and what became of it."""
+    """The position (3,) of a queried frame in its parent frame, and its outcome."""
 
     at: Floats
     outcome: CoverageOutcome
 
 
 def cell_width(extent_m: float) -> float:
-    """Width of cells for a plan whose longer side is that long, metres: 0.25, 0.5, 1, 2, 5, 10."""
-    wanted = max(extent_m / _CELLS_ALONG, _LEAST_CELL_M)
+    """Return the width of a plan's cells by its longer side, metres: 0.25, 0.5, 1, 2, 5, 10."""
+    target = max(extent_m / _CELLS_ALONG, _LEAST_CELL_M)
     steps = [
         _LEAST_CELL_M,
         0.5,
         *(digit * 10.0**power for power in range(6) for digit in (1, 2, 5)),
     ]
-    return min(steps, key=lambda step: abs(math.log(step / wanted)))
+    return min(steps, key=lambda step: abs(math.log(step / target)))
 
 
 def coverage_plans(
-    queried: Mapping[str, Sequence[QueriedPosition]], taken: Mapping[str, Floats],
+    queried: Mapping[str, Sequence[QueriedPosition]], positions: Mapping[str, Floats],
     axes: Mapping[str, PlanAxes], cell_m: float | None,
 ) -> tuple[list[CoveragePlan], float]:  # fmt: skip
     """Count frames by cell.
 
     Parameters
     ----------
-    queried : frames by parent frame
-    taken : (n, 3) where all frames of the map were taken, by parent frame
-    axes : of each parent frame of `queried`
-    cell_m : width of the cells; None for one that fits
+    queried : queried frames by parent frame
+    positions : (n, 3) positions of all frames of the map, by parent frame
+    axes : axes of the plan of each parent frame
+    cell_m : width of the cells; None selects a suitable one
 
     Returns
     -------
-    plans : in the order of `queried`
-    cell_m : width of their cells; a multiple of what was asked for where that gives too many
+    plans : plans in the order of `queried`
+    cell_m : width of their cells; a multiple of the requested one if there are too many cells
     """
-    flat_taken = {name: taken.get(name, np.empty((0, 3))) @ axes[name].axes.T for name in queried}
+    flat = {name: positions.get(name, np.empty((0, 3))) @ axes[name].axes.T for name in queried}
     flat_queried = {
         name: np.array([one.at for one in some]) @ axes[name].axes.T
         for name, some in queried.items()
     }
     if cell_m is None:
-        every = [np.concatenate([flat_taken[name], flat_queried[name]]) for name in queried]
-        cell_m = cell_width(max((float(np.ptp(flat, axis=0).max()) for flat in every), default=0.0))
+        every = [np.concatenate([flat[name], flat_queried[name]]) for name in queried]
+        cell_m = cell_width(max((float(np.ptp(one, axis=0).max()) for one in every), default=0.0))
     while True:
         counted = {
-            name: (_places(flat_taken[name], cell_m), _places(flat_queried[name], cell_m))
+            name: (_places(flat[name], cell_m), _places(flat_queried[name], cell_m))
             for name in queried
         }
         if sum(len({*all_of, *some}) for all_of, some in counted.values()) <= MOST_CELLS:
@@ -113,7 +109,7 @@ def coverage_plans(
 
 
 def _places(flat: Floats, cell_m: float) -> list[Place]:
-    # a pose may be of any size: those beyond lie in the outermost cell
+    # coordinates of poses are unbounded; distant ones count in the outermost cell
     places = np.clip(np.floor(flat / cell_m), -_FARTHEST_CELL, _FARTHEST_CELL)
     return [(column, row) for column, row in places.astype(np.int64).tolist()]
 
@@ -133,34 +129,29 @@ def _cells(
     ]  # fmt: skip
 
 
-# Two results of a map compared, cell by cell.
-
-
 def queried_in(cell: CoverageCell) -> int:
-    """How many frames of a cell were queried."""
+    """Return the number of queried frames in a cell."""
     return sum(getattr(cell, name) for name in COVERAGE_OUTCOMES)
 
 
 def localisability(cell: CoverageCell) -> float:
-    """Mean over the checked frames of a cell: 1 for found, -1 for wrong, 0 otherwise."""
+    """Return the mean over the checked frames of a cell: 1 for found, -1 for wrong, else 0."""
     return (cell.found - cell.wrong) / max(queried_in(cell) - cell.unchecked, 1)
 
 
 def plan_changes(
     before: Sequence[CoveragePlan], after: Sequence[CoveragePlan]
 ) -> list[PlanChanges]:
-    """Return cells with queried frames in either of two results, whose plans have the same cells
-    and axes.
-    """
+    """Return the changes of cells with queried frames in either of two comparable results."""
     names = dict.fromkeys(plan.parent_frame for plan in (*after, *before))
-    told = []
+    changed = []
     for name in names:
         earlier, later = _by_place(before, name), _by_place(after, name)
         places = sorted({*earlier, *later}, key=lambda place: place[::-1])
         changes = [_change(place, earlier.get(place), later.get(place)) for place in places]
-        known = [one for one in changes if one is not None]
-        told.append(PlanChanges(parent_frame=name, cells=known))
-    return told
+        changes_here = [one for one in changes if one is not None]
+        changed.append(PlanChanges(parent_frame=name, cells=changes_here))
+    return changed
 
 
 def _by_place(plans: Sequence[CoveragePlan], name: str) -> dict[Place, CoverageCell]:
@@ -188,23 +179,21 @@ def _change(
     return CellChange(column=place[0], row=place[1], trend=trend, before=before, after=after)
 
 
-# A surface as a picture: the darker the more of it stands upright there.
-
-#: Read on white and on black alike; how opaque a single cell is, and a wall.
+#: Colour that is legible on white and on black, and opacities of a single cell and of a wall.
 _COLOUR, _OPACITIES = (122, 130, 143), (90.0, 255.0)
-#: Percentile of the counts of pixels that is fully opaque.
+#: Percentile of the pixels' counts that is fully opaque.
 _FULL = 97.0
 
 
 @dataclass(frozen=True)
 class PlanFrame:
-    """Where a picture lies on a plan.
+    """The frame of a picture on a plan.
 
     Parameters
     ----------
-    m_per_pixel : metres
-    width, height : pixels
-    left, top : of the upper left corner along the axes, metres
+    m_per_pixel : width of a pixel, metres
+    width, height : size in pixels
+    left, top : upper left corner along the axes, metres
     """
 
     m_per_pixel: float
@@ -217,14 +206,14 @@ class PlanFrame:
 def plan_frame(
     axes: Floats, low: Sequence[float], high: Sequence[float], cell_m: float, longer: int
 ) -> PlanFrame:
-    """Room for a box.
+    """Return the frame of a picture that shows a box.
 
     Parameters
     ----------
-    axes : (2, 3) to the right and to the top
-    low, high : (3,) corners of the box, metres
-    cell_m : no side is shorter
-    longer : pixels of the longer side
+    axes : (2, 3) unit vectors to the right and to the top
+    low, high : (3,) opposite corners of the box, metres
+    cell_m : minimum length of the sides, metres
+    longer : longer side, pixels
     """
     ends = np.stack([low, high])
     corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]]
@@ -240,19 +229,19 @@ def surface_picture(
     plan: PlanFrame, axes: Floats, points: Iterable[Floats], cell_m: float,
     heights: tuple[float | None, float | None],
 ) -> bytes:  # fmt: skip
-    """A picture as a PNG.
+    """Return a picture of a surface as a PNG that is darker where more points lie above each other.
 
     Parameters
     ----------
-    plan : where it lies
-    axes : (2, 3) of the plan
-    points : (N, 3) of each tile, metres
-    cell_m : width of their cells
-    heights : only what lies between these, metres along up; None for no limit
+    plan : frame of the picture
+    axes : (2, 3) axes of the plan
+    points : points (N, 3) of each tile, metres
+    cell_m : width of the cells, metres
+    heights : limits of the heights, metres along the up vector; None for no limit
     """
     from PIL import Image
 
-    # no finer than the cells: there would be gaps between them
+    # pixels smaller than cells would leave gaps
     step = max(plan.m_per_pixel, cell_m)
     columns, rows = (
         max(math.ceil(side * plan.m_per_pixel / step), 1) for side in (plan.width, plan.height)
@@ -279,7 +268,7 @@ def surface_picture(
     picture[..., 3] = np.where(shown, np.rint(least + share * (full - least)), 0)
     large = Image.fromarray(picture)
     if (columns, rows) != (plan.width, plan.height):
-        # the picture may reach a little beyond the plan at the right and at the bottom
+        # the picture may extend beyond the plan on the right and at the bottom
         box = (0.0, 0.0, plan.width * plan.m_per_pixel / step,
                plan.height * plan.m_per_pixel / step)  # fmt: skip
         large = large.resize((plan.width, plan.height), Image.Resampling.NEAREST, box=box)

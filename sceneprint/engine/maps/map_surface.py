@@ -1,4 +1,4 @@
-"""Surfaces of maps: begun, told, read by tile, looked into, drawn and removed."""
+"""Surfaces of maps: their tiles, the frames that saw them, plans, and the start of their jobs."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ from sceneprint_client.surface_encoding import CELL, SIDE, cell_points
 
 log = logging.getLogger(__name__)
 
-#: Cells that a plan is drawn of, at most: of more, those of a coarser level.
+#: Maximum number of cells in a plan; with more, the plan uses a coarser level.
 _DRAWN_CELLS = 1_500_000
-#: Around a spot, in cells: how near a frame must have seen something, by default and at most.
+#: Default and maximum radius around a spot in cells, within which a frame must have a point.
 _NEAR, _NEAREST = 2.0, float(SIDE)
-#: Artifacts that one page of sightings opens, and those that are looked up at once.
+#: Maximum number of geometries to read for a page of sightings, and number of frames in a query.
 _OPENED, _AT_ONCE = 150, 25
-#: Largest coordinate that is asked for, metres.
+#: Largest coordinate in a request, metres.
 FARTHEST_M = 1e9
-#: Seconds for which one call removes tiles.
+#: Maximum duration of a call that removes tiles, seconds.
 _CALL_S = 10.0
 
 
@@ -71,23 +71,23 @@ class MapSurfaces:
         self._store, self._bell = store, bell
 
     def get(self, map_name: str) -> MapSurface:
-        """The surface of a map as it is now; UnknownMap where there is none."""
+        """Return the surface of a map; raise UnknownMap if the map does not exist."""
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
             return _surface_record(connection, row, surface)
 
     def begin(self, map_name: str) -> tuple[MapSurface, bool]:
-        """Have the surface of a map built, or brought up to date.
+        """Start a job that builds or updates the surface of a map.
 
         Returns
         -------
-        surface : as it is now
-        begun : whether a job is at it; else there is nothing to do
+        surface : current record
+        pending : whether a job is pending; if not, the surface is up to date
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : it has no frames to build it of.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the map has no frames with poses.
         """
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
@@ -97,23 +97,23 @@ class MapSurfaces:
             elif not surface.wanted:
                 stored.write_surface(connection, row.number, wanted=True, model_id="")
                 surface = stored.find_surface(connection, row.number) or surface
-            begun, blobs = begin_job(connection, row, surface)
-            if begun:
+            pending, blobs = begin_job(connection, row, surface)
+            if pending:
                 record_change(connection, "surface.requested", map_name)
-            told = _surface_record(connection, row, stored.find_surface(connection, row.number))
-            if not begun and not told.frames:
+            record = _surface_record(connection, row, stored.find_surface(connection, row.number))
+            if not pending and not record.frames:
                 raise InvalidRequest(
                     f"Map {row.name!r} has no indexed frame with a pose, so there is no surface. "
                     "Send `pose` with uploads, or edit frames with PATCH."
                 )
         collect_deleted_blobs(self._store, blobs)
-        if begun:
+        if pending:
             self._bell.ring()
-        return told, begun
+        return record, pending
 
     def remove(self, map_name: str) -> None:
-        """Remove the surface of a map; workers build it again only on request. Raise UnknownMap if
-        there is no such map.
+        """Remove the surface of a map, which is rebuilt only on request; raise UnknownMap if the
+        map does not exist.
         """
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
@@ -133,53 +133,58 @@ class MapSurfaces:
         self, map_name: str, parent: str | None = None, level: int = 0,
         cursor: str | None = None, limit: int = 1000,
     ) -> Page[SurfaceTile]:  # fmt: skip
-        """Tiles of a parent frame and level, by column, row and floor.
+        """Return a page of tiles, by column, row and floor.
 
         Parameters
         ----------
-        parent : default: the parent frame of most frames
-        level : 0 for the finest
+        parent : parent frame; None selects that of most frames
+        level : level of the tiles, 0 for the finest
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : a cursor that was not given out.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the service did not issue the cursor.
         """
         beyond = _place_of(cursor)
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
             name = _parent_name(surface, parent)
-            found: list[TileRow] = []
+            rows: list[TileRow] = []
             if surface is not None and name is not None:
-                found = stored.list_tiles(connection, row.number, name, level, beyond, limit + 1)
-        more = "~".join(map(str, found[limit - 1].place)) if len(found) > limit else None
+                rows = stored.list_tiles(connection, row.number, name, level, beyond, limit + 1)
+        more = "~".join(map(str, rows[limit - 1].place)) if len(rows) > limit else None
         items = [
             SurfaceTile(
                 column=one.tile_x, row=one.tile_y, floor=one.tile_z, cells=one.cells,
                 bytes=one.cells * CELL.itemsize, digest=one.digest,
             )
-            for one in found[:limit]
+            for one in rows[:limit]
         ]  # fmt: skip
         return Page[SurfaceTile](items=items, next_cursor=more)
 
     def tile(self, map_name: str, digest: str) -> Output[bytes]:
-        """Return the cells of a tile. Raise UnknownMap or NotFound if the map has no such tile now.
-        The output raises DamagedBlob if the bytes are lost; a worker then makes the tile again.
+        """Return the cells of a tile.
+
+        The output raises DamagedBlob if the bytes are lost; a worker then rebuilds the tile.
+
+        Raises
+        ------
+        UnknownMap, NotFound : If the map does not have the tile any more.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
-            found = None
+            stored_tile = None
             if surface is not None:
-                found = stored.tile_of_digest(connection, row.number, digest)
-        if surface is None or found is None:
+                stored_tile = stored.tile_of_digest(connection, row.number, digest)
+        if surface is None or stored_tile is None:
             raise _unknown_tile(row, digest)
         scale = scale_of(surface)
 
         def make() -> bytes:
             try:
-                return tile_cells(self._store, found, scale).tobytes()
+                return tile_cells(self._store, stored_tile, scale).tobytes()
             except DamagedBlob:
-                self._mend(row, found)
+                self._rebuild_tile(row, stored_tile)
                 raise
 
         return Output(digest, make)
@@ -188,20 +193,20 @@ class MapSurfaces:
         self, map_name: str, spot: Sequence[float], radius: float | None = None,
         parent: str | None = None, cursor: str | None = None, limit: int = 20,
     ) -> Page[SurfaceSighting]:  # fmt: skip
-        """Frames that saw a spot, from the nearest viewpoint on.
+        """Return a page of the frames that saw a spot, nearest viewpoint first.
 
-        A page may hold fewer than `limit` before the last, as each call opens so many artifacts.
+        A page may have fewer than `limit` frames, since a call reads a limited number of frames.
 
         Parameters
         ----------
         spot : x, y, z in the parent frame, metres
-        radius : a frame saw the spot if it saw a point so near, metres; default: two cells
-        parent : default: the parent frame of most frames
+        radius : maximum distance of a frame's point from the spot, metres; default: two cells
+        parent : parent frame; None selects that of most frames
 
         Raises
         ------
-        UnknownMap : no such map.
-        InvalidRequest : a cursor that was not given out, or a radius of more than 64 cells.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the service did not issue the cursor, or the radius exceeds 64 cells.
         """
         beyond = self._store.seals.moment("frame", cursor)
         with self._store.database.read() as connection:
@@ -212,42 +217,42 @@ class MapSurfaces:
         within = _NEAR * surface.cell_m if radius is None else radius
         if not 0 < within <= _NEAREST * surface.cell_m:
             raise InvalidRequest(
-                f"The radius is {within:g} m. Give one above 0 and up to "
+                f"The radius is {within:g} m. Use one above 0 and up to "
                 f"{_NEAREST * surface.cell_m:g} m.",
-                (("radius", "out of its range"),),
+                (("radius", "out of range"),),
             )
         places = _tiles_around(spot, within, surface.cell_m * SIDE)
-        seen: list[SightingFrame] = []
-        opened = 0
-        while len(seen) < limit and opened < _OPENED:
+        hits: list[SightingFrame] = []
+        count = 0
+        while len(hits) < limit and count < _OPENED:
             with self._store.database.read() as connection:
-                some = stored.frames_seeing(
+                block = stored.frames_seeing(
                     connection, surface, name, places, spot, beyond, _AT_ONCE
                 )
-            for one in some:
+            for one in block:
                 beyond = one.square, one.number
-                opened += 1
+                count += 1
                 if self._saw(one, spot, within):
-                    seen.append(one)
-                if len(seen) == limit:
+                    hits.append(one)
+                if len(hits) == limit:
                     break
-            if len(some) < _AT_ONCE and len(seen) < limit:
+            if len(block) < _AT_ONCE and len(hits) < limit:
                 beyond = None
                 break
         more = None if beyond is None else self._moment(beyond)
-        items = [_sighting(one, name, math.sqrt(one.square)) for one in seen]
+        items = [_sighting(one, name, math.sqrt(one.square)) for one in hits]
         return Page[SurfaceSighting](items=items, next_cursor=more)
 
     def frames_in(
         self, map_name: str, low: Sequence[float], high: Sequence[float],
         parent: str | None = None, cursor: str | None = None, limit: int = 20,
     ) -> Page[SurfaceSighting]:  # fmt: skip
-        """Frames taken in a box, the nearest to its middle first; see `sightings`.
+        """Return a page of the frames with viewpoints in a box, those nearest to its centre first.
 
         Parameters
         ----------
         map_name, parent, cursor, limit : see `sightings`
-        low, high : x, y, z of two of its corners, metres
+        low, high : x, y, z of two opposite corners, metres
         """
         beyond = self._store.seals.moment("frame", cursor)
         ends = np.sort([low, high], axis=0).tolist()
@@ -256,47 +261,47 @@ class MapSurfaces:
             name = _parent_name(surface, parent)
             if surface is None or name is None:
                 return Page[SurfaceSighting](items=[])
-            found = stored.frames_taken_in(
+            rows = stored.frames_taken_in(
                 connection, surface, name, ends[0], ends[1], beyond, limit + 1
             )
-        last = found[limit - 1] if len(found) > limit else None
+        last = rows[limit - 1] if len(rows) > limit else None
         more = None if last is None else self._moment((last.square, last.number))
-        items = [_sighting(one, name, None) for one in found[:limit]]
+        items = [_sighting(one, name, None) for one in rows[:limit]]
         return Page[SurfaceSighting](items=items, next_cursor=more)
 
     def picture(
         self, map_name: str, parent: str | None = None, width: int = PLAN_WIDTH,
         low: float | None = None, high: float | None = None,
     ) -> Output[bytes]:  # fmt: skip
-        """A surface seen from above as a PNG, transparent where nothing is.
+        """Return a plan of a surface as a PNG with a transparent background.
 
         Parameters
         ----------
-        parent : default: the parent frame of most frames
-        width : of the longer side, pixels
-        low, high : only what lies between these heights, metres along up
+        parent : parent frame; None selects that of most frames
+        width : longer side, pixels
+        low, high : limits of the heights, metres along the up vector
 
         Raises
         ------
-        UnknownMap : no such map.
-        NotFound : there is no surface in that parent frame.
+        UnknownMap : If the map does not exist.
+        NotFound : If there is no surface in the parent frame.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
             name = _parent_name(surface, parent)
-            told = None
+            record = None
             if surface is not None:
-                told = next((one for one in surface.parents if one["parent_frame"] == name), None)
+                record = next((one for one in surface.parents if one["parent_frame"] == name), None)
             totals = [
                 one for one in stored.level_totals(connection, row.number) if one.parent == name
             ]
-        if surface is None or told is None or not totals:
+        if surface is None or record is None or not totals:
             raise NotFound(
-                f"Map {row.name!r} has no surface in that parent frame. Begin it with "
+                f"Map {row.name!r} has no surface in that parent frame. Start it with "
                 f"POST /v1/maps/{row.name}/surface, and see GET /v1/maps/{row.name}/surface for "
                 "its parent frames."
             )
-        axes = np.array(told["axes"])
+        axes = np.array(record["axes"])
         plan = plan_frame(axes, totals[0].low, totals[0].high, surface.cell_m, width)
         level = _drawn_level(surface, totals, plan)
 
@@ -306,12 +311,12 @@ class MapSurfaces:
             points = (self._points(surface, one) for one in tiles)
             return surface_picture(plan, axes, points, surface.cell_m * FACTOR**level, (low, high))
 
-        tag = tag_of("surface-plan", row.number, surface.updated_at, told["axes"], width, low,
+        tag = tag_of("surface-plan", row.number, surface.updated_at, record["axes"], width, low,
                      high, name)  # fmt: skip
         return Output(tag, make)
 
     def _points(self, surface: SurfaceRow, tile: TileRow) -> Floats:
-        """(N, 3) of a tile, metres; none of one that is lost or was replaced meanwhile."""
+        """Return the points (N, 3) of a tile, metres; none if it is lost or was replaced."""
         try:
             cells = tile_cells(self._store, tile, scale_of(surface))
         except DamagedBlob:
@@ -326,8 +331,8 @@ class MapSurfaces:
         apart = transform_points(np.array(frame.pose), surface_points(geometry)) - np.array(spot)
         return bool(((apart * apart).sum(axis=1) <= within * within).any())
 
-    def _mend(self, row: MapRow, tile: TileRow) -> None:
-        """Have a tile made again whose bytes are lost; NotFound where it was replaced meanwhile."""
+    def _rebuild_tile(self, row: MapRow, tile: TileRow) -> None:
+        """Schedule the rebuild of a lost tile; raise NotFound if it was replaced meanwhile."""
         with self._store.database.write() as connection:
             now = stored.tile_of_number(connection, tile.number)
             if now is None or now.blob != tile.blob:
@@ -338,16 +343,13 @@ class MapSurfaces:
         return self._store.seals.next_moment("frame", [last, last], 1)
 
 
-# Jobs: begun by whoever asks, and by workers as frames come.
-
-
 def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple[bool, list[str]]:
-    """Queue a job where one is needed and none is pending; an earlier one is removed.
+    """Queue a job for a surface that is out of date, unless one is pending; remove the former job.
 
     Returns
     -------
-    begun : whether a job is pending now
-    blobs : of the earlier job: sweep them when this is committed
+    pending : whether a job is pending now
+    blobs : blobs of the former job, to collect after the commit
     """
     job = _job_of(connection, surface)
     if job is not None and not job.state.over:
@@ -378,7 +380,7 @@ def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple
 
 
 def remove_block(store: Store, row: MapRow) -> bool:
-    """Remove some of a surface that was deleted; whether nothing is left of it."""
+    """Remove a block of a deleted surface; return whether nothing is left."""
     with store.database.write(map_number=row.number) as connection:
         surface = stored.find_surface(connection, row.number)
         if surface is None or surface.wanted:
@@ -392,38 +394,41 @@ def remove_block(store: Store, row: MapRow) -> bool:
     return over
 
 
-#: Seconds between two looks at all maps; seconds after which frames are fused although more come.
+#: Seconds between two checks of all maps, and maximum delay of a job while frames are arriving.
 LOOK_S, LONGEST_S = 5.0, 60.0
-#: In place of when a map was first seen: it was looked at, and waits for what comes next.
+#: Replaces the time of the first change of a map whose changes have been handled.
 _DONE = math.inf
-#: Maps that get their rows in one look.
+#: Maximum number of rows of surfaces to add in one check.
 _ROWS_AT_ONCE = 100
 
 
 class SurfaceUpkeep:
-    """Begins jobs for surfaces that lack frames, or, unless `auto`, only for deleted ones; any
-    number of processes may.
+    """Starter of jobs for surfaces that are out of date; any number of processes may run it.
+
+    Parameters
+    ----------
+    auto : whether new frames start jobs, or only deleted ones
     """
 
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:
         self._store, self._bell, self._auto = store, bell, auto
         self._next = 0.0
-        # of maps that may lack something: their revision and edits, and when they were first seen
+        # revision and edits of changed maps, and the time of the first change
         self._seen: dict[int, tuple[tuple[int, int], float]] = {}
 
     def run(self) -> None:
-        """One look, where it is time; what goes wrong is logged and tried again."""
+        """Check all maps if it is due; log errors, after which the next check tries again."""
         if time.monotonic() < self._next:
             return
         self._next = time.monotonic() + LOOK_S
         try:
             with self._store.database.read() as connection:
-                found = stored.maps_to_update(connection)
+                pairs = stored.maps_to_update(connection)
             if self._auto:
-                self._add_rows([row for row, surface in found if surface is None])
+                self._add_rows([row for row, surface in pairs if surface is None])
             seen = self._seen
             self._seen = {}
-            for row, surface in found:
+            for row, surface in pairs:
                 if surface is None:
                     continue
                 if not surface.wanted:
@@ -432,12 +437,12 @@ class SurfaceUpkeep:
                     continue
                 self._look(row, surface, seen.get(row.number))
         except SceneprintError as error:
-            log.warning("surfaces not looked at", extra={"error": str(error)})
+            log.warning("check of surfaces failed", extra={"error": str(error)})
 
     def _look(
         self, row: MapRow, surface: SurfaceRow, seen: tuple[tuple[int, int], float] | None
     ) -> None:
-        """Begin a job where frames came and no more come, or have come for long."""
+        """Start a job once no more frames arrive, or after LONGEST_S."""
         at = row.revision, surface.pose_edits
         changed = seen is None or seen[0] != at
         since = time.monotonic() if seen is None or (changed and seen[1] == _DONE) else seen[1]
@@ -445,7 +450,7 @@ class SurfaceUpkeep:
         if since == _DONE or (changed and time.monotonic() - since < LONGEST_S):
             return
         self._seen[row.number] = at, _DONE
-        with self._store.database.read() as connection:  # most often there is nothing: no lock
+        with self._store.database.read() as connection:  # usually nothing is due, so no lock
             if not self._is_due(connection, row, surface):
                 return
         with self._store.database.write(map_number=row.number) as connection:
@@ -453,19 +458,19 @@ class SurfaceUpkeep:
             now = stored.find_surface(connection, row.number)
             if now is None or not now.wanted:
                 return
-            begun, blobs = begin_job(connection, row, now)
+            pending, blobs = begin_job(connection, row, now)
         collect_deleted_blobs(self._store, blobs)
-        if begun:
+        if pending:
             self._bell.ring()
 
     def _is_due(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
-        """Whether a job is to be begun unasked."""
-        if self._is_hopeless(connection, row, surface):
+        """Return whether to start a job without a request."""
+        if self._has_failed(connection, row, surface):
             return False
         return self._auto or bool(stored.frames_to_remove(connection, surface, 1))
 
-    def _is_hopeless(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
-        """Whether the last job failed with the same frames: somebody must look at it first."""
+    def _has_failed(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
+        """Return whether the last job failed with the same frames; the user has to retry it."""
         job = _job_of(connection, surface)
         if job is None or not job.state.over or job.state == JobState.SUCCEEDED:
             return False
@@ -486,9 +491,6 @@ class SurfaceUpkeep:
                         stored.add_surface(connection, row)
 
 
-# Records.
-
-
 def _job_of(connection: Connection, surface: SurfaceRow) -> JobRow | None:
     if surface.job_number is None:
         return None
@@ -496,7 +498,7 @@ def _job_of(connection: Connection, surface: SurfaceRow) -> JobRow | None:
 
 
 def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | None) -> MapSurface:
-    """A surface as JSON."""
+    """Return the API record of a surface."""
     if surface is None:
         return MapSurface(
             map=row.name, state="none", job_id=None, error=None, frames=0,
@@ -539,13 +541,13 @@ def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | N
 
 
 def _parent_record(
-    surface: SurfaceRow, told: dict[str, Any], totals: Sequence[LevelTotals]
+    surface: SurfaceRow, parent: dict[str, Any], totals: Sequence[LevelTotals]
 ) -> SurfaceParent:
     finest = totals[0]
-    plan = plan_frame(np.array(told["axes"]), finest.low, finest.high, surface.cell_m, PLAN_WIDTH)
+    plan = plan_frame(np.array(parent["axes"]), finest.low, finest.high, surface.cell_m, PLAN_WIDTH)
     return SurfaceParent(
-        parent_frame=told["parent_frame"], frames=told["frames"], up=_vector(told["up"]),
-        up_from=told["up_from"], x_axis=told["axes"][0], y_axis=told["axes"][1],
+        parent_frame=parent["parent_frame"], frames=parent["frames"], up=_vector(parent["up"]),
+        up_from=parent["up_from"], x_axis=parent["axes"][0], y_axis=parent["axes"][1],
         low=_vector(finest.low), high=_vector(finest.high),
         levels=[
             SurfaceLevel(
@@ -564,7 +566,7 @@ def _parent_record(
 
 def _unknown_tile(row: MapRow, digest: str) -> NotFound:
     return NotFound(
-        f"Map {row.name!r} has no tile {digest!r:.80}: it changed, or was removed. List tiles with "
+        f"Map {row.name!r} has no tile {digest!r:.80}: it changed or was removed. List tiles with "
         f"GET /v1/maps/{row.name}/surface/tiles."
     )
 
@@ -583,7 +585,7 @@ def _vector(at: Sequence[float]) -> Vector:
 
 
 def _parent_name(surface: SurfaceRow | None, parent: str | None) -> str | None:
-    """The parent frame that was asked for, or that of most frames."""
+    """Return the requested parent frame, or that of most frames."""
     if parent is not None or surface is None:
         return parent
     return surface.parents[0]["parent_frame"] if surface.parents else None
@@ -602,7 +604,7 @@ def _place_of(cursor: str | None) -> TilePlace | None:
 
 
 def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[TilePlace]:
-    """Places of the tiles that a ball may touch."""
+    """Return the places of the tiles that a ball may touch."""
     low = [math.floor((at - within) / tile_m) for at in spot]
     high = [math.floor((at + within) / tile_m) for at in spot]
     x, y, z = (range(a, b + 1) for a, b in zip(low, high, strict=True))
@@ -610,7 +612,7 @@ def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[T
 
 
 def _drawn_level(surface: SurfaceRow, totals: Sequence[LevelTotals], plan: PlanFrame) -> int:
-    """The coarsest level that is as fine as the pixels; a coarser one of very many cells."""
+    """Return the coarsest level as fine as the pixels, or a coarser one for too many cells."""
     fine = [one for one in totals if surface.cell_m * FACTOR**one.level <= plan.m_per_pixel]
     first = fine[-1].level if fine else 0
     few = [one.level for one in totals if one.level >= first and one.cells <= _DRAWN_CELLS]

@@ -1,12 +1,11 @@
-"""Selected frames of a map, or a whole session, edited or deleted.
+"""Edits and deletions of selected frames or of whole sessions.
 
 map, FrameSelection  --delete_selection-->  FramesDeleted
-map, FramesEdit  --edit_selection-->  FramesEdited, with the edits that undo it
+map, FramesEdit  --edit_selection-->  FramesEdited, with the inverse edits
 map, session  --delete_session | edit_session-->  SessionChange
 
-Frames are written some at a time, each block in a transaction of its own, as writers wait
-meanwhile. What is interrupted can be called again and goes on where it stopped; a call that is
-repeated finds nothing left to do.
+Each block of frames has its own transaction, since other writers wait for it. An interrupted call
+can be repeated and continues with the remaining frames.
 """
 
 from __future__ import annotations
@@ -41,35 +40,35 @@ from sceneprint_client.api.listing import (
 
 
 def delete_selection(
-    store: Store, map_name: str, wanted: FrameSelection, tombstones: Tombstones,
+    store: Store, map_name: str, selection: FrameSelection, tombstones: Tombstones,
     seconds: float = CALL_S,
 ) -> FramesDeleted:  # fmt: skip
-    """Delete selected frames until none is left or the time is over.
+    """Delete selected frames in blocks.
 
     Parameters
     ----------
-    wanted : which frames
-    tombstones : that the frames become
-    seconds : after which no further block is begun
+    selection : frames to delete
+    tombstones : store of the deleted frames
+    seconds : duration after which no further block is started
 
     Raises
     ------
-    UnknownMap : there is none.
+    UnknownMap : If the map does not exist.
     """
     until, deleted, last = time.monotonic() + seconds, 0, 0
     deletion: int | None = None
     while True:
         with store.database.write() as connection:
             row = find_map(connection, map_name)
-            some = _selected(connection, row, wanted, last, AT_ONCE)
+            block = _selected(connection, row, selection, last, AT_ONCE)
             deletion = deletion or tombstones.begin(row)
-            numbers = [one.number for one in some]
+            numbers = [one.number for one in block]
             blobs = delete_frames(connection, row, numbers, deletion=deletion)
             last = numbers[-1] if numbers else last
-            left = _count(connection, row, wanted, last)
+            left = _count(connection, row, selection, last)
             record = tombstones.find(connection, row, deletion)
         collect_deleted_blobs(store, blobs)
-        deleted += len(some)
+        deleted += len(block)
         if not left or time.monotonic() >= until:
             break
     return FramesDeleted(map=row.name, frames=deleted, remaining=left, deletion=record)
@@ -78,18 +77,17 @@ def delete_selection(
 def edit_selection(
     store: Store, map_name: str, edit: FramesEdit, seconds: float = CALL_S
 ) -> FramesEdited:
-    """Edit selected frames, 1000 of them at most, until none is left or the time is over.
+    """Edit at most 1000 selected frames in blocks.
 
     Parameters
     ----------
     store, map_name, seconds : see `delete_selection`
-    edit : which frames, and what to change
+    edit : selection and changes
 
     Raises
     ------
-    UnknownMap, UnknownFrame : there is none; of the frame `after`.
-    InvalidRequest : a frame would have more tags than it may have. The frames before it are
-        changed.
+    UnknownMap, UnknownFrame : If the map or the frame `after` does not exist.
+    InvalidRequest : If a frame would get too many tags; earlier frames remain edited.
     """
     until, done, changed = time.monotonic() + seconds, 0, 0
     inverse: dict[str, dict[str, Any]] = {}
@@ -100,12 +98,12 @@ def edit_selection(
     while True:
         with store.database.write() as connection:
             row = find_map(connection, map_name)
-            some = _selected(connection, row, edit, last, AT_ONCE)
-            for frame in some:
+            block = _selected(connection, row, edit, last, AT_ONCE)
+            for frame in block:
                 changed += _edit(connection, row, frame, edit, inverse)
                 last, last_id = frame.number, frame.id
             left = _count(connection, row, edit, last)
-        done += len(some)
+        done += len(block)
         if not left or done >= MOST_SELECTED or time.monotonic() >= until:
             break
     return FramesEdited(
@@ -115,13 +113,13 @@ def edit_selection(
 
 
 def edited_tags(frame: FrameRow, edit: FramesEdit | SessionEdit) -> list[str]:
-    """Return the tags of a frame after an edit; raise InvalidRequest if they are too many."""
-    gone = set(edit.remove_tags)
-    tags = [tag for tag in frame.tags if tag not in gone]
+    """Return the tags of a frame after an edit; raise InvalidRequest if there are too many."""
+    removed = set(edit.remove_tags)
+    tags = [tag for tag in frame.tags if tag not in removed]
     tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]
     if len(tags) > MOST_TAGS:
         raise InvalidRequest(
-            f"Frame {frame.id} would have {len(tags)} tags, and a frame has at most "
+            f"Frame {frame.id} would have {len(tags)} tags, but a frame can have at most "
             f"{MOST_TAGS}. Remove some with `remove_tags`.",
             (("add_tags", "too many"),),
         )
@@ -132,7 +130,7 @@ def _edit(
     connection: Connection, row: MapRow, frame: FrameRow, edit: FramesEdit,
     inverse: dict[str, dict[str, Any]],
 ) -> int:  # fmt: skip
-    """Edit a frame, and add to what undoes it; 0 where it was so already."""
+    """Edit a frame, and add the inverse edit to `inverse`; return the number of changed frames."""
     values: dict[str, Any] = {}
     for name in ("session", "robot"):
         if name in edit.model_fields_set:
@@ -154,49 +152,45 @@ def _edit(
 
 
 def _selected(
-    connection: Connection, row: MapRow, wanted: FrameSelection, after: int, limit: int
+    connection: Connection, row: MapRow, selection: FrameSelection, after: int, limit: int
 ) -> list[FrameRow]:
-    """The next selected frames, in the order they came."""
-    if wanted.filter is not None:
+    """Return the next selected frames in the order of uploads."""
+    if selection.filter is not None:
         beyond = TakenPosition(after, None, None)
-        return list_frames(connection, row.number, beyond, limit, _in_order(wanted))
-    asked = select(frames).where(
-        frames.c.map_number == row.number, frames.c.id.in_(wanted.frame_ids or []),
+        return list_frames(connection, row.number, beyond, limit, _in_order(selection))
+    statement = select(frames).where(
+        frames.c.map_number == row.number, frames.c.id.in_(selection.frame_ids or []),
         frames.c.state != FrameState.DELETED, frames.c.number > after,
     )  # fmt: skip
-    found = connection.execute(asked.order_by(frames.c.number).limit(limit)).mappings()
-    return [frame_row(one) for one in found]
+    rows = connection.execute(statement.order_by(frames.c.number).limit(limit)).mappings()
+    return [frame_row(one) for one in rows]
 
 
-def _count(connection: Connection, row: MapRow, wanted: FrameSelection, after: int) -> int:
-    """How many selected frames come after one."""
-    if wanted.filter is not None:
-        return count_listed(connection, row.number, _in_order(wanted), after)
-    return len(_selected(connection, row, wanted, after, MOST_SELECTED))
+def _count(connection: Connection, row: MapRow, selection: FrameSelection, after: int) -> int:
+    """Return the number of selected frames after one."""
+    if selection.filter is not None:
+        return count_listed(connection, row.number, _in_order(selection), after)
+    return len(_selected(connection, row, selection, after, MOST_SELECTED))
 
 
-def _in_order(wanted: FrameSelection) -> Any:
-    return None if wanted.filter is None else wanted.filter.model_copy(update={"order": "asc"})
-
-
-# A session as a whole: renamed, tagged, or deleted with all its frames.
+def _in_order(chosen: FrameSelection) -> Any:
+    return None if chosen.filter is None else chosen.filter.model_copy(update={"order": "asc"})
 
 
 def delete_session(
     store: Store, map_name: str, session: str, tombstones: Tombstones, robot: str | None = None,
     seconds: float = CALL_S,
 ) -> SessionChange:  # fmt: skip
-    """Delete frames of a session, in whatever state, until none is left or the time is over.
+    """Delete frames of a session, in any state, in blocks.
 
     Parameters
     ----------
-    tombstones : that the frames become
-    robot : only those that it took; None for those of all robots
-    seconds : after which no further block is begun
+    robot : robot of the frames; None selects all robots
+    tombstones, seconds : see `delete_selection`
 
     Raises
     ------
-    UnknownMap, UnknownSession : there is none.
+    UnknownMap, UnknownSession : If the map or the session does not exist.
     """
     done = delete_selection(store, map_name, _of_session(session, robot), tombstones, seconds)
     _require_frames(done.frames, map_name, session, robot)
@@ -207,38 +201,37 @@ def edit_session(
     store: Store, map_name: str, session: str, edit: SessionEdit, robot: str | None = None,
     after: str | None = None, seconds: float = CALL_S,
 ) -> SessionChange:  # fmt: skip
-    """Rename a session or its robot, and add or remove tags, on all its frames.
+    """Change the name, the robot and the tags of a session's frames in blocks.
 
-    A name that another session has joins the two. Poses and their parent frames stay.
+    Renaming a session to an existing name merges the two. Poses and their parent frames remain.
 
     Parameters
     ----------
     store, map_name, session, robot, seconds : see `delete_session`
-    edit : what to change
-    after : id of the last frame of an earlier call, to go on from there
+    edit : changes
+    after : id of the last frame of an earlier call, after which this one continues
 
     Returns
     -------
-    change : with the names afterwards, and how many frames were gone through
+    change : new names, and the number of processed frames
 
     Raises
     ------
-    UnknownMap, UnknownSession, UnknownFrame : there is none.
-    InvalidRequest : a frame would have more tags than it may have. The frames before it are
-        changed.
+    UnknownMap, UnknownSession, UnknownFrame : If the map, the session or the frame does not exist.
+    InvalidRequest : If a frame would get too many tags; earlier frames remain edited.
     """
     until, done, at = time.monotonic() + seconds, 0, after
-    wanted = _of_session(session, robot)
+    selection = _of_session(session, robot)
     while True:
         with store.database.write() as connection:
             row = find_map(connection, map_name)
             last = 0 if at is None else find_frame(connection, row, at).number
-            some = _selected(connection, row, wanted, last, AT_ONCE)
-            for frame in some:
+            block = _selected(connection, row, selection, last, AT_ONCE)
+            for frame in block:
                 write_frame(connection, row, frame, _values(frame, edit))
                 at, last = frame.id, frame.number
-            left = _count(connection, row, wanted, last)
-        done += len(some)
+            left = _count(connection, row, selection, last)
+        done += len(block)
         if not left or time.monotonic() >= until:
             break
     if after is None:
@@ -250,7 +243,7 @@ def edit_session(
 
 
 def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
-    """Columns of a frame that an edit asks for."""
+    """Return the columns of a frame after an edit."""
     values: dict[str, object] = {}
     if edit.session is not None:
         values["session"] = edit.session
@@ -262,10 +255,10 @@ def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
 
 
 def _of_session(session: str, robot: str | None) -> FrameSelection:
-    """Return the selection of a session, whose name no rule for new names applies to."""
+    """Return the selection of a session, without validation, since old names may be invalid."""
     robots = [] if robot is None else [robot]
-    wanted = FrameListing.model_construct(session=[session], robot=robots)
-    return FrameSelection.model_construct(filter=wanted)
+    listing = FrameListing.model_construct(session=[session], robot=robots)
+    return FrameSelection.model_construct(filter=listing)
 
 
 def _require_frames(count: int, map_name: str, session: str, robot: str | None) -> None:

@@ -1,11 +1,11 @@
-"""The surface of a map, made and kept up to date: a job in slices.
+"""Jobs that build and update the surface of a map in slices.
 
-    frames that came              -->  added to the tiles they touch
-    frames that went or moved     -->  their tiles made anew from the other frames that touch them
+    new frames                -->  fused into the tiles that they touch
+    deleted or moved frames   -->  their tiles rebuilt from the other frames that touch them
 
-Each slice does one of these for some frames, and stores the tiles with what it did in one commit.
-So a tile is at any time that of the frames that are noted as fused, and a job that is lost goes on
-where its last slice ended.
+Each slice handles some frames, and stores the tiles and its progress in one commit. Therefore tiles
+always consist of the frames that are recorded as fused, and an interrupted job continues after its
+last slice.
 """
 
 from __future__ import annotations
@@ -50,38 +50,36 @@ from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.surface_encoding import CELL, NO_SESSION, SIDE, STEPS
 
-#: Kind of the jobs, and of the event that tells of their end.
+#: Kind of the jobs, and kind of the event at their end.
 SURFACE, UPDATED = "surface", "surface.updated"
-#: Seconds that a slice fuses frames; writing its tiles takes about as long.
+#: Seconds for which a slice fuses frames; writing its tiles takes about as long.
 SLICE_S = 1.5
-#: Levels of a surface, and the width of the finest cells in voxels of the map's model.
+#: Number of levels of a surface, and width of the finest cells in voxels of the map's model.
 LEVELS, VOXELS = 3, 2.5
-#: Parent frames that are told of: those of most frames. Sessions that cells tell apart.
+#: Maximum numbers of parent frames in a record, and of sessions that cells distinguish.
 MOST_PARENTS, MOST_SESSIONS = 20, 10_000
-#: Frames looked up at once; frames taken out in one slice.
-_FRAMES, _TAKEN_OUT = 256, 500
-#: What a slice holds at most: tiles that are changed, and cells of frames or tiles.
+#: Numbers of frames to read at once, and to remove in one slice.
+_FRAMES, _REMOVED = 256, 500
+#: Maximum numbers of changed tiles, and of cells of frames or tiles, in a slice.
 _TILES, _CELLS = 96, 1_500_000
 
 
 def cell_width(voxel_m: float) -> float:
-    """Width of the finest cells for a model of such voxels, metres."""
+    """Return the width of the finest cells for a model with voxels of this width, metres."""
     return float(np.clip(VOXELS * voxel_m, 1e-3, 100.0))
 
 
 def surface_points(geometry: Geometry) -> Floats:
-    """(N, 3) all points that a frame's artifact has, in its sensor's axes."""
-    found = geometry.surface.points[geometry.surface.valid]
+    """Return all points (N, 3) of a geometry in the sensor frame."""
+    points = geometry.surface.points[geometry.surface.valid]
     if geometry.surface.spread is not None:
         spread = geometry.surface.spread
-        found = np.concatenate([found, spread.points[spread.valid]])
-    return found.astype(np.float64)
+        points = np.concatenate([points, spread.points[spread.valid]])
+    return points.astype(np.float64)
 
 
 def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
-    """Return a tile as clients receive it, its sums encoded at the finest level; raise DamagedBlob
-    if it is lost or damaged.
-    """
+    """Return the cells of a tile as clients receive them; raise DamagedBlob if they are lost."""
     data = store.blobs.get(tile.blob or "")
     if tile.level:
         return np.frombuffer(data, CELL)
@@ -89,26 +87,26 @@ def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
 
 
 def scale_of(surface: SurfaceRow) -> TimeScale | None:
-    """How the tiles of a surface tell times; None where no frame had one."""
+    """Return the scale of times in the tiles of a surface; None if no frame has a time."""
     if surface.taken_from is None:
         return None
     return TimeScale(surface.taken_from, surface.taken_step_s)
 
 
-#: Parent frame, and place, of a tile.
+#: Parent frame and place of a tile.
 _Key = tuple[str, TilePlace]
 
 
 @dataclass
 class _Slice:
-    """What a slice is about to store.
+    """The changes of a slice.
 
     Parameters
     ----------
-    tiles : columns of tiles by parent frame, level and place; None of those that are empty now
-    damaged : tiles of the finest level that must be made anew
-    unread : of coarser levels, which must be made anew from the finest
-    blobs : that are there, and that `tiles` refers to
+    tiles : columns of tiles by parent frame, level and place; None for tiles that are now empty
+    damaged : damaged tiles of the finest level, to rebuild from frames
+    unread : damaged tiles of coarser levels, to rebuild from the finest level
+    blobs : new blobs that `tiles` refers to
     """
 
     tiles: dict[tuple[str, int, TilePlace], dict[str, Any] | None] = field(default_factory=dict)
@@ -117,16 +115,16 @@ class _Slice:
     blobs: list[str] = field(default_factory=list)
 
     def store(self, connection: Connection, map_number: int) -> tuple[dict[_Key, int], list[str]]:
-        """Write the tiles; numbers of those of the finest level, and blobs of no use any more."""
+        """Write the tiles; return numbers of those of the finest level, and unused blobs."""
         numbers: dict[_Key, int] = {}
-        left: list[str] = []
+        unused: list[str] = []
         for (parent, level, place), values in self.tiles.items():
             if values is None:
-                gone = stored.tiles_at(connection, map_number, parent, level, [place])
-                left += stored.remove_tiles(connection, list(gone.values()))
+                empty = stored.tiles_at(connection, map_number, parent, level, [place])
+                unused += stored.remove_tiles(connection, list(empty.values()))
                 continue
             number, blobs = stored.write_tile(connection, map_number, parent, level, place, values)
-            left += blobs
+            unused += blobs
             if level == 0:
                 numbers[parent, place] = number
         for parent, place in self.damaged:
@@ -134,22 +132,22 @@ class _Slice:
                 connection, map_number, parent, 0, place,
                 {"rebuilt_to": 0, "scale": stored.NO_SCALE},
             )  # fmt: skip
-            left += blobs
+            unused += blobs
             numbers[parent, place] = number
         for parent, level, place in self.unread:
             stored.forget_scale(connection, map_number, parent, place, FACTOR**level)
-        doom(connection, left)
-        return numbers, left
+        doom(connection, unused)
+        return numbers, unused
 
 
 class SurfaceHandler:
-    """Does the jobs."""
+    """Handler of jobs that update surfaces."""
 
     def __init__(self, store: Store, signers: Signers) -> None:
         self._store, self._signers = store, signers
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """A slice: some frames added or taken out, some tiles made anew, or the conclusion."""
+        """Run a slice: add or remove frames, rebuild tiles, or conclude the job."""
         is_over = ends_within(is_over, SLICE_S)
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
@@ -163,8 +161,8 @@ class SurfaceHandler:
             progress |= {"done": 0, "after": 0, "checked": False}
             with self._store.database.read() as connection:
                 progress["total"] = stored.count_left(connection, surface)
-        if not progress["checked"]:  # all of them first: tiles are made anew once
-            return self._take_out(surface, progress)
+        if not progress["checked"]:  # all removals first, so that tiles are rebuilt once
+            return self._remove_frames(surface, progress)
         with self._store.database.read() as connection:
             rebuilt = stored.tiles_to_rebuild(connection, row.number, _TILES)
         if rebuilt:
@@ -178,13 +176,11 @@ class SurfaceHandler:
         if new:
             return self._add(row, surface, progress, new, is_over)
         if progress["after"]:
-            return SliceResult(False, progress | {"after": 0})  # of lower numbers, edited since
+            return SliceResult(False, progress | {"after": 0})  # for edited earlier frames
         return self._conclude(row, surface, progress)
 
-    # kinds of slices
-
     def _reset(self, row: MapRow, surface: SurfaceRow, task: LongJob) -> SliceResult:
-        """Remove what was made with another model, some at a time, and begin."""
+        """Remove a block of tiles of another model; reset the surface after the last block."""
         cell_m = cell_width(self._signers(row.model_id).model.parameters.cloud.voxel_size)
 
         def write(connection: Connection) -> Collection[str]:
@@ -199,10 +195,10 @@ class SurfaceHandler:
 
         return SliceResult(False, dict(task.progress), write=write)
 
-    def _take_out(self, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Frames that are gone or were edited: the tiles they touch are made anew next."""
+    def _remove_frames(self, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
+        """Remove deleted and edited frames, and schedule the rebuild of their tiles."""
         with self._store.database.read() as connection:
-            numbers = stored.frames_to_remove(connection, surface, _TAKEN_OUT)
+            numbers = stored.frames_to_remove(connection, surface, _REMOVED)
         if not numbers:
             return SliceResult(False, progress | {"checked": True})
 
@@ -211,13 +207,13 @@ class SurfaceHandler:
             return ()
 
         progress["done"] += len(numbers)
-        return SliceResult(False, _told(progress), write=write)
+        return SliceResult(False, _with_total(progress), write=write)
 
     def _rebuild(
         self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow],
         is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        """Make tiles anew from the frames that touch them, as far as the time goes."""
+        """Rebuild tiles from the frames that touch them, while time allows."""
         tiles = _first_cells(tiles)
         last = tiles[0].rebuilt_to or 0
         sums: dict[_Key, list[CellSums]] = {}
@@ -227,22 +223,22 @@ class SurfaceHandler:
                 try:
                     data = self._store.blobs.get(tile.draft)
                 except DamagedBlob:
-                    return _again(surface, progress, [(tile.parent, tile.place)])
+                    return _restart(surface, progress, [(tile.parent, tile.place)])
                 sums[tile.parent, tile.place] = [np.frombuffer(data, CELL_SUM)]
         numbers, over = [one.number for one in tiles], False
         sessions = _Sessions(surface.sessions)
         while not over:
             with self._store.database.read() as connection:
                 touching = stored.frames_touching(connection, numbers, last, _FRAMES)
-                found = stored.fused_frames(connection, surface, touching)
+                frames = stored.fused_frames(connection, surface, touching)
             over = len(touching) < _FRAMES
-            for one in found:
+            for one in frames:
                 for key, cells in self._cells(surface, one, sessions).items():
                     if key in sums:
                         sums[key].append(cells)
                 last = one.number
                 if is_over():
-                    over = over and one is found[-1]
+                    over = over and one is frames[-1]
                     break
             else:
                 last = touching[-1] if touching else last
@@ -262,7 +258,7 @@ class SurfaceHandler:
     def _rescale(
         self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow]
     ) -> SliceResult:
-        """Give out tiles again with times as the surface tells them now."""
+        """Encode tiles again with the current time scale of the surface."""
         done = _Slice()
         self._publish(surface, self._sums_of(_first_cells(tiles), done), done)
         return self._result(surface, progress, done, _Sessions(surface.sessions))
@@ -271,7 +267,7 @@ class SurfaceHandler:
         self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any],
         new: Sequence[FusedFrame], is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        """Fuse frames into the tiles they touch, as far as the time goes."""
+        """Fuse frames into the tiles that they touch, while time allows."""
         times = [one.captured_at for one in new if one.captured_at is not None]
         scale = scale_of(surface)
         if times and (scale is None or not scale.holds(min(times), max(times))):
@@ -295,7 +291,7 @@ class SurfaceHandler:
         for key, sums in self._sums_of(before, done).items():
             parts[key].append(sums)
         for key in done.damaged:
-            del parts[key]  # made anew from all that touch it
+            del parts[key]  # rebuilt from all frames that touch it
         changed = {key: fuse_cells(own) for key, own in parts.items()}
         self._publish(surface, changed, done)
         progress["after"] = added[-1].number
@@ -303,7 +299,7 @@ class SurfaceHandler:
         return self._result(surface, progress, done, sessions, _Addition(row, added, touches))
 
     def _change_scale(self, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Tell times otherwise: a frame was taken before or after those that can be told."""
+        """Extend the time scale of a surface to frames outside of its range."""
 
         def write(connection: Connection) -> Collection[str]:
             times = stored.taken_range(connection, surface)
@@ -318,7 +314,7 @@ class SurfaceHandler:
         return SliceResult(False, progress, write=write)
 
     def _conclude(self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """The end, where nothing came, went or was edited meanwhile; else once more."""
+        """Return the end of the job, or another slice if frames have changed meanwhile."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
             now = stored.find_surface(connection, row.number)
@@ -344,37 +340,35 @@ class SurfaceHandler:
         result = {"frames": frames, "tiles": sum(one.tiles for one in totals)}
         return SliceResult(True, progress, result=result, event=UPDATED, write=write)
 
-    # what they share
-
     def _cells(
         self, surface: SurfaceRow, frame: FusedFrame, sessions: _Sessions
     ) -> dict[_Key, CellSums]:
-        """What a frame saw, by tile; nothing of one whose artifact is lost or damaged."""
+        """Return the cells of a frame by tile; none if its geometry is lost or damaged."""
         try:
             geometry = read_geometry(self._store.blobs.get(frame.geometry))
         except (DamagedBlob, UnreadableGeometry):
             return {}
         points = transform_points(np.array(frame.pose), surface_points(geometry))
         stamp = ViewStamp(frame.number, frame.captured_at, sessions.index(frame.session))
-        found = view_cells(points, surface.cell_m, stamp)
-        return {(frame.parent, place): cells for place, cells in found.items()}
+        tiles = view_cells(points, surface.cell_m, stamp)
+        return {(frame.parent, place): cells for place, cells in tiles.items()}
 
     def _sums_of(self, tiles: Iterable[TileRow], done: _Slice) -> dict[_Key, CellSums]:
-        """Sums of tiles; those that are damaged are noted."""
-        found: dict[_Key, CellSums] = {}
+        """Return the sums of tiles, and add damaged tiles to `done.damaged`."""
+        sums: dict[_Key, CellSums] = {}
         for tile in tiles:
             key = tile.parent, tile.place
             if tile.blob is None or tile.rebuilt_to is not None:
                 done.damaged.append(key)
                 continue
             try:
-                found[key] = np.frombuffer(self._store.blobs.get(tile.blob), CELL_SUM)
+                sums[key] = np.frombuffer(self._store.blobs.get(tile.blob), CELL_SUM)
             except DamagedBlob:
                 done.damaged.append(key)
-        return found
+        return sums
 
     def _publish(self, surface: SurfaceRow, changed: Mapping[_Key, CellSums], done: _Slice) -> None:
-        """Put tiles of the finest level, and what of the coarser ones changes with them."""
+        """Store tiles of the finest level, and update the coarser levels."""
         scale = scale_of(surface)
         parts: dict[_Key, Cells] = {}
         for (parent, place), rows in changed.items():
@@ -394,7 +388,7 @@ class SurfaceHandler:
     def _publish_coarser(
         self, surface: SurfaceRow, level: int, parts: Mapping[_Key, Cells], done: _Slice
     ) -> dict[_Key, Cells]:
-        """Put tiles of a level of which parts changed; returns what changes of the next level."""
+        """Store changed tiles of a coarser level; return the changed parts of the next level."""
         groups: dict[_Key, dict[TilePlace, Cells]] = {}
         for (parent, place), cells in parts.items():
             x, y, z = (one // FACTOR for one in place)
@@ -407,10 +401,10 @@ class SurfaceHandler:
         above: dict[_Key, Cells] = {}
         for key, changed in groups.items():
             parent, place = key
-            kept = self._coarse_cells(before.get(key), done)
+            cells_before = self._coarse_cells(before.get(key), done)
             for part in changed:
-                kept = remove_tile(kept, part)
-            cells = merge_cells(kept, np.concatenate(list(changed.values())))
+                cells_before = remove_tile(cells_before, part)
+            cells = merge_cells(cells_before, np.concatenate(list(changed.values())))
             above[key] = coarsen_cells({place: cells})
             done.tiles[parent, level, place] = None
             if len(cells):
@@ -449,12 +443,12 @@ class SurfaceHandler:
             stored.write_surface(connection, surface.map_number, **values)
             return left
 
-        return SliceResult(False, _told(progress), write=write, blobs=done.blobs)
+        return SliceResult(False, _with_total(progress), write=write, blobs=done.blobs)
 
 
 @dataclass(frozen=True)
 class _Addition:
-    """Frames that a slice added to a map's surface, and the tiles that each touches."""
+    """Frames that a slice adds to a surface, and the tiles that they touch."""
 
     row: MapRow
     frames: list[FusedFrame]
@@ -462,14 +456,14 @@ class _Addition:
 
 
 class _Sessions:
-    """Names of sessions by the index that cells have of them; new ones come last."""
+    """Names of sessions by their index in cells; new names are appended."""
 
     def __init__(self, known: Sequence[str]) -> None:
         self.names = list(known)
         self._index = {name: i for i, name in enumerate(known)}
 
     def index(self, name: str | None) -> int:
-        """The index of a session; NO_SESSION without one, and of those beyond MOST_SESSIONS."""
+        """Return the index of a session; NO_SESSION without a name or beyond MOST_SESSIONS."""
         if name is None or (name not in self._index and len(self.names) >= MOST_SESSIONS):
             return NO_SESSION
         if name not in self._index:
@@ -481,32 +475,35 @@ class _Sessions:
 def parent_records(
     connection: Connection, row: MapRow, known: Mapping[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return the parent frames of a surface by their number of frames, with their up. Those that
-    are `known` keep up and axes.
+    """Return the records of a surface's parent frames, those with the most frames first.
+
+    Parameters
+    ----------
+    known : earlier records by name, whose axes and up vectors are reused
     """
     counts = stored.count_fused(connection, row.number)
     names = sorted(counts, key=lambda name: (-counts[name], name))[:MOST_PARENTS]
-    found = []
+    records = []
     for name in names:
-        told = known.get(name)
-        if told is None:
+        record = known.get(name)
+        if record is None:
             some = stored.spread_fused(connection, row.number, name, 200)
-            seen = parent_axes(connection, row, some)
-            told = {
-                "parent_frame": name, "axes": seen.axes.tolist(), "up_from": seen.up_from,
-                "up": np.cross(seen.axes[0], seen.axes[1]).tolist(),
+            view = parent_axes(connection, row, some)
+            record = {
+                "parent_frame": name, "axes": view.axes.tolist(), "up_from": view.up_from,
+                "up": np.cross(view.axes[0], view.axes[1]).tolist(),
             }  # fmt: skip
-        found.append(told | {"frames": counts[name]})
-    return found
+        records.append(record | {"frames": counts[name]})
+    return records
 
 
-def _told(progress: dict[str, Any]) -> dict[str, Any]:
-    """Progress; more may have come than was counted at first."""
+def _with_total(progress: dict[str, Any]) -> dict[str, Any]:
+    """Return the progress with a total that includes frames which were added during the job."""
     return progress | {"total": max(progress["total"], progress["done"])}
 
 
-def _again(surface: SurfaceRow, progress: dict[str, Any], keys: Sequence[_Key]) -> SliceResult:
-    """Make tiles anew from the first frame on."""
+def _restart(surface: SurfaceRow, progress: dict[str, Any], keys: Sequence[_Key]) -> SliceResult:
+    """Return a slice that schedules the rebuild of tiles from the first frame on."""
     done = _Slice(damaged=list(keys))
 
     def write(connection: Connection) -> Collection[str]:
@@ -516,7 +513,7 @@ def _again(surface: SurfaceRow, progress: dict[str, Any], keys: Sequence[_Key]) 
 
 
 def _first_cells(tiles: Sequence[TileRow]) -> list[TileRow]:
-    """As many of some tiles as there is room for, and at least one."""
+    """Return the first tiles with at most _CELLS cells, at least one."""
     room = np.cumsum([one.cells for one in tiles]) <= _CELLS
     return list(tiles[: max(int(room.sum()), 1)])
 
@@ -524,7 +521,7 @@ def _first_cells(tiles: Sequence[TileRow]) -> list[TileRow]:
 def _tiles_of(
     connection: Connection, surface: SurfaceRow, keys: Iterable[_Key], level: int = 0
 ) -> list[TileRow]:
-    """Those of some tiles that are there."""
+    """Return the existing tiles at some places."""
     places: dict[str, list[TilePlace]] = {}
     for parent, place in keys:
         places.setdefault(parent, []).append(place)
@@ -538,7 +535,7 @@ def _tiles_of(
 
 
 def _columns(surface: SurfaceRow, level: int, place: TilePlace, cells: Cells) -> dict[str, Any]:
-    """Columns of a tile that tell of its cells."""
+    """Return the columns of a tile that depend on its cells."""
     tile_m = surface.cell_m * FACTOR**level * SIDE
     at = cells["at"].astype(np.int64)
     low = (np.array(place) + at.min(axis=0) / STEPS) * tile_m

@@ -1,4 +1,4 @@
-"""Deleted frames: restored while their deletion can be undone, and purged afterwards."""
+"""Tombstones of deleted frames, which can be restored for a while and are purged afterwards."""
 
 from __future__ import annotations
 
@@ -29,29 +29,32 @@ from sceneprint.store.tombstones import (
 from sceneprint_client.api import Page
 from sceneprint_client.api.listing import MOST_REFUSED, FrameDeletion, FramesRestored, RefusedFrame
 
-#: Frames deleted, edited or restored in one transaction: other writers wait for some 20 ms.
+#: Maximum number of frames to change in one transaction, for which other writers wait 20 ms.
 AT_ONCE = 100
-#: Seconds after which a call ends with what is left.
+#: Maximum duration of a call in seconds; it returns the number of remaining frames.
 CALL_S = 10.0
 #: Ids of deletions, which fit into 64 bits.
 _NUMBER = re.compile("[0-9]{1,18}")
 
 
 class Tombstones:
-    """Deletes frames, restores them, and purges them when their time is over.
+    """Deletion, restoration and purge of frames.
 
     Parameters
     ----------
-    seconds : for which deleted frames can be restored; 0: no deletion can be undone
-    wake : called when frames wait to be signed
+    seconds : duration for which deleted frames can be restored; 0 disables restoration
+    wake : function that is called when restored frames wait for a signature
     """
 
     def __init__(self, store: Store, seconds: float, wake: Callable[[], None]) -> None:
         self._store, self._seconds, self._wake = store, seconds, wake
 
     def begin(self, row: MapRow) -> int | None:
-        """Return the number of a deletion that begins now; None if it cannot be undone. `row` is
-        the map as the writing transaction reads it.
+        """Return the number of a new deletion; None if it cannot be undone.
+
+        Parameters
+        ----------
+        row : row of the map, read in the writing transaction
         """
         return row.revision + 1 if self._seconds > 0 else None
 
@@ -64,28 +67,36 @@ class Tombstones:
         collect_deleted_blobs(self._store, blobs)
 
     def find(self, connection: Connection, row: MapRow, number: int | None) -> FrameDeletion | None:
-        """Return the deletion of a number, if it can be undone."""
+        """Return a deletion; None if it does not exist or cannot be undone."""
         if number is None:
             return None
-        found = find_deletion(connection, row.number, self._seconds, number)
-        return None if found is None else self._record(found)
+        deletion = find_deletion(connection, row.number, self._seconds, number)
+        return None if deletion is None else self._record(deletion)
 
     def list_all(self, map_name: str, cursor: str | None, limit: int) -> Page[FrameDeletion]:
-        """Return a page of the deletions that can be undone, newest first. Raise UnknownMap, and
-        InvalidRequest for a cursor that was not issued.
+        """Return a page of the deletions that can be undone, newest first.
+
+        Raises
+        ------
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the service did not issue the cursor.
         """
         before = self._store.seals.row("deletion", cursor)
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-            found = list_deletions(connection, row.number, self._seconds, limit + 1, before)
-        more = self._store.seals.next_cursor("deletion", [one.number for one in found], limit)
-        items = [self._record(one) for one in found[:limit]]
+            deletions = list_deletions(connection, row.number, self._seconds, limit + 1, before)
+        more = self._store.seals.next_cursor("deletion", [one.number for one in deletions], limit)
+        items = [self._record(one) for one in deletions[:limit]]
         return Page[FrameDeletion](items=items, next_cursor=more)
 
     def restore_one(self, map_name: str, frame_id: str) -> None:
-        """Restore a deleted frame, so that queries find it again at once. Raise UnknownMap or
-        UnknownFrame if it cannot be restored, Conflict if its content was uploaded again, and
-        QuotaExceeded if the map has no room for it.
+        """Restore a deleted frame, which queries find again immediately.
+
+        Raises
+        ------
+        UnknownMap, UnknownFrame : If the frame cannot be restored.
+        Conflict : If its content was uploaded again.
+        QuotaExceeded : If the map has no room for the frame.
         """
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
@@ -98,24 +109,24 @@ class Tombstones:
             successor = successor_of(connection, frame)
             if successor is not None:
                 raise Conflict(
-                    f"Frame {frame.id} was not restored: it was uploaded again, as frame "
-                    f"{successor}."
+                    f"Frame {frame.id} was not restored, since it was uploaded again as frame "
+                    f"{successor}. Use that frame."
                 )
             restore_frame(connection, row, frame)
         self._wake()
 
     def restore(self, map_name: str, deletion_id: str, seconds: float = CALL_S) -> FramesRestored:
-        """Restore the frames of a deletion, until none is left or the time is over.
+        """Restore the frames of a deletion in blocks.
 
         Parameters
         ----------
-        deletion_id : of a deletion of `list_all`
-        seconds : after which no further block is begun
+        deletion_id : id of a deletion from `list_all`
+        seconds : duration after which no further block is started
 
         Raises
         ------
-        UnknownMap, UnknownDeletion : there is none, or it can no longer be undone.
-        QuotaExceeded : the map has no room for all of its frames; none was restored.
+        UnknownMap, UnknownDeletion : If the deletion does not exist or cannot be undone.
+        QuotaExceeded : If the map has no room for all of its frames; none was restored.
         """
         until, done, last, left = time.monotonic() + seconds, 0, 0, 1
         refused: list[RefusedFrame] = []
@@ -123,15 +134,15 @@ class Tombstones:
             with self._store.database.write() as connection:
                 row = find_map(connection, map_name)
                 number = int(deletion_id) if _NUMBER.fullmatch(deletion_id) else 0
-                found = find_deletion(connection, row.number, self._seconds, number)
-                if found is None:
+                deletion = find_deletion(connection, row.number, self._seconds, number)
+                if deletion is None:
                     if not last:
                         raise _unknown_deletion(row, deletion_id)
-                    left = 0  # its time was over meanwhile
+                    left = 0  # the deletion has expired meanwhile
                     break
                 if not last:
-                    _require_room(row, found)
-                before, own = done, (row.number, self._seconds, found.number)
+                    _require_room(row, deletion)
+                before, own = done, (row.number, self._seconds, deletion.number)
                 for frame in tombstones_of(connection, *own, last, AT_ONCE):
                     last = frame.number
                     successor = successor_of(connection, frame)
@@ -139,36 +150,36 @@ class Tombstones:
                         restore_frame(connection, row, frame)
                         done += 1
                     else:
-                        reason = f"it was uploaded again, as frame {successor}"
+                        reason = f"it was uploaded again as frame {successor}"
                         refused.append(RefusedFrame(frame_id=frame.id, reason=reason))
-                left = found.frames - (done - before) - len(refused)
+                left = deletion.frames - (done - before) - len(refused)
         self._wake()
         return FramesRestored(
             map=row.name, frames=done, refused=refused[:MOST_REFUSED], remaining=left
         )
 
     def purge(self, *, everything: bool = False) -> int:
-        """Delete for good what can no longer be restored; with `everything`, all tombstones.
+        """Purge tombstones that cannot be restored any more; with `everything`, all tombstones.
 
         Returns
         -------
-        how many frames
+        purged : number of frames
         """
         with self._store.database.read() as connection:
             rows, purged = list_maps(connection), 0
         for row in rows:
             while numbers := self._spent(row, everything=everything):
                 with self._store.database.write(map_number=row.number) as connection:
-                    # restored or purged meanwhile: what is left of them
-                    there = {one[0] for one in oldest_tombstones(connection, row.number)}
-                    numbers = [one for one in numbers if one in there]
+                    # without frames that were restored or purged meanwhile
+                    existing = {one[0] for one in oldest_tombstones(connection, row.number)}
+                    numbers = [one for one in numbers if one in existing]
                     blobs = purge_frames(connection, row.number, numbers)
                 collect_deleted_blobs(self._store, blobs)
                 purged += len(numbers)
         return purged
 
     def _spent(self, row: MapRow, *, everything: bool) -> list[int]:
-        """Return numbers of the oldest tombstones of a map whose time is over."""
+        """Return the numbers of the oldest expired tombstones of a map."""
         with self._store.database.read() as connection:
             over = read_clock(connection) - self._seconds
             oldest = oldest_tombstones(connection, row.number)
@@ -184,16 +195,16 @@ class Tombstones:
 def _unknown_deletion(row: MapRow, deletion_id: str) -> UnknownDeletion:
     return UnknownDeletion(
         f"Map {row.name!r} has no deletion {deletion_id!r:.80} that can be undone: it never "
-        "existed, or its time is over, or all its frames were restored. "
-        f"GET /v1/maps/{row.name}/deletions lists those that can be."
+        "existed, has expired, or all its frames were restored. "
+        f"See GET /v1/maps/{row.name}/deletions for the deletions that can be undone."
     )
 
 
 def _require_room(row: MapRow, deletion: Deletion) -> None:
-    """Check that a map may hold all frames of a deletion; their bytes it holds already."""
+    """Check that the quota has room for all frames of a deletion, whose bytes still count."""
     if row.quota_frames is not None and row.used_frames + deletion.frames > row.quota_frames:
         raise QuotaExceeded(
-            f"The deletion has {deletion.frames} frames, for which the quota of map {row.name!r} "
-            "leaves no room, so none was restored. Restore some of them one by one, or ask the "
+            f"The deletion has {deletion.frames} frames, but the quota of map {row.name!r} has no "
+            "room for all of them, so none was restored. Restore single frames, or ask the "
             "operator for a larger quota."
         )

@@ -74,8 +74,8 @@ def finish_association(
         "unchecked": int((judged.accepted & ~confirmed).sum()),
     }  # fmt: skip
     verdicts = [
-        {"consistent": True if sure else None if stands else False, "loops": loops, "closed": closed}
-        for sure, stands, loops, closed in zip(
+        {"consistent": True if sure else None if ok else False, "loops": loops, "closed": closed}
+        for sure, ok, loops, closed in zip(
             confirmed.tolist(), judged.accepted.tolist(), judged.loops.tolist(),
             judged.closed.tolist(), strict=True,
         )

@@ -188,7 +188,7 @@ class Differences(Products[NewDifference, Difference]):
                 break
 
     def _posed(self, row: MapRow, number: int, parent: str) -> tuple[Geometry, Floats] | None:
-        """Return a frame's geometry and T_parent_sensor; None if lost or in another parent frame."""
+        """Return a frame's geometry and T_parent_sensor; None if lost or of another parent."""
         with self._store.database.read() as connection:
             stop = path_frames(connection, [number]).get(number)
             blob = geometry_blobs(connection, [number], row.model_id).get(number)

@@ -486,7 +486,7 @@ def _likeliest_cause(
 def _cause_in_view(
     geometry: Geometry, tried: Validated, p: ValidationParameters
 ) -> tuple[Cause, str] | None:
-    """Return a cause in the query frame itself, and the next step; None if there is no such cause."""
+    """Return a cause in the query frame itself, and the next step; None if there is none."""
     if len(geometry.patches) < p.minimum_patches:
         return (
             "too_little_in_view",
