@@ -548,7 +548,7 @@ def _wait(context: Context, one: Map) -> int:
             time.sleep(max(LOOK_S, 10 * took))
     _print_reencoding(one)
     if now is not None and now.model_id == coming.model_id and not now.dead:
-        stats = Statistics(context).tell(minutes=1)
+        stats = Statistics(context).collect(minutes=1)
         reason = waiting_reason(stats, now.left)
         print_error(f"no progress for {STALL_S:.0f} s. {reason}")
     return 0 if one.model_id == coming.model_id else 2

@@ -1,4 +1,4 @@
-"""The one place that joins computation and storage: frames in, answers out.
+"""The engine: computation on stored frames, from uploads to answers.
 
 frame  --Uploads.add-->  store  --JobRunner.run-->  signature  --Queries.upload-->  Answer
 """

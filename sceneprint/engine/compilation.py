@@ -1,9 +1,8 @@
-"""Compiling kernels before anyone waits for them, in processes of their own beside each other.
+"""Compilation of kernels in advance, by separate processes.
 
-A process that compiles answers nobody meanwhile. So kernels are compiled by others, which leave
-the machine code on disk: those of signing by one, those of validation by another, as neither
-needs the other's. Kernels of clouds, and of views of a whole surface, are compiled when the first
-of these comes.
+A process that compiles cannot answer requests, so other processes compile the kernels and write
+their machine code to the disk: one those of signing and one those of validation. Kernels of clouds
+and of views of surfaces are compiled when the first cloud or surface arrives.
 
     python -m sceneprint.engine.compilation signing|validation|clouds FOLDER_OF_TABLES
 """
@@ -27,20 +26,20 @@ from sceneprint.geometry.signature import pair_features
 from sceneprint.geometry.views import plan
 from sceneprint.models import PRESETS, read_model
 
-#: A kernel of each part that is among the last to be compiled: where it is, so are the others.
+#: One of the last kernels to be compiled of each part, whose machine code shows that all exist.
 _LAST = {"signing": pair_features._count, "validation": icp.refine_in_place, "clouds": plan._add}
-#: What a service for depth images needs, and what it needs for clouds as well.
+#: Parts that a service for depth images needs, and those that a service for clouds needs.
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
-#: Seconds between two looks whether they are compiled.
+#: Seconds between two checks of the processes.
 _LOOK_S = 0.05
 #: Seconds between two reports of progress.
 _REPORT_S = 5.0
-#: Those who need kernels wait for whoever compiles them.
+#: Held during compilation, so that other threads wait.
 _compiling = threading.Lock()
 
 
 def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
-    """Which of the parts are yet to be compiled for this processor, or for this version."""
+    """Return the parts that are not compiled yet for this processor and version."""
     return tuple(part for part in parts if not code_folder(_LAST[part])[1])
 
 
@@ -48,47 +47,46 @@ def compile_kernels(
     cache_dir: Path, parts: Sequence[str] = DEPTH, say: Callable[[str], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:  # fmt: skip
-    """Compile parts that are missing, in a process each, and wait for them.
+    """Compile missing parts, each in its own process, and wait for the processes.
 
-    Where a process fails, kernels are compiled when they are first used. Machine code is for every
-    processor from x86-64-v3 on: with the wider registers of its own, one that gathers scattered
-    numbers slowly is slower (docs/performance.md). It is for this one where this one is another,
-    as arm64 is, or where the environment names one (NUMBA_CPU_NAME).
+    Kernels of a failed process are compiled on first use. The target is x86-64-v3, since wider
+    vector instructions slow down processors with slow gather instructions (docs/performance.md).
+    On other processors, such as arm64, and if NUMBA_CPU_NAME is set, it is the actual processor.
 
     Parameters
     ----------
-    cache_dir : of pair tables: the one that signing needs is built on the way
-    parts : of `ALL`
-    say : takes each line of progress
-    stop : once it is set, nothing more is compiled
+    cache_dir : folder of pair tables, in which the table for signing is created
+    parts : parts to compile, of `ALL`
+    say : function that receives each line of progress
+    stop : event that cancels the compilation
     """
     with _compiling:
-        wanted = missing(parts)
-        if not wanted:
+        absent = missing(parts)
+        if not absent:
             return
-        tell, begun = say or (lambda _: None), time.monotonic()
-        tell(
-            f"first use after installation: compiling kernels for {' and '.join(wanted)}, once; "
+        report, started = say or (lambda _: None), time.monotonic()
+        report(
+            f"first use after installation: compiling kernels for {' and '.join(absent)}, once; "
             "it takes half a minute on two idle processors"
         )
         environment = dict(os.environ)
         if not environment.get("NUMBA_CPU_NAME") and runs_here():
             environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES}
-        # clouds are validated with the kernels of the other parts: compiled twice, if beside them
-        # each process writes a byte to it for each kernel
+        # clouds come last, since they reuse kernels of the other parts; each process writes a byte
+        # per compiled kernel to the file
         with os.fdopen(os.memfd_create("compiled kernels"), "wb") as compiled:
-            for group in ([one for one in wanted if one != "clouds"], ["clouds"]):
-                commands = {part: (part, str(cache_dir)) for part in group if part in wanted}
-                if _run(commands, environment, compiled, tell, stop):
+            for group in ([one for one in absent if one != "clouds"], ["clouds"]):
+                commands = {part: (part, str(cache_dir)) for part in group if part in absent}
+                if _run(commands, environment, compiled, report, stop):
                     return
-        tell(f"compilation finished in {time.monotonic() - begun:.0f} s")
+        report(f"compilation finished in {time.monotonic() - started:.0f} s")
 
 
 def _run(
     commands: Mapping[str, Sequence[str]], environment: Mapping[str, str], compiled: IO[bytes],
-    tell: Callable[[str], None], stop: threading.Event | None,
+    report: Callable[[str], None], stop: threading.Event | None,
 ) -> bool:  # fmt: skip
-    """Compile parts beside each other; return whether `stop` ended it."""
+    """Compile parts concurrently; return whether `stop` was set."""
     running: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for part, arguments in commands.items():
@@ -103,14 +101,14 @@ def _run(
                 return True
             if time.monotonic() > next_report:
                 next_report += _REPORT_S
-                tell(f"compiled {os.fstat(compiled.fileno()).st_size} kernels so far")
+                report(f"compiled {os.fstat(compiled.fileno()).st_size} kernels so far")
             for part, process in [*running.items()]:
                 if process.poll() is not None:
                     del running[part]
                     if process.returncode:
-                        tell(
-                            f"compiling kernels for {part} failed (exit code {process.returncode})"
-                            ": they are compiled on first use"
+                        report(
+                            f"kernels for {part} not compiled (exit code {process.returncode})"
+                            "; they are compiled on first use"
                         )
             time.sleep(_LOOK_S)
     finally:
@@ -121,13 +119,13 @@ def _run(
 
 
 def _compile(part: str, cache_dir: Path) -> None:
-    """Use every kernel of a part once."""
+    """Compile the kernels of a part by using each of them once."""
     from sceneprint.engine.signers import warm_clouds, warm_signing, warm_validation, warm_views
     from sceneprint.pipeline import open_signer
 
     model = read_model(PRESETS[0])
     p = model.parameters.validation
-    # the corner as signing left it, so that validation need not wait for that
+    # a stored result of signing, so that both parts can be compiled concurrently
     corner = read_geometry(files("sceneprint.engine").joinpath("corner.artifact").read_bytes())
     if part == "validation":
         warm_validation(corner, p)

@@ -1,4 +1,4 @@
-"""What the concerns of the engine share: settings, store, bell, signers, readers and query log."""
+"""The shared objects of an engine: settings, store, wakeup, signers, readers and query log."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from sceneprint.store.wakeup import Notices, Wakeup
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What the concerns of one process are built from; safe to share between threads.
+    """The shared objects of one process; safe to share between threads.
 
     Parameters
     ----------
-    bell : wakes the workers that wait for jobs
-    indexes : the indexes of all maps, which a fleet may share
-    cores : that queries share
+    bell : signal that wakes workers which wait for jobs
+    indexes : indexes of all maps, which a fleet may share
+    cores : processor cores for queries
     """
 
     settings: Settings
@@ -48,29 +48,27 @@ class Context:
 def open_context(
     settings: Settings, patience_s: float = 0.0, may_go_on: Callable[[float], bool] | None = None
 ) -> Iterator[Context]:
-    """Open a store with everything that works on it, and close it at the end.
+    """Open a store and the objects that use it, and close them at the end.
 
     Parameters
     ----------
-    patience_s, may_go_on : how long to wait for a database server that is away; see
-        `open_patiently`
+    patience_s, may_go_on : limits of the wait for an unreachable database; see `open_patiently`
 
     Raises
     ------
-    UnusableStore, NewerSchema : the store cannot be opened.
+    UnusableStore, NewerSchema : If the store cannot be opened.
     """
     with ExitStack() as stack:
         yield open_patiently(lambda: _enter(stack, settings), patience_s, may_go_on)
 
 
 def require_writable(settings: Settings) -> None:
-    """Raise the error that a service or a worker with these settings would end with.
+    """Check that a service or a worker could start with these settings.
 
     Raises
     ------
-    UnusableStore, NewerSchema : other processes cannot share the blobs, or the store cannot be
-        opened, also after waiting for its server.
-    ReadOnlyStore : it cannot be written to.
+    UnusableStore, NewerSchema : If the store cannot be opened or shared with other processes.
+    ReadOnlyStore : If the store cannot be written to.
     """
     with closing(
         open_patiently(lambda: open_store(settings.database, settings.served_blobs))
@@ -95,7 +93,7 @@ def _enter(stack: ExitStack, settings: Settings) -> Context:
         server = not store.database.is_sqlite
         bell = Notices(store.database) if server else Wakeup(settings.bell_dir)
         opened.callback(bell.close)
-        # threads of a service work side by side, and sums must have one order: the same bytes
+        # concurrent requests use all cores, and a fixed order of sums gives reproducible bytes
         opened.enter_context(threadpool_limits(1))
         cores = opened.enter_context(closing(Cores(settings.query_cores)))
         answers = open_answers(store.blobs, settings.query_dir)

@@ -1,4 +1,4 @@
-"""Rows of the store as JSON tells them."""
+"""API records and entity tags of rows of the store."""
 
 from __future__ import annotations
 
@@ -37,8 +37,6 @@ from sceneprint_client.api.base import Direction
 from sceneprint_client.api.frames import Kind, SampleRange
 from sceneprint_client.poses import quaternion_of
 
-# Entity tags: short texts that change when what they stand for does.
-
 #: Columns of a frame that can be edited.
 EDITABLE = (
     "robot", "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base", "up",
@@ -46,29 +44,29 @@ EDITABLE = (
 )  # fmt: skip
 
 
-#: As `json.dumps(parts, sort_keys=True)`, which makes an encoder each time.
+#: Like `json.dumps(parts, sort_keys=True)`, which would create an encoder for each call.
 _encode = json.JSONEncoder(sort_keys=True).encode
 
 
 def tag_of(*parts: object) -> str:
-    """32 digits of what can be told as JSON: the same for the same parts."""
-    told = _encode(parts)
-    return hashlib.sha256(told.encode()).hexdigest()[:32]
+    """Return an entity tag of 32 digits, which is a hash of the parts as JSON."""
+    encoded = _encode(parts)
+    return hashlib.sha256(encoded.encode()).hexdigest()[:32]
 
 
 def frame_tag(frame: FrameRow) -> str:
-    """Return the entity tag of a frame, which changes with whatever can be edited."""
+    """Return the entity tag of a frame, which changes with its editable columns."""
     return tag_of("frame", [getattr(frame, name) for name in EDITABLE])
 
 
 def map_tag(row: MapRow) -> str:
-    """Return the entity tag of a map, which changes with whatever can be edited."""
+    """Return the entity tag of a map, which changes with its editable columns."""
     limits = row.quota_frames, row.quota_bytes, row.retention_days
     return tag_of("map", row.name, row.title, *limits, row.up)
 
 
 def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
-    """T_parent_child (4, 4) as JSON tells it."""
+    """Return the API record of T_parent_child (4, 4)."""
     x, y, z, w = quaternion_of(T[:3, :3]).tolist()
     return Transform(
         parent_frame=parent_frame,
@@ -80,60 +78,57 @@ def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
 
 
 def when(seconds: float | None) -> Any:
-    """Seconds since 1970 as a time in UTC."""
+    """Return seconds since 1970 as a time in UTC."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
 
 
 def model_label(name: str, model_id: str) -> str:
-    """As `Model.label`."""
+    """Return the label of a model, as `Model.label` does."""
     return f"{name}-{model_id[:12]}"
 
 
 def sensor_frame(frame_id: str, kind: Kind) -> str:
-    """What the coordinates of a frame's sensor are called in transforms.
-
-    The optical ones of a camera; a cloud keeps the axes that its sensor has.
-    """
+    """Return the name of a sensor frame in transforms: optical for a camera, else with its axes."""
     return f"{frame_id}.optical" if kind == "depth" else f"{frame_id}.sensor"
 
 
 def sensor_of(frame: FrameRow) -> str:
-    """What the coordinates of a stored frame's sensor are called in transforms."""
+    """Return the name of a stored frame's sensor frame in transforms."""
     return sensor_frame(frame.id, frame.kind)
 
 
 def query_sensor(frame: FrameName | None, kind: Kind, maps: Sequence[str]) -> str:
-    """What the coordinates of a query's sensor are called.
+    """Return the name of a query's sensor frame in transforms.
 
-    By its id where it is a stored frame, asked of its own map alone: another map may have a frame
-    of the same id, and a transform leads from one frame to another.
+    It contains the id of a stored frame only if its own map is searched alone, since another map
+    may have a frame of the same id.
 
     Parameters
     ----------
-    frame : that was asked for; None for an upload
-    kind : of it
-    maps : that were asked
+    frame : stored frame that is the query; None for an upload
+    kind : kind of the query frame
+    maps : names of the searched maps
     """
     alone = frame is not None and list(maps) == [frame.map]
     return sensor_frame(frame.frame_id if frame is not None and alone else "query", kind)
 
 
 def map_record(connection: Connection, row: MapRow) -> Map:
-    """A map."""
-    names, coming, overdue = model_names(connection), None, None
+    """Return the API record of a map."""
+    names, reencoding, overdue = model_names(connection), None, None
     if row.retention_days is not None:
         overdue = count_old_frames(connection, row.number, time.time() - DAY_S * row.retention_days)
     if row.next_model_id is not None:
         label = model_label(names[row.next_model_id], row.next_model_id)
         now = switch_progress(connection, row)
-        coming = Reencoding(model=label, model_id=row.next_model_id, **asdict(now))
+        reencoding = Reencoding(model=label, model_id=row.next_model_id, **asdict(now))
     posed, parents = count_poses(connection, row.number)
     return Map(
         name=row.name,
         title=row.title,
         model=model_label(names[row.model_id], row.model_id),
         model_id=row.model_id,
-        reencoding=coming,
+        reencoding=reencoding,
         created_at=when(row.created_at),
         revision=row.revision,
         frames=count_states(connection, row.number),
@@ -150,24 +145,24 @@ def map_record(connection: Connection, row: MapRow) -> Map:
     )
 
 
-def frame_records(connection: Connection, row: MapRow, found: list[FrameRow]) -> list[Frame]:
-    """Frames of one map; of deleted ones nothing is told that their purge will remove."""
-    jobs = signing_jobs(connection, [frame.number for frame in found])
-    return [_frame(row, without_content(frame), jobs[frame.number]) for frame in found]
+def frame_records(connection: Connection, row: MapRow, rows: list[FrameRow]) -> list[Frame]:
+    """Return the API records of frames of one map, without content that a purge removes."""
+    jobs = signing_jobs(connection, [frame.number for frame in rows])
+    return [_frame(row, without_content(frame), jobs[frame.number]) for frame in rows]
 
 
 def job_progress(job: JobRow) -> Progress | None:
-    """How far a long job has come; None before its first slice is over."""
+    """Return the progress of a long job; None before the end of its first slice."""
     if job.progress is None:
         return None
-    known = {name: job.progress[name] for name in Progress.model_fields if name in job.progress}
-    return Progress(**{"done": 0} | known)
+    fields = {name: job.progress[name] for name in Progress.model_fields if name in job.progress}
+    return Progress(**{"done": 0} | fields)
 
 
 def job_record(
     job: JobRow, frame_id: str | None, map_name: str | None, followed_by: str | None = None
 ) -> Job:
-    """A job, and the names of what it is about."""
+    """Return the API record of a job."""
     return Job(
         job_id=job.id,
         kind=job.kind,
@@ -228,12 +223,12 @@ def _direction(up: Sequence[float] | None) -> Direction | None:
 
 
 def sample_range_of(frame: FrameRow) -> SampleRange | None:
-    """Return how far away the samples of a frame are; None once it is purged."""
+    """Return the range of a frame's samples; None after its purge."""
     return None if frame.samples is None else SampleRange.model_validate(frame.samples)
 
 
 def _sensor_record(frame: FrameRow) -> dict[str, Any]:
-    """How the samples or the points of a frame are read."""
+    """Return the fields of a frame's record that describe its samples or points."""
     if frame.cloud is None:
         return {
             "kind": "depth",
@@ -243,7 +238,7 @@ def _sensor_record(frame: FrameRow) -> dict[str, Any]:
             "depth_scale": frame.depth_scale,
             "depth_along_ray": frame.depth_along_ray,
         }
-    at = frame.cloud["viewpoint"]
+    eye = frame.cloud["viewpoint"]
     return {
         "kind": "cloud",
         "samples": sample_range_of(frame),
@@ -251,7 +246,7 @@ def _sensor_record(frame: FrameRow) -> dict[str, Any]:
         "depth_scale": None,
         "depth_along_ray": None,
         "points": frame.cloud["points"],
-        "viewpoint": None if at is None else Vector(**dict(zip("xyz", at, strict=True))),
+        "viewpoint": None if eye is None else Vector(**dict(zip("xyz", eye, strict=True))),
         "units_per_metre": frame.cloud["units_per_metre"],
         "note": frame.cloud["note"],
     }

@@ -1,4 +1,4 @@
-"""Signers, cached: each model is made ready to sign once a process."""
+"""Cached signers of models, and use of all kernels before the first request."""
 
 from __future__ import annotations
 
@@ -27,13 +27,16 @@ from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics, ReferenceS
 
 log = logging.getLogger(__name__)
 
-#: Seconds that a request waits for kernels that are being compiled.
+#: Seconds for which a request waits for the compilation of kernels.
 KERNELS_S = 20.0
 
 
 class Signers:
-    """Signers by the id of their model, whose file is in the database; `cache_dir` has the pair
-    tables.
+    """Signers by the ids of their models, which are in the database.
+
+    Parameters
+    ----------
+    cache_dir : folder of pair tables
     """
 
     def __init__(self, database: Database, cache_dir: Path) -> None:
@@ -44,15 +47,15 @@ class Signers:
         self._compiled.set()
 
     def hold(self) -> None:
-        """Have those who sign or validate wait: kernels are compiled elsewhere meanwhile."""
+        """Let signing and validation wait while another process compiles kernels."""
         self._compiled.clear()
 
     def release(self) -> None:
-        """Let them go on."""
+        """Let signing and validation continue after `hold`."""
         self._compiled.set()
 
     def require_kernels(self, wait_s: float | None = None) -> None:
-        """Wait until kernels are compiled; raise Busy after `wait_s` (default: KERNELS_S)."""
+        """Wait for compiled kernels; raise Busy after `wait_s` seconds (default: KERNELS_S)."""
         if not self._compiled.wait(KERNELS_S if wait_s is None else wait_s):
             raise Busy(
                 "The service is waiting for its kernels, which the first start after an "
@@ -60,11 +63,15 @@ class Signers:
             )
 
     def __call__(self, model_id: str) -> Signer:
-        """Return the signer of a map's model. Raise UnreadableModel if another version of
-        sceneprint stored it, and Busy while kernels are being compiled.
+        """Return the signer of a stored model.
+
+        Raises
+        ------
+        UnreadableModel : If another version of sceneprint stored the model.
+        Busy : If kernels are still being compiled.
         """
         self.require_kernels()
-        with self._lock:  # building a table takes seconds: once is enough
+        with self._lock:  # a table takes seconds to build, so only one thread may
             if model_id not in self._open:
                 with self.database.read() as connection:
                     content = model_content(connection, model_id)
@@ -73,7 +80,7 @@ class Signers:
             return self._open[model_id]
 
     def of(self, model: Model) -> Signer:
-        """The signer of a model that no map may refer to yet; see `__call__`."""
+        """Return the signer of a model that need not be stored; raise Busy as `__call__` does."""
         self.require_kernels()
         with self._lock:
             if model.id not in self._open:
@@ -81,32 +88,27 @@ class Signers:
             return self._open[model.id]
 
     def warm(self) -> None:
-        """Load code and tables of every model in use before a request needs them."""
+        """Load code and tables of all models in use before a request needs them."""
         with self.database.read() as connection:
             used = {one for row in list_maps(connection) for one in models_of(row)}
         for model_id in used:
             try:
                 warm(self(model_id))
-            except ModelError as error:  # it costs the maps of this model, and no others
+            except ModelError as error:  # maps of other models are not affected
                 log.error("model unusable", extra={"model": model_id, "error": str(error)})
 
 
-# Loading all code and tables before the first request asks for them.
-
-
 def warm(signer: Signer, *, clouds: bool = False) -> bool:
-    """Sign, search and validate a corner of a room, so that kernels are compiled or loaded.
+    """Sign, search and validate a corner of a room, to compile or load all kernels.
 
     Parameters
     ----------
-    signer : whose table is touched
-    clouds : do it with clouds too, with and without a viewpoint: their kernels take long to
-        compile, and not every service meets a cloud
+    signer : signer, whose table is loaded
+    clouds : whether to include kernels of clouds, which take long to compile
 
     Returns
     -------
-    whole : the corner was recognised, so every stage has run; False where a model of another
-        range sees nothing there
+    is_complete : whether every stage has run; False for a model whose range excludes the corner
     """
     p = signer.model.parameters.validation
     with suppress(FrameError):
@@ -118,19 +120,19 @@ def warm(signer: Signer, *, clouds: bool = False) -> bool:
 
 
 def warm_signing(signer: Signer) -> bytes:
-    """Sign and search the corner; returns its artifact."""
+    """Sign and search the corner, and return its artifact."""
     signature, seen = prepare(_corner(), signer)
     metric, rows = signer.model.metric, signature.vector[None].copy()
     search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
     pairwise_distances(rows, metric)
-    rows.flags.writeable = False  # as a mapped file is: another compilation
+    rows.flags.writeable = False  # kernels are compiled separately for read-only arrays
     distances(signature.vector.copy(), rows, metric)
     return write_geometry(seen)
 
 
 def warm_validation(geometry: Geometry, p: ValidationParameters) -> bool:
-    """Validate a corner against itself, and draw it; returns whether it was accepted."""
-    drawn = sample_points(geometry.surface, 1)  # as a page asks for them
+    """Validate a corner against itself, draw it, and return whether it was accepted."""
+    drawn = sample_points(geometry.surface, 1)  # as for the dashboard
     patches_at(drawn, geometry.patches)
     residuals(drawn, geometry.surface, np.eye(4), p.agreement)
     return validate(geometry, geometry, p=p).status == "accepted"
@@ -145,7 +147,7 @@ def warm_clouds(signer: Signer, geometry: Geometry) -> None:
 
 
 def warm_views() -> None:
-    """Choose and render views of a small room: of its points, and of its triangles."""
+    """Choose and render views of a small room, from its points and from its triangles."""
     model = read_model("depth").parameters
     camera = view_parameters(model, Intrinsics(40, 30, 36, 36, 19.5, 14.5))
     corners = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 2.5)], np.float32)
@@ -162,7 +164,7 @@ def warm_views() -> None:
 
 
 def _corner() -> DepthFrame:
-    """A wall, a floor and a box that stands off the middle, two metres away."""
+    """Return a view of a wall, a floor and a box at a distance of two metres."""
     camera = Intrinsics(256, 192, 220, 220, 127.5, 95.5)
     y, x = np.mgrid[0:192, 0:256]
     right, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
@@ -172,7 +174,7 @@ def _corner() -> DepthFrame:
 
 
 def _cloud(frame: DepthFrame, *, has_viewpoint: bool) -> Cloud:
-    """What a depth image shows, as points."""
+    """Return the points of a depth image."""
     k = frame.intrinsics
     v, u = np.nonzero(frame.depth)
     z = frame.depth[v, u]

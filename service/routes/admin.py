@@ -231,13 +231,13 @@ def stats(
         asking.require_every("read")
     else:
         asking.require(map_name, "read")
-    return here.statistics.tell(minutes, map_name)
+    return here.statistics.collect(minutes, map_name)
 
 
 @operations_router.get("/models", responses=declared())
 def models(here: Here, asking: Asking) -> Page[ModelInfo]:
     """List models for maps: the presets, and those that maps have or had."""
-    found = here.catalogue.tell(lambda name: asking.may("read", name))
+    found = here.catalogue.list_all(lambda name: asking.may("read", name))
     if not asking.reads_every:  # a model of unreadable maps would reveal them
         found = [one for one in found if one.preset or one.maps]
     return Page[ModelInfo](items=found)

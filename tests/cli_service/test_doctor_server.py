@@ -47,7 +47,7 @@ def test_more_connections_than_the_server_allows(postgres: Server) -> None:
 def test_a_service_does_not_take_the_server_for_a_file(postgres_url: str, tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, database_url=SecretStr(postgres_url))
     with Engine(settings) as engine:
-        stats = engine.statistics.tell(1)
+        stats = engine.statistics.collect(1)
     assert stats.bytes.database is not None
     size = f"{stats.bytes.database / 1e6:.1f}"
     text = f"database of {size} MB, blobs of 0.0 MB, indexes of 0.0 MB"

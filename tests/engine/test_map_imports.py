@@ -203,7 +203,7 @@ def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(
     task = claimed(chosen)
     edit_map(chosen.store, "hall", {"quota_frames": 1})
     before = replace(task, job=replace(task.job, progress={**task.progress, "phase": "choose"}))
-    with pytest.raises(QuotaExceeded, match=r"needs \d+ views, .* of the 1 that its quota allows"):
+    with pytest.raises(QuotaExceeded, match=r"has \d+ views, .* 1 frames"):
         slice_of(chosen, before, lambda: True)
     edit_map(chosen.store, "hall", {"quota_frames": None, "quota_bytes": used_bytes(chosen) + 10})
     with pytest.raises(QuotaExceeded):
@@ -211,7 +211,7 @@ def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(
     assert chosen.run(task) == JobState.FAILED
     error = str(chosen.get_job(task.job.id).error)
     assert "0 of" in error
-    assert "the same file sent again adds the others" in error
+    assert "the same file again to add the other views" in error
     chosen.imports.tidy()
     assert (used_bytes(chosen), list(chosen.store.blobs.digests())) == (0, [])
 
@@ -224,7 +224,7 @@ def test_a_surface_needs_room_beyond_that_of_its_file(empty: Engine) -> None:
     job = begun(empty, data.encode())
     edit_map(empty.store, "hall", {"quota_bytes": len(data) + 10})
     assert empty.run(claimed(empty)) == JobState.FAILED
-    assert "its quota allows" in str(empty.get_job(job.job_id).error)
+    assert "a larger quota" in str(empty.get_job(job.job_id).error)
     assert used_bytes(empty) == len(data)
 
 
@@ -269,7 +269,7 @@ def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
     east = FAR + np.array([50.0, 0.0, 0.0])
     failed = slices(east, "east.obj", 3)
     error = str(empty.get_job(failed.job.id).error)
-    assert "'district' has frames already" in error
+    assert "'district' already has frames" in error
     offset = np.round(FAR + np.ptp(make_room(np.random.default_rng(3)).vertices, axis=0) / 2)
     stated = dict(zip("xyz", offset.tolist(), strict=True))
     far_off = slices(east, "east.obj", 1, offset=stated | {"y": 0.0})

@@ -34,12 +34,12 @@ def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatc
         ).all()
     folder = full.settings.data_dir
     on_disk = sum(p.stat().st_size for p in (folder / "blobs").glob("*/*"))
-    told = full.statistics.tell(1, "hall").bytes
+    told = full.statistics.collect(1, "hall").bytes
     assert told.blobs == on_disk
     assert told.database == sum(one[1] for one in held)
     assert told.index == sum(p.stat().st_size for p in _files(folder / "index"))
     assert (told.free, told.disk) == (None, None)
-    shop = full.statistics.tell(1, "shop").bytes
+    shop = full.statistics.collect(1, "shop").bytes
     assert (shop.database, shop.blobs, shop.index) == (0, 0, 0)
 
     monkeypatch.setattr(measuring, "WEIGHED", 4)  # the 1st, 4th, 7th and 10th stand for all

@@ -71,7 +71,7 @@ def test_history_is_that_of_all_processes(make_engine, noon):
             connection.execute(
                 update(samples).where(samples.c.number == number).values(at=noon - ago)
             )
-    stats = engine.statistics.tell(3)
+    stats = engine.statistics.collect(3)
     assert [one.at.timestamp() - noon for one in stats.minutes] == [-150, -90, -30]
     assert [one.received for one in stats.minutes] == [0, 0, 1]
     assert [one.indexed for one in stats.minutes] == [0, 2, 1]
@@ -85,11 +85,11 @@ def test_history_is_that_of_all_processes(make_engine, noon):
     assert last.latency is not None
     assert bin_of(last.latency.p50) == bin_of(last.latency.p95) == bin_of(0.1)
     assert bin_of(last.latency.p99) == bin_of(0.1)  # the 198th of 200; the 199th took 3 s
-    own = engine.statistics.tell(3, "hall")
+    own = engine.statistics.collect(3, "hall")
     assert [one.indexed for one in own.minutes] == [0, 1, 1]
     assert (own.total.queries, own.total.latency, own.workers, own.bytes.free) == (None,) * 4
     with pytest.raises(UnknownMap):
-        engine.statistics.tell(3, "shop")
+        engine.statistics.collect(3, "shop")
 
 
 def test_what_waits_and_who_works(make_engine, uploads):
@@ -102,16 +102,16 @@ def test_what_waits_and_who_works(make_engine, uploads):
         for number in (1, 2, 3):
             made = time.time() - 100 * number
             connection.execute(update(jobs).where(jobs.c.number == number).values(created_at=made))
-    stats = engine.statistics.tell(1)
+    stats = engine.statistics.collect(1)
     assert (stats.maps, stats.frames, stats.jobs) == (2, {"received": 3}, {"queued": 3})
     assert stats.waiting == 3
     assert stats.oldest_waiting_s == {"sign": pytest.approx(100, abs=20)}  # the least number
-    of_shop = engine.statistics.tell(1, "shop")
+    of_shop = engine.statistics.collect(1, "shop")
     assert (of_shop.frames, of_shop.jobs, of_shop.waiting) == ({"received": 2}, {"queued": 2}, 2)
     assert of_shop.oldest_waiting_s == {"sign": pytest.approx(200, abs=20)}
     with engine.store.database.write() as connection:
         connection.execute(update(jobs).where(jobs.c.number == 3).values(kind="associate"))
-    assert engine.statistics.tell(1, "shop").oldest_waiting_s == {
+    assert engine.statistics.collect(1, "shop").oldest_waiting_s == {
         "associate": pytest.approx(300, abs=60), "sign": pytest.approx(200, abs=60),
     }  # fmt: skip
     with engine.store.database.write() as connection:
@@ -119,27 +119,27 @@ def test_what_waits_and_who_works(make_engine, uploads):
     assert stats.workers == []
     work = engine.claim("far:17")
     with engine.bell.listen():
-        stats = engine.statistics.tell(1)
+        stats = engine.statistics.collect(1)
     assert work is not None
     here = f"{os.uname().nodename}:{os.getpid()}"
     assert stats.workers is not None
     assert {one.name: one.job_id for one in stats.workers} == {
         "far:17": work.job.id, here: None
     }  # fmt: skip
-    assert engine.statistics.tell(1).workers == [stats.workers[0]]
+    assert engine.statistics.collect(1).workers == [stats.workers[0]]
     engine.put_back(work)
-    assert engine.statistics.tell(1).workers == []
+    assert engine.statistics.collect(1).workers == []
 
 
 @pytest.mark.sqlite_only("reads the size of its file")
 def test_indexes_and_sizes_are_told(data, make_engine):
     engine = make_engine(data)
     indexed = engine.get_map("hall").frames["indexed"]
-    (index,) = engine.statistics.tell(1).indexes
+    (index,) = engine.statistics.collect(1).indexes
     assert (index.map, index.version, index.tail) == ("hall", None, indexed)
     assert index.recall is None
     engine.rebuild_index("hall")
-    (index,) = engine.statistics.tell(1).indexes
+    (index,) = engine.statistics.collect(1).indexes
     assert (index.version, index.tail) == (1, 0)
     assert index.recall == IndexRecall(  # compared whole
         share=1, near=10, sample=0, probes=0, frames=indexed
@@ -308,7 +308,7 @@ def test_models_are_listed_with_the_maps_that_may_be_named(make_engine, small_mo
     for name in ("hall", "shop"):
         engine.create_map(NewMap(name=name, model="depth"))
     engine.reencode("shop", small_model)
-    found = {one.name: one for one in engine.catalogue.tell(lambda name: name != "hall")}
+    found = {one.name: one for one in engine.catalogue.list_all(lambda name: name != "hall")}
     assert list(found) == [*PRESETS, "small"]
     depth, small = read_model("depth"), found["small"]
     assert found["depth"].maps == ["shop"]

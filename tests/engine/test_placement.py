@@ -246,8 +246,8 @@ def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> Non
         with pytest.raises(InvalidRequest, match="covariance of the prior is not valid"):
             localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
     for least, most, told in (
-        (1e-320, 1.0, "from 1e-160 to 1, and"), (0.9e-12, 1.0, "from 9.49e-07 to 1, and"),
-        (1.0, 1e308, r"from 1 to 1e\+154, and"), (1e-4, 1.1e6, r"from 0.01 to 1.05e\+03, and"),
+        (1e-320, 1.0, "between 1e-160 and 1, but"), (0.9e-12, 1.0, "between 9.49e-07 and 1, but"),
+        (1.0, 1e308, r"between 1 and 1e\+154, but"), (1e-4, 1.1e6, r"between 0.01 and 1.05e\+03"),
     ):  # fmt: skip
         given = np.diag([least, 1.0, most, 1.0, 1.0, 1.0])
         with pytest.raises(InvalidRequest, match=told):

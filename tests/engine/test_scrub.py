@@ -75,7 +75,7 @@ def test_all_bytes_are_read_once_a_day(full: Engine) -> None:
     assert before <= stored.began_at <= stored.finished_at <= time.time()
     assert stored.next_at == stored.began_at + PASS_S
     assert _scrub(full).run(now=True) is None  # nobody else begins another
-    told = full.statistics.tell().scrub
+    told = full.statistics.collect().scrub
     assert told is not None
     assert (told.blobs, told.bytes, told.damaged) == (row.blobs, row.bytes, 0)
 

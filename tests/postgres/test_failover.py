@@ -145,7 +145,7 @@ def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
 async def _states_told(app: FastAPI) -> dict[str, int]:
     """Frames by state, as the application tells them once it has begun."""
     async with app.router.lifespan_context(app):
-        return dict(app.state.service.statistics.tell().frames)
+        return dict(app.state.service.statistics.collect().frames)
 
 
 def test_a_database_that_goes_while_a_service_starts_is_waited_for(

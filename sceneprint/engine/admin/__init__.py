@@ -1,1 +1,1 @@
-"""Keys, statistics and the tasks of an operator."""
+"""Keys, statistics, events and the audit log."""

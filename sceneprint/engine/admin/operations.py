@@ -1,4 +1,4 @@
-"""Operator tasks of a store: events, audit log, keys, tenants, and removal of old rows."""
+"""Events, audit log, keys and tenants of a store, and the removal of their old rows."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class EventSlice(NamedTuple):
 
     Parameters
     ----------
-    events : events
+    events : events of the slice
     place : number up to which the events are complete
     seen : last number up to it that the reader may see
     """
@@ -96,7 +96,7 @@ def begin(database: Database, wanted: EventFilter, kept: int, after: int | None)
 
 
 def next_events(database: Database, wanted: EventFilter, place: int, most: int) -> EventSlice:
-    """Return the next events."""
+    """Return at most `most` events after a place."""
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
@@ -137,12 +137,12 @@ class Events:
 
         Raises
         ------
-        UnknownMap : the map does not exist.
-        InvalidRequest : there are too many kinds, or one is malformed.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If there are too many kinds, or one is malformed.
         """
         if len(kinds) > MOST_KINDS or not all(re.fullmatch(r"[a-z_.]{1,32}", k) for k in kinds):
             raise InvalidRequest(
-                f"The kinds {', '.join(kinds)!r:.80} are not valid. Give up to {MOST_KINDS} "
+                f"The kinds {', '.join(kinds)!r:.80} are not valid. Pass up to {MOST_KINDS} "
                 "prefixes of event kinds, such as frame. or frame.indexed.",
                 (("kind", "not an event kind"),),
             )
@@ -168,7 +168,7 @@ class Events:
 
         Raises
         ------
-        InvalidRequest : the service issued no such cursor or event id.
+        InvalidRequest : If the service did not issue the cursor or the event id.
         """
         seals, before = self._store.seals, None
         least = 0 if after is None else seals.event(after)
@@ -187,10 +187,9 @@ class Events:
         return EventPage(items=items, next_cursor=more, newest=seals.seal("event", newest))
 
     def tidy(self) -> int:
-        """Remove old events and results of idempotent requests if it is due; return the number of
-        events.
+        """Remove old events and idempotent requests if it is due; return the number of events.
 
-        Errors are logged, and the next call tries again.
+        Errors are logged, and a later call tries again.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
@@ -258,9 +257,13 @@ class Audit:
             audit_log.record_change(connection, action, map_name, target, **data)
 
     def tidy(self, now: float | None = None) -> int:
-        """Remove expired lines if it is time, and return their number. Errors are logged, and the
-        next call tries again. `now` is in seconds since 1970, by default by the clock of the
-        database.
+        """Remove expired lines if it is due, and return their number.
+
+        Errors are logged, and a later call tries again.
+
+        Parameters
+        ----------
+        now : seconds since 1970; None reads the clock of the database
         """
         if time.monotonic() - self._pruned < PRUNE_S or self._store.database.read_only:
             return 0
@@ -277,7 +280,7 @@ class Audit:
             return 0
 
     def lines(self, wanted: AuditFilter) -> Iterator[AuditLine]:
-        """Yield all lines, the oldest first."""
+        """Yield all lines, oldest first."""
         after = 0
         while True:  # a transaction for each block, as the reader may be slow
             with self._store.database.read() as connection:
@@ -290,11 +293,11 @@ class Audit:
     def page(
         self, wanted: AuditFilter, cursor: str | None = None, limit: int = 100
     ) -> Page[AuditLine]:
-        """Return a page of lines, the newest first.
+        """Return a page of lines, newest first.
 
         Raises
         ------
-        InvalidRequest : the service did not issue the cursor.
+        InvalidRequest : If the service did not issue the cursor.
         """
         seals = self._store.seals
         before = seals.row("audit", cursor)
@@ -317,23 +320,23 @@ def create_key(
 
     Parameters
     ----------
-    grants : scope by name of a map, `*` for all; default: admin of all
-    expires_at : end of validity, with a time zone; default: never
-    tenant : owner; default: a tenant with the key's name
+    grants : scope by name of a map, or `*` for all maps; None grants admin for all maps
+    expires_at : end of validity, with a time zone; None for no end
+    tenant : owner; None selects a tenant with the key's name
 
     Raises
     ------
-    InvalidRequest : the name is empty, too long, not printable or reserved; a name of a map is
+    InvalidRequest : If the name is empty, too long, not printable or reserved; if a map name is
         malformed; or `expires_at` is out of range.
-    Conflict : the name is in use.
-    UnknownTenant : the tenant does not exist.
+    Conflict : If the name is in use.
+    UnknownTenant : If the tenant does not exist.
     """
     _check_name(name, "key")
     granted: dict[str, Scope] = dict(grants or {EVERY: "admin"})
     for pattern in granted:
         if not re.fullmatch(MAP_OR_EVERY, pattern):
             raise InvalidRequest(
-                f"{pattern!r:.80} is not a valid map name. Give map names, or * for all maps.",
+                f"{pattern!r:.80} is not a valid map name. Use names of maps, or * for all maps.",
                 (("grants", "not a map name"),),
             )
     until = None if expires_at is None else _until(expires_at)
@@ -349,8 +352,8 @@ def create_tenant(store: Store, name: str) -> None:
 
     Raises
     ------
-    InvalidRequest : the name is empty, too long, not printable or reserved.
-    Conflict : the name is in use.
+    InvalidRequest : If the name is empty, too long, not printable or reserved.
+    Conflict : If the name is in use.
     """
     _check_name(name, "tenant")
     with store.database.write() as connection:
@@ -363,7 +366,7 @@ def delete_tenant(store: Store, name: str) -> None:
 
     Raises
     ------
-    UnknownTenant, Conflict : see `tenants.delete_tenant`.
+    UnknownTenant, Conflict : See `tenants.delete_tenant`.
     """
     with store.database.write() as connection:
         tenants.delete_tenant(connection, name)
@@ -384,22 +387,22 @@ OVERLAP_S, MOST_OVERLAP_S = 3600.0, 30 * 86_400.0
 
 
 def revoke_key(store: Store, name: str) -> None:
-    """Revoke a key; raise UnknownKey if there is none of that name."""
+    """Revoke a key; raise UnknownKey if it does not exist."""
     with store.database.write() as connection:
         stored.revoke_key(connection, name)
 
 
 def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey:
-    """Give a key a new secret, and return it; the former secret stays valid for a while.
+    """Replace the secret of a key, and return the key with its new secret.
 
     Parameters
     ----------
-    overlap_s : seconds; 0: the former secret ends now
+    overlap_s : seconds for which the former secret remains valid
 
     Raises
     ------
     InvalidRequest : `overlap_s` is negative, or more than 30 days.
-    UnknownKey : the key does not exist.
+    UnknownKey : If the key does not exist.
     """
     if not 0 <= overlap_s <= MOST_OVERLAP_S:
         raise InvalidRequest(
@@ -417,7 +420,7 @@ def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page
 
     Raises
     ------
-    InvalidRequest : the service did not issue the cursor.
+    InvalidRequest : If the service did not issue the cursor.
     """
     after = None if cursor is None else _name_of(cursor)
     with store.database.read() as connection:

@@ -1,6 +1,6 @@
 """Statistics of the service, now and over the last hour, from the shared store.
 
-frames, jobs, events, samples  --Statistics.tell-->  Stats
+frames, jobs, events, samples  --Statistics.collect-->  Stats
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _read(path: Path) -> IndexManifest | None:
     try:
         return read_manifest(path)
     except DamagedIndex:
-        return None  # readers skip it as well
+        return None  # readers skip it too
 
 
 # Sizes of a store's parts on the disk.
@@ -221,7 +221,7 @@ MINUTE_S, HOUR_S = 60.0, 3600.0
 MEASURED_S = 30.0
 #: Seconds for which metrics are reused.
 TOLD_S = 1.0
-#: Number of frames and jobs above which a thread counts them, and its maximum share of the time.
+#: Number of frames and jobs above which a thread counts them, and its maximum share of time.
 MANY, COUNTING = 100_000, 0.01
 #: Kinds of samples: counts of a service, and starts of workers.
 SERVICE, WORKER = "service", "worker"
@@ -294,7 +294,7 @@ class Statistics:
         self._figures: tuple[float, Figures] | None = None
         self._lock = threading.Lock()
 
-    def tell(self, minutes: int = 60, map_name: str | None = None) -> Stats:
+    def collect(self, minutes: int = 60, map_name: str | None = None) -> Stats:
         """Return all statistics of the store or of one map.
 
         Parameters
@@ -304,7 +304,7 @@ class Statistics:
 
         Raises
         ------
-        UnknownMap : the map does not exist.
+        UnknownMap : If the map does not exist.
         """
         now = time.time()
         start = (now // MINUTE_S - minutes + 1) * MINUTE_S
@@ -394,7 +394,7 @@ class Statistics:
         return self._counts
 
     def _look(self) -> Figures:
-        stats = self.tell(minutes=1)
+        stats = self.collect(minutes=1)
         with self._store.database.read() as connection:
             began = store_counts.count_samples(connection, WORKER, time.time() - HOUR_S)
             waiting = waiting_by_tenant(connection)

@@ -1,1 +1,1 @@
-"""Uploads: decoded, checked for duplicates, stored and queued."""
+"""Uploads and imports of frames."""

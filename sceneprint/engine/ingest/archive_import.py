@@ -1,6 +1,6 @@
-"""Import of archives: store a file whole on upload, then read its frames by a worker.
+"""Import of archives: a request stores the file, and a worker adds its frames.
 
-For a map that comes as one file, see `map_import`.
+See `map_import` for maps in one file.
 
     chunks  --Receiver-->  a seekable blob  --Imports.begin-->  job  --Imports.handle-->  items
 """
@@ -55,16 +55,15 @@ from sceneprint_client.frame_files import meta_of
 #
 #     archive  --steps_of-->  Steps  --next_block-->  a block  --add_block-->  ImportItems
 #
-# Frames are added as by uploads, so that a repeated slice finds them.
+# Frames are added like uploads, so a repeated slice finds them as duplicates.
 
-#: Maximum number of frames in one commit, and of their bytes: a cloud may have 512 MiB, and a block
-#: is in memory.
+#: Maximum number of frames in one commit, and of their bytes in memory; a cloud may have 512 MiB.
 _AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A frame of an archive, or the reason why it cannot be read."""
+    """A frame of an archive, or the error of reading it."""
 
     name: str
     sequence: FrameSequence | None = None
@@ -73,9 +72,9 @@ class Step:
 
 
 def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterator[Step]:
-    """Yield the frames and errors of an archive, in the same order each time.
+    """Yield the frames and errors of an archive in a fixed order.
 
-    With `session`, all frames have that session; else each sequence is one.
+    With `session`, all frames belong to that session; otherwise, each sequence is a session.
     """
     for name, reason in archive.refused:
         yield Step(name, refused=errors.UnreadableArchive(reason))
@@ -85,7 +84,7 @@ def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterat
 
 
 def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step]:
-    """Return the next block of steps, at least one."""
+    """Return the next block with at least one step."""
     count = size = 0
     for step in steps[done : done + _AT_ONCE]:
         size += 0 if step.reference is None else archive.size_of(step.reference)
@@ -98,7 +97,7 @@ def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[S
 def add_block(
     uploads: Uploads, task: LongJob, archive: Archive, steps: Sequence[Step], options: ImportOptions
 ) -> list[ImportItem]:
-    """Add a block of frames in one commit, while the job is this worker's."""
+    """Add a block of frames in one commit, if this worker still holds the job."""
 
     def fence(connection: Connection) -> None:  # the job may be cancelled
         queue.check_held(connection, task.job)
@@ -125,7 +124,7 @@ def add_block(
 def _added(
     uploads: Uploads, map_name: str, block: list[Upload], fence: Callable[[Connection], None]
 ) -> list[UploadOutcome]:
-    """Add frames together, or one by one if memory is too small."""
+    """Add frames together, or separately if memory is too small."""
     if not block:
         return []
     try:
@@ -160,7 +159,7 @@ def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
 def _summary_of(
     archive: Archive, steps: Sequence[Step], items: Sequence[dict[str, Any]], options: ImportOptions
 ) -> UploadSummary:
-    """Return the summary of an import, from the results of its steps."""
+    """Return the summary of an import with these results of its steps."""
     results = [ImportItem.model_validate(one) for one in items]
     without, frames = Counter[str](), 0
     for step, item in zip(steps, results, strict=True):
@@ -194,9 +193,9 @@ def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
 
 #: Kinds of the jobs that import archives, and maps in one file.
 KIND, MAP_KIND = "import", "import-map"
-#: Seconds between two searches for archives of finished imports.
+#: Seconds between two removals of archives of finished imports.
 TIDY_S = 5.0
-#: Maximum ratio of a compressed tar's content to the largest accepted archive.
+#: Maximum size of a compressed tar's content, relative to the largest accepted archive.
 _UNPACKED = 4
 #: Maximum number of ids in one statement.
 _IDS_AT_ONCE = 500
@@ -205,7 +204,7 @@ _MOST_PIXELS = 640
 
 
 class _MapBytes:
-    """Pass on the bytes of a map's file unchanged, and check them.
+    """Filter that checks the bytes of a map's file.
 
     Parameters
     ----------
@@ -216,7 +215,7 @@ class _MapBytes:
         self._name, self._head, self._size = name, b"", 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
-        """Yield the chunk; raise InvalidRequest if the file is an archive."""
+        """Yield a chunk unchanged; raise InvalidRequest if the file is an archive."""
         if len(self._head) < HEAD:
             self._head += chunk[: HEAD - len(self._head)]
             if len(self._head) >= BLOCK and is_archive(self._head):
@@ -229,7 +228,7 @@ class _MapBytes:
         yield chunk
 
     def end(self) -> Iterator[bytes]:
-        """Yield nothing; raise UnreadableCloud if the file is not a map."""
+        """Raise UnreadableCloud if the file is not a map; yield nothing."""
         surface_format(self._head, self._name, self._size)
         yield from ()
 
@@ -240,8 +239,8 @@ class Receiver:
     Parameters
     ----------
     blob : its blob, with compressed tars inflated
-    source : converts received bytes to stored ones
-    reserve : function that counts bytes against the map's quota before they are written
+    source : filter that converts received bytes to stored ones
+    reserve : function that reserves bytes of the map's quota before they are written
     """
 
     def __init__(
@@ -254,15 +253,15 @@ class Receiver:
 
         Raises
         ------
-        UnreadableArchive : the file is not an archive, is damaged, or contains too much.
-        UnreadableCloud : the file is not a map.
-        QuotaExceeded : the map has no room for it.
-        StoreFull, UnusableStore : the blob cannot be written.
+        UnreadableArchive : If the file is not an archive, is damaged, or is too large.
+        UnreadableCloud : If the file is not a map.
+        QuotaExceeded : If the map has no room for the file.
+        StoreFull, UnusableStore : If the blob cannot be written.
         """
         self._write(self._source.pieces(chunk))
 
     def end(self) -> queue.JobFile:
-        """Make the blob durable; raise the errors of `write`."""
+        """Make the blob durable; see `write` for errors."""
         self._write(self._source.end())
         return queue.JobFile(
             ARCHIVE, self._blob.keep(), self._blob.size, "application/octet-stream"
@@ -292,15 +291,15 @@ def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewPa
 
     Raises
     ------
-    InvalidRequest : a camera was sent for a model of scans.
+    InvalidRequest : If a camera was sent for a model of scans.
     """
     k = options.camera
     camera = None
     if k is not None:
         if not isinstance(view_parameters(model).camera, Intrinsics):
             raise errors.InvalidRequest(
-                "The model of the map is one for scans all around, and `camera` would have no "
-                "effect. Leave it out, or import into a map with the model `depth`.",
+                "The model of the map is for 360-degree scans, so `camera` would have no effect. "
+                "Leave it out, or import into a map with the model `depth`.",
                 (("camera", "does not apply to a map of scans"),),
             )
         n = math.ceil(max(k.width, k.height) / _MOST_PIXELS)
@@ -312,7 +311,7 @@ def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewPa
 
 
 class Imports:
-    """Imports of archives, and the start of those of maps."""
+    """Imports of archives, and the start of imports of maps."""
 
     def __init__(self, context: Context, uploads: Uploads) -> None:
         self._store, self._bell, self._uploads = context.store, context.bell, uploads
@@ -321,16 +320,16 @@ class Imports:
 
     @contextmanager
     def receive(self, map_name: str, options: ImportOptions) -> Iterator[Receiver]:
-        """Receive a file in parts; unless `Receiver.end` is called, it is removed.
+        """Receive a file in parts; remove it unless `Receiver.end` is called.
 
-        Its bytes count against the map's quota as they arrive, until this context ends: call
-        `begin` within it.
+        Its bytes count against the map's quota from their arrival until the end of the context,
+        within which `begin` must be called.
 
         Raises
         ------
-        UnknownMap : the map does not exist.
-        InvalidRequest : a camera was sent for a map of scans.
-        ReadOnlyStore, StoreFull, UnusableStore : nothing can be stored.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If a camera was sent for a map of scans.
+        ReadOnlyStore, StoreFull, UnusableStore : If the store cannot be written.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -354,7 +353,7 @@ class Imports:
             incoming.add(row.number, -reserved)
 
     def _require_room(self, row: MapRow, incoming: int) -> None:
-        """Check that a map has room for all incoming bytes, and purge tombstones for them."""
+        """Check that a map has room for all incoming bytes; purge tombstones if necessary."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
         if row.quota_bytes is None or row.used_bytes + incoming <= row.quota_bytes:
@@ -376,8 +375,8 @@ class Imports:
 
         Raises
         ------
-        UnknownMap, IdempotencyConflict, QuotaExceeded : see `queue_task`; the archive is removed.
-        Conflict : an import of the same archive has just ended, and removed it.
+        UnknownMap, IdempotencyConflict, QuotaExceeded : See `queue_task`; the archive is removed.
+        Conflict : If an import of the same archive has just ended and removed it.
         """
         data = options.model_dump(mode="json", by_alias=True)
         kind = MAP_KIND if options.as_ == "map" else KIND
@@ -387,8 +386,8 @@ class Imports:
             )
         except Swept as error:
             raise errors.Conflict(
-                "An import of the same file ended while this one was received, and its bytes were "
-                "removed with it. Send the file again."
+                "Another import of the same file ended and removed its bytes while this one was "
+                "received. Send the file again."
             ) from error
         except errors.SceneprintError:
             collect_deleted_blobs(self._store, [archive.blob])
@@ -400,12 +399,12 @@ class Imports:
     def items(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
     ) -> Page[ImportItem]:
-        """Return the results so far, in order, of an archive's frames or a map's views.
+        """Return a page of the results of an archive's frames or a map's views, in order.
 
         Raises
         ------
-        UnknownMap, UnknownJob : the map or import does not exist.
-        InvalidRequest : the service did not issue the cursor.
+        UnknownMap, UnknownJob : If the map or import does not exist.
+        InvalidRequest : If the service did not issue the cursor.
         """
         first = row_of(cursor) or 0
         with self._store.database.read() as connection:
@@ -417,7 +416,7 @@ class Imports:
         return Page[ImportItem](items=[ImportItem(**one) for one in rows[:limit]], next_cursor=more)
 
     def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Import a part of an archive: at least one block of frames."""
+        """Import at least one block of an archive's frames."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(ARCHIVE)
@@ -440,12 +439,12 @@ class Imports:
 
         Raises
         ------
-        UnusableStore : the store cannot be written; the next call tries again.
+        UnusableStore : If the store cannot be written; the next call tries again.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
         self._tidied = time.monotonic()
-        with self._store.database.read() as connection:  # usually none, so no lock
+        with self._store.database.read() as connection:  # usually there is none, so no lock
             if not queue.finished_with_file(connection, ARCHIVE):
                 return 0
         with self._store.database.write() as connection:

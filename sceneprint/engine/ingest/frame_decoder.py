@@ -40,7 +40,7 @@ class Read:
     frame : frame for the geometry
     cloud : stored description of a cloud: packing, viewpoint, units per metre, number of points,
         and corrections
-    base : name of the robot's base frame, and T_base_sensor; None if unknown
+    base : name of the robot's base frame and T_base_sensor; None if unknown
     """
 
     frame: AnyFrame
@@ -62,11 +62,11 @@ def read_upload(data: bytes, meta: FrameMeta, decoders: Decoders) -> Read:
 
     Raises
     ------
-    FrameError : the samples cannot be decoded, the camera is invalid or that of another image, the
+    FrameError : If the samples cannot be decoded, the camera is invalid or of another image, the
         pose or T_base_sensor is not rigid, or there are no samples.
-    InvalidRequest : a depth image has no camera, a cloud has one, or other metadata does not apply;
+    InvalidRequest : If a depth image has no camera, a cloud has one, or metadata does not apply;
         UnsupportedType if the package that unpacks the file is not installed.
-    Busy : no decoder is free, or none can be started.
+    Busy : If no decoder is free, or none can be started.
     """
     with decoders.place() as decoder:
         return _read(data, meta, decoder)
@@ -106,8 +106,8 @@ def read_stored(data: bytes, row: FrameRow, decoders: Decoders) -> AnyFrame:
 
     Raises
     ------
-    DamagedBlob : the decoder fails, as it did not before.
-    Busy : no decoder is free, or none can be started.
+    DamagedBlob : If the decoder fails, although it accepted the upload earlier.
+    Busy : If no decoder is free, or none can be started.
     """
     try:
         with decoders.place() as decoder:
@@ -142,7 +142,7 @@ def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
 
 
 def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
-    """Return the viewpoint of a stored cloud in its coordinates; None of a depth image."""
+    """Return the viewpoint of a stored cloud in its coordinates; None for a depth image."""
     if row.cloud is None or row.cloud["viewpoint"] is None:
         return None
     x, y, z = row.cloud["viewpoint"]
@@ -150,7 +150,7 @@ def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
 
 
 def content_id(read: Read) -> str:
-    """Return the hash of samples and camera, or points and viewpoint, but not of their packing."""
+    """Return the hash of samples and camera, or of points and viewpoint, regardless of packing."""
     if isinstance(read.frame, Cloud):
         viewpoint = None if read.cloud is None else read.cloud["viewpoint"]
         digest = hashlib.sha256(f"cloud {json.dumps(viewpoint)}\n".encode())
@@ -169,7 +169,7 @@ def columns(
 
     Parameters
     ----------
-    pose, base : T_parent_sensor, and the base as in Read
+    pose, base : T_parent_sensor, and the base as in `Read`
     """
     parent = None
     if meta.pose is not None:
@@ -202,11 +202,11 @@ def base_of(
     ----------
     transform : transform in the request
     viewpoint : viewpoint of a cloud. Without `transform`, the cloud's coordinates replace the base
-        unless the viewpoint is their origin, so that answers contain their pose as well
+        unless the viewpoint is their origin, so that answers also contain their pose
 
     Raises
     ------
-    InvalidPose : the transform is not rigid.
+    InvalidPose : If the transform is not rigid.
     """
     if transform is not None:
         return transform.base_frame, pose_matrix(transform, "T_base_sensor")
@@ -223,9 +223,7 @@ def _packing(data: bytes) -> CloudFormat:
 
 
 def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
-    """Return whether an upload is a point cloud. An array may be either; with a camera it is an
-    image.
-    """
+    """Return whether an upload is a point cloud; an NPY array with a camera is an image."""
     if meta.format is not None:
         return True
     cloud_format = format_of(data)
@@ -254,8 +252,8 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Deco
         raise errors.UnsupportedType(str(error)) from error
     if scan.file_format != _packing(data):  # it could not be decoded again
         raise errors.UnreadableCloud(
-            f"The file is read as {scan.file_format.upper()} but does not start like one. Write "
-            "the file again."
+            f"The file was sent as {scan.file_format.upper()}, but does not start like one. Write "
+            "the file again, or correct the format."
         )
     # -0.0 is the same viewpoint as 0.0
     seen_from = None if scan.viewpoint is None else [value + 0.0 for value in scan.viewpoint]
@@ -285,7 +283,7 @@ def _without_camera(data: bytes) -> errors.SceneprintError:
     if format_at(data, "depth") is not None:
         return errors.InvalidRequest(
             "The frame is a depth image, but its intrinsics are missing. Send width, height, "
-            "fx, fy, cx and cy of the camera. If it is a point cloud as NPY, give it the shape "
+            "fx, fy, cx and cy of the camera. If it is a point cloud as NPY, its shape must be "
             "(N, 3) or (N, 4).",
             (("intrinsics", "needed for a depth image"),),
         )
@@ -314,7 +312,7 @@ def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
 
     Raises
     ------
-    InvalidPose : the transform is not rigid, or the quaternion has not unit length.
+    InvalidPose : If the transform is not rigid, or the quaternion does not have unit length.
     """
     with naming(what):
         return _matrix(pose)
@@ -325,12 +323,12 @@ def _matrix(pose: GivenTransform) -> Floats:
         return rigid_transform(np.array(pose.matrix))
     t, r = pose.translation, pose.rotation
     if t is None or r is None:  # the schema requires both without a matrix
-        raise InvalidPose("The pose is incomplete. Give translation and rotation, or matrix.")
+        raise InvalidPose("The pose is incomplete. Send translation and rotation, or matrix.")
     q = np.array([r.x, r.y, r.z, r.w])
     length = float(np.linalg.norm(q))
     if not abs(length - 1.0) <= _TOLERANCE:
         raise InvalidPose(
-            f"The quaternion of the pose has length {length:.3g}, not 1. Give a unit quaternion "
+            f"The quaternion of the pose has length {length:.3g}, not 1. Send a unit quaternion "
             "x, y, z, w."
         )
     T = np.eye(4)

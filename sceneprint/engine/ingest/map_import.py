@@ -1,4 +1,4 @@
-"""Import of a map as one cloud or mesh: views of it are rendered and become its frames.
+"""Import of a map from one cloud or mesh, whose rendered views become frames.
 
     file  --read-->  surface  --choose-->  viewpoints  --render-->  frames  --sign, test-->  result
 
@@ -74,13 +74,13 @@ _MOST_WEAK = 20
 
 @dataclass(frozen=True, eq=False)
 class StoredSurface:
-    """The file of the job: a surface and its viewpoints, as consecutive NPY arrays.
+    """The file of a job: a surface and its viewpoints, as consecutive NPY arrays.
 
     Parameters
     ----------
     surface : decoded surface
-    poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views to add, and of those to test
-        the map with; empty before they are chosen
+    poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views to add and of the test
+        views; empty until they are chosen
     floor : height of the floor along `up`, metres
     """
 
@@ -111,14 +111,14 @@ _NO_POSES: Floats = np.empty((0, 4, 4))
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A rendered view, as a robot would send it."""
+    """The upload of a rendered view."""
 
     data: bytes
     meta: FrameMeta
 
 
 class _Views:
-    """Renders the views of a job.
+    """Renderer of a job's views.
 
     Parameters
     ----------
@@ -134,10 +134,10 @@ class _Views:
         self._renderer = Renderer(stored.surface, parameters)
 
     def upload(self, number: int) -> Upload:
-        """Return a view of the map as a frame to add.
+        """Return the upload of a view by its number.
 
-        Its id is a hash of content and viewpoint, so a repeated view is added once, and equal views
-        of two places are two frames.
+        Its id is a hash of content and viewpoint, so that a repeated view is added once, but equal
+        views of two places are two frames.
         """
         pose, options = self._stored.poses[number], self._options
         view = self.view(pose)
@@ -157,7 +157,7 @@ class _Views:
         return Upload(view.data, meta, options.priority, options.if_novel, frame_id)
 
     def view(self, pose: Floats) -> _View:
-        """Return a view as a robot that does not know its pose would send it."""
+        """Return a view at a pose, without the pose in its metadata."""
         seen, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
             return _View(encode_npy(seen), FrameMeta())
@@ -171,23 +171,23 @@ class _Views:
 
 
 def names_of(options: ImportOptions) -> tuple[str, str]:
-    """Return session and parent frame of the views of an import."""
+    """Return the session and the parent frame of an import's views."""
     stem = PurePath(options.name).stem
     own = stem if options.robot is None else f"{options.robot}/{stem}"
     return options.session or stem, options.parent_frame or own
 
 
 class MapImporter:
-    """Handler of jobs that import a map from one file.
+    """Handler of jobs that import maps from files.
 
     Parameters
     ----------
-    uploads : adds the views of a map as frames
-    queries : tests the map with views that it does not have
+    uploads : uploads, for the views
+    queries : queries, for the test of the map with held-out views
     """
 
     def __init__(self, context: Context, uploads: Uploads, queries: Queries) -> None:
-        # processor time: what is left of a job's time is for writing
+        # processor time; the rest of the job's time remains for writing
         self._limits = SurfaceLimits(seconds=0.75 * context.settings.job_timeout_s)
         self._store, self._signers = context.store, context.signers
         self._uploads, self._queries = uploads, queries
@@ -208,8 +208,6 @@ class MapImporter:
             )
         phase = self._phases[task.progress.get("phase", "read")]
         return phase(task, options, file, is_over)
-
-    # phases
 
     def _read(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
@@ -256,8 +254,8 @@ class MapImporter:
         n, tests = len(plan.poses), len(plan.held_out)
         if not n:
             raise InvalidRequest(
-                "There is no place in the map from which a sensor would see enough of it. Check "
-                "the units and the axis that points up, or name the height of the sensor."
+                "A sensor would see too little from every place in the map. Check the units and "
+                "the up axis, or pass the height of the sensor."
             )
         self._require_room(task.of_map, n)
         floor = 0.0 if plan.floor is None else plan.floor
@@ -290,8 +288,8 @@ class MapImporter:
             for upload, outcome in zip(block, outcomes, strict=True):
                 if isinstance(outcome.error, QuotaExceeded):
                     raise QuotaExceeded(
-                        f"{outcome.error} {first} of {progress['views']} views were added; the "
-                        "same file sent again adds the others."
+                        f"{outcome.error} {first} of {progress['views']} views were added. Send "
+                        "the same file again to add the other views."
                     )
                 item = import_item(str(upload.meta.name), outcome)
                 progress["refused"] += outcome.added is None
@@ -304,7 +302,7 @@ class MapImporter:
     def _await_signatures(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Wait until all views are signed, before the map is tested."""
+        """Wait until all views are signed."""
         del options, file, is_over
         progress = dict(task.progress)
         states = self._states(task)
@@ -334,8 +332,6 @@ class MapImporter:
             event="import.done",
         )  # fmt: skip
 
-    # what the phases share
-
     def _parameters(self, row: MapRow, options: ImportOptions) -> ViewParameters:
         with self._store.database.read() as connection:
             row = current_map(connection, row)
@@ -364,31 +360,30 @@ class MapImporter:
     def _require_one_offset(
         self, task: LongJob, options: ImportOptions, offset: Floats, views: _Views
     ) -> None:
-        """Check that no file with another offset has frames in the parent frame."""
+        """Check that the parent frame has no frames with another offset."""
         _, parent = names_of(options)
         number, first = task.of_map.number, str(views.upload(0).frame_id)
         with self._store.database.read() as connection:
             in_use = has_parent_frame(connection, number, parent)
             if not in_use or living_frame(connection, number, first) is not None:
-                return  # the first file, or the same one again
+                return  # the first file, or a repeated one
         x, y, z = offset.tolist()
         raise InvalidRequest(
-            f"The parent frame {parent!r} has frames already, and {options.name} lies far from its "
-            f"origin: its own offset would be {x:.0f},{y:.0f},{z:.0f}. Send `offset` (--offset) "
-            "with the numbers that the first file in this frame was imported with, or name "
-            "another `parent_frame`.",
-            (("offset", "needed: the parent frame has frames already"),),
+            f"The parent frame {parent!r} already has frames, but {options.name} lies far from its "
+            f"origin, so its own offset would be {x:.0f},{y:.0f},{z:.0f}. Send `offset` (--offset) "
+            "with the numbers of the first file in this frame, or another `parent_frame`.",
+            (("offset", "needed, since the parent frame has frames"),),
         )
 
     def _require_room(self, row: MapRow, views: int) -> None:
-        """Check that the quota has room for all views, before any is added."""
+        """Check that the quota has room for all views."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
             held = map_usage(connection, row.number).frames
         if row.quota_frames is not None and held + views > row.quota_frames:
             raise QuotaExceeded(
-                f"The map needs {views} views, and holds {held} frames of the {row.quota_frames} "
-                "that its quota allows. Ask the operator for a larger quota (PATCH "
+                f"The import has {views} views, but the map has {held} of at most "
+                f"{row.quota_frames} frames. Ask the operator for a larger quota (PATCH "
                 f"/v1/maps/{row.name})."
             )
 
@@ -397,7 +392,7 @@ class MapImporter:
             return states_of_import(connection, task.job)
 
     def _outcome(self, row: MapRow, views: _Views, pose: Floats, options: ImportOptions) -> str:
-        """Return the outcome of localising a robot at a pose, on one core."""
+        """Return the outcome of localising a robot at a pose; the query uses one core."""
         session, parent = names_of(options)
         view = views.view(pose)
         query = Query(keep=False, filter=Filter(session=[session], tags=[VIRTUAL]))
@@ -409,7 +404,7 @@ class MapImporter:
 
         try:
             answer = steadily(self._store, [row.name], ask)
-        except FrameError:  # nothing in the view can be signed
+        except FrameError:  # the view cannot be signed
             return "not_found"
         stop = PathFrame(
             -1, "", None, None, None, parent, pose.tolist(), is_cloud=view.meta.intrinsics is None
@@ -425,7 +420,7 @@ class MapImporter:
         counts = Counter(outcomes)
         names = ("points", "triangles", "units_per_metre", "units_from", "up_from", "notes")
         facts: dict[str, Any] = {name: progress[name] for name in names}
-        # every view has a pose in the map's parent frame, so all are checked
+        # all views are checked, since each has a pose in the map's parent frame
         facts |= {name: counts[name] for name in COVERAGE_OUTCOMES if name != "unchecked"}
         return MapImportResult(
             **facts, up=Direction(**_xyz(surface.up)), offset=Vector(**_xyz(surface.offset)),
@@ -436,12 +431,12 @@ class MapImporter:
         )  # fmt: skip
 
 
-#: Maximum distance of points from their origin, metres: single precision must keep millimetres.
+#: Maximum distance of points from their origin in metres, so that single precision is sufficient.
 _FARTHEST_M = 20_000.0
 
 
 def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> ReferenceSurface:
-    """Return a surface relative to another offset; raise InvalidRequest if that is far away."""
+    """Return a surface relative to another offset; raise InvalidRequest if it is far away."""
     to = np.array([offset.x, offset.y, offset.z])
     points = surface.points + (surface.offset - to)
     if not np.abs(points).max() <= _FARTHEST_M:
@@ -449,7 +444,7 @@ def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> R
         raise InvalidRequest(
             f"{name} lies about {middle}, more than {_FARTHEST_M / 1000:.0f} km from the offset. "
             "Check its numbers, which are metres, and the units of the file.",
-            (("offset", "far from the surface"),),
+            (("offset", "too far from the surface"),),
         )
     return replace(surface, points=points.astype(np.float32), offset=to)
 
@@ -460,16 +455,16 @@ def _counted(progress: dict[str, Any]) -> dict[str, Any]:
 
 
 def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
-    """Return the squares of the floor in which fewer than half of the tested views were localised.
+    """Return the squares of the floor with fewer than half of their test views localised.
 
     Parameters
     ----------
     stored : surface with the poses of the views
-    outcomes : outcomes of the views, in order
+    outcomes : outcomes of the test views, in order
 
     Returns
     -------
-    areas : areas, those with the most failed views first
+    areas : weak areas, those with the most failed views first
     """
     if not outcomes:
         return []

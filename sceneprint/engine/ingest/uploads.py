@@ -59,11 +59,11 @@ def find_duplicate(
     Parameters
     ----------
     metadata : the upload's columns
-    frame_id : id that the caller requests; None: any frame with the content is a duplicate
+    frame_id : requested id; None if any frame with the content is a duplicate
 
     Raises
     ------
-    FrameConflict : a frame has the id or content, but other content or metadata.
+    FrameConflict : If a frame has the id or content, but other content or metadata.
     """
     if frame_id is not None:
         frame = living_frame(connection, row.number, frame_id)
@@ -135,7 +135,7 @@ class UploadResult:
 
     @property
     def taken(self) -> Added:
-        """The frame and its job; raises `error` if the upload was refused."""
+        """The frame and its job; raise `error` if the upload was refused."""
         if self.added is None:
             raise self.error or ValueError("neither stored nor refused")
         return self.added
@@ -165,7 +165,7 @@ def _added(frame: FrameRow, job_id: str, reason: str | None = None) -> Added:
 def replayed(
     connection: Connection, row: MapRow, data: dict[str, Any]
 ) -> list[UploadResult] | None:
-    """Return stored results with their frames as they are now; None if the map was replaced."""
+    """Return stored results with their current frames; None if the map was replaced."""
     results = []
     for one in data["frames"]:
         if "error" in one:
@@ -244,11 +244,11 @@ class _Prepared:
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """Uploads that are stored together.
+    """Uploads to store together.
 
     Parameters
     ----------
-    todo : uploads without a result yet, by their place
+    todo : uploads without a result yet, by index
     results, once, fence : see `Uploads.add_all`
     left : possibly unused blobs of the last attempt
     """
@@ -261,7 +261,7 @@ class _Request:
 
     @cached_property
     def blobs(self) -> dict[str, bytes]:
-        """Blobs that must be durable first."""
+        """Blobs to write before the rows."""
         return {one.blob: one.upload.data for one in self.todo.values()}
 
     @property
@@ -288,7 +288,7 @@ class Uploads:
 
     def __init__(self, context: Context) -> None:
         self._store, self._bell = context.store, context.bell
-        # by map, while a thread writes to it
+        # groups by map, while a thread writes to it
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
         self._new_frames = NewFrames(context.store.database)
@@ -297,25 +297,25 @@ class Uploads:
     def add(
         self, map_name: str, upload: Upload, once: IdempotentRequest | None = None
     ) -> tuple[UploadResult, bool]:
-        """Store a frame in a map durably; it is signed soon after.
+        """Store a frame in a map durably, and queue its signing.
 
-        The same content with the same metadata is a duplicate of the existing frame. A failed or
-        redundant duplicate is retried, and one whose upload is lost or damaged gets it again.
+        An upload with the content and the metadata of a frame is a duplicate. It retries a failed
+        or redundant frame, and replaces a lost or damaged upload.
 
         Returns
         -------
         outcome : result with `added`
-        replayed : whether it is that of an earlier request of the same `once`
+        replayed : whether an earlier request with the key of `once` stored it
 
         Raises
         ------
-        UnknownMap : the map does not exist.
-        InvalidRequest : the frame id is not valid; or see `read_upload`.
-        FrameError : see `read_upload`.
-        FrameConflict : the frame exists with other content or metadata.
-        QuotaExceeded : the map's quota has no room for another frame; nothing was stored.
-        IdempotencyConflict : see `IdempotentRequest`.
-        UnusableStore : the disk is full, or the database cannot be written; nothing was stored.
+        UnknownMap : If the map does not exist.
+        InvalidRequest : If the frame id is not valid. See also `read_upload`.
+        FrameError : See `read_upload`.
+        FrameConflict : If the frame exists with other content or metadata.
+        QuotaExceeded : If the map's quota has no room for another frame; nothing was stored.
+        IdempotencyConflict : See `IdempotentRequest`.
+        UnusableStore : If the disk is full, or the database cannot be written; nothing was stored.
         """
         [outcome], again = self.add_all(map_name, [upload], once)
         if outcome.error is not None:
@@ -326,8 +326,9 @@ class Uploads:
         self, map_name: str, uploads: Sequence[Upload], once: IdempotentRequest | None = None,
         fence: Callable[[Connection], None] | None = None,
     ) -> tuple[list[UploadResult], bool]:  # fmt: skip
-        """Store frames in a map in one commit; see `add`. Results contain the errors of single
-        frames.
+        """Store frames in a map in one commit; see `add`.
+
+        The results contain errors of single frames.
 
         Parameters
         ----------
@@ -337,14 +338,14 @@ class Uploads:
 
         Raises
         ------
-        UnknownMap, IdempotencyConflict, UnusableStore : see `add`; nothing was stored.
+        UnknownMap, IdempotencyConflict, UnusableStore : See `add`; nothing was stored.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)  # before decoding
             before = _before(connection, row, once)
         if before is not None:
             for upload, outcome in zip(uploads, before, strict=True):
-                if outcome.added is not None:  # its upload may be lost
+                if outcome.added is not None:  # the stored upload may be lost
                     self._renew(map_name, outcome.added.frame_id, upload)
             return before, True
         outcomes: list[UploadResult | None] = [None] * len(uploads)
@@ -382,14 +383,14 @@ class Uploads:
         return _Prepared(upload, blob, content_id(read), metadata)
 
     def _read_result(self, map_name: str, ready: _Prepared) -> UploadResult | None:
-        """Return the result of an upload that needs no write; None if it needs one."""
+        """Return the result of an upload without a write; None if a write is needed."""
         try:
             with self._store.database.read() as connection:
                 row = find_map(connection, map_name)
                 frame = find_duplicate(
                     connection, row, ready.content, ready.metadata, ready.upload.frame_id
                 )
-                if frame is None:  # without room, no blob is written
+                if frame is None:  # check the quota before a blob is written
                     require_room(connection, row, ready.size + self.incoming.add(row.number, 0))
                 if frame is None or is_retried(frame.state):
                     return None
@@ -426,7 +427,7 @@ class Uploads:
         Returns
         -------
         outcomes : results of all uploads
-        replayed : whether they are those of an earlier request
+        replayed : whether an earlier request stored them
         """
         self._store.database.require_writable()  # before blobs are written
         todo = {i: one for i, one in ready.items() if results[i] is None}
@@ -455,7 +456,7 @@ class Uploads:
                 return written
 
     def _insert_single(self, row: MapRow, request: _Request) -> UploadResult | None:
-        """Insert one new frame in one round trip to PostgreSQL, with concurrent ones.
+        """Insert one new frame in one round trip to PostgreSQL, together with concurrent ones.
 
         Return None on SQLite, which has no round trips, and if the frame needs more statements.
         """
@@ -478,7 +479,7 @@ class Uploads:
         if request.fence is not None:
             request.fence(connection)
         if not all(map(self._store.blobs.holds, request.blobs)):
-            return None  # before a stored result is returned, whose frame may need the blob
+            return None  # also before a replay, whose frame may need the blob
         if request.once is not None:
             now = find_map(connection, row.name)
             if now.number != row.number:
@@ -499,13 +500,13 @@ class Uploads:
         outcomes = [written.get(i, one) for i, one in enumerate(request.results)]
         if request.once is not None and not any(
             one is not None and isinstance(one.error, errors.QuotaExceeded) for one in outcomes
-        ):  # a repeated request may find room
+        ):  # a repeated request may succeed
             stored = [_stored_outcome(one) for one in outcomes if one is not None]
             request.once.store(connection, {"frames": stored})
         return outcomes, False
 
     def _grouping(self, row: MapRow) -> Grouping:
-        """Return the group whose writes are committed together: by map; on SQLite, one for all."""
+        """Return the group of writes to a map that are committed together; SQLite has one group."""
         key = None if self._store.database.is_sqlite else row.number
         with self._guard:
             group = self._writes.get(key)
@@ -517,13 +518,13 @@ class Uploads:
 def _before(
     connection: Connection, row: MapRow, once: IdempotentRequest | None
 ) -> list[UploadResult] | None:
-    """Return the results of the same request, if it was sent before."""
+    """Return the results of an earlier identical request; None without one."""
     data = None if once is None else once.stored_result(connection)
     return None if data is None else replayed(connection, row, data)
 
 
 def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
-    """Return the row of a frame that its map may lack.
+    """Return the row of a frame that may be new.
 
     With `once`, on PostgreSQL, the same statement stores the result for the idempotency key.
     """
@@ -547,7 +548,7 @@ def _new_result(new: NewFrame) -> UploadResult:
 def _insert_new(
     connection: Connection, row: MapRow, todo: dict[int, _Prepared]
 ) -> dict[int, UploadResult]:
-    """Insert new frames, and return the results by place; see `_store_one` for the others."""
+    """Insert new frames, and return their results by index; see `_store_one` for the others."""
     new = {i: _new_frame(row, one) for i, one in todo.items() if one.upload.frame_id is None}
     ids = receive_frames(connection, list(new.values()))
     return {i: _new_result(one) for i, one in new.items() if one.frame_id in ids}
@@ -558,7 +559,7 @@ def _store_one(
 ) -> UploadResult:
     """Store an upload and return its result; add unused blobs to `left`."""
     upload = ready.upload
-    try:  # again: another upload may have been first
+    try:  # repeats the search, since another upload may have been first
         frame = find_duplicate(connection, row, ready.content, ready.metadata, upload.frame_id)
     except errors.FrameConflict as error:
         left.append(ready.blob)
@@ -568,7 +569,7 @@ def _store_one(
         left.append(ready.blob)
         return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
-    # a failed frame counts already, but its packing may differ
+    # the quota counts a failed frame already, but the size of the upload may differ
     held = 0 if frame is None or new else frame.bytes
     try:
         left.extend(make_room(connection, row, ready.size - held, new=new))
@@ -578,7 +579,7 @@ def _store_one(
     if frame is None:
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
     else:  # retry it
-        left.append(frame.blob)  # the packing may differ
+        left.append(frame.blob)  # the new upload may have another packing
         frame = renew_frame(connection, frame.number, ready.blob_columns)
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)

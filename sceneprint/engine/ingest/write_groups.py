@@ -1,6 +1,6 @@
-"""Write groups: writes that arrive while another one runs share the next transaction.
+"""Write groups: writes that arrive during another write share the next transaction.
 
-A commit waits for the disk, whatever it contains, so eight clients need not wait eight times.
+A commit waits for the disk regardless of its size, so eight clients need not wait eight times.
 
     run(a), run(b), run(c)  --Grouping, in one commit-->       each gets its own result
     receive(a), receive(b)  --NewFrames, in one statement-->   whether each was inserted
@@ -23,10 +23,10 @@ from sceneprint.store.new_frames import NewFrame, receive_frames
 T = TypeVar("T")
 W = TypeVar("W")
 
-#: Maximum number of writes in one transaction; other writers wait for it.
+#: Maximum number of writes in one transaction, for which other writers wait.
 MOST_TOGETHER = 32
-#: Seconds that new frames of several maps wait for one of them. A map is usually in use for a few
-#: milliseconds; frames of the others should not wait longer.
+#: Seconds for which new frames of several maps wait for a locked map. Locks usually last a few
+#: milliseconds.
 MAPS_WAIT_S = 0.25
 
 
@@ -35,7 +35,7 @@ class _Waiting(Generic[W]):
 
     Parameters
     ----------
-    leads : whether its thread writes for the others, or is about to; see `_Group`
+    leads : whether its thread writes for all threads; see `_Group`
     ready : set when the write is done, or its thread leads
     left : whether its thread no longer waits
     """
@@ -49,9 +49,7 @@ class _Waiting(Generic[W]):
 
 
 class _Group(Generic[W]):
-    """Writes of many threads. One thread at a time writes all waiting ones with its own; then the
-    next one leads.
-    """
+    """Writes of many threads, of which one at a time leads and performs all waiting writes."""
 
     def __init__(self) -> None:
         self._waiting: list[_Waiting[W]] = []
@@ -59,7 +57,7 @@ class _Group(Generic[W]):
         self._led = False
 
     def _await(self, work: W) -> Any:
-        """Wait until a write is done, by this thread or another, and return its result."""
+        """Wait until this or another thread has performed a write, and return its result."""
         mine = _Waiting(work)
         with self._list:
             self._waiting.append(mine)
@@ -67,11 +65,11 @@ class _Group(Generic[W]):
         try:
             if not mine.leads:
                 mine.ready.wait()
-            while not mine.done:  # more may wait before it than are written at once
+            while not mine.done:  # a batch may end before this write
                 self._write()
         except BaseException:  # such as Ctrl-C
             with self._list:
-                mine.left = True  # the writing thread does not return it to the list
+                mine.left = True  # the leading thread must not return it to the list
                 if mine in self._waiting:
                     self._waiting.remove(mine)
             raise
@@ -83,7 +81,7 @@ class _Group(Generic[W]):
         return mine.result
 
     def _hand_over(self) -> None:
-        """Let the next thread lead."""
+        """Pass the lead to the next thread."""
         with self._list:
             self._led = bool(self._waiting)
             if self._waiting:
@@ -91,11 +89,11 @@ class _Group(Generic[W]):
                 self._waiting[0].ready.set()
 
     def _write(self) -> None:
-        """Write the waiting writes, from the first on."""
+        """Perform a batch of the first waiting writes."""
         batch: list[_Waiting[W]] = []
         try:
             self._write_together(batch)
-        except BaseException:  # Ctrl-C stops only this caller: the others write themselves
+        except BaseException:  # Ctrl-C stops only this caller, so others perform their writes
             with self._list:
                 back = [one for one in batch if not (one.done or one.left)]
                 self._waiting = back + self._waiting
@@ -106,13 +104,13 @@ class _Group(Generic[W]):
                     one.ready.set()
 
     def _take(self, batch: list[_Waiting[W]], *, all_: bool = False) -> None:
-        """Move waiting writes, from the first on, to `batch`."""
+        """Move the first waiting writes to `batch`."""
         with self._list:
             batch[:] = self._waiting[: None if all_ else MOST_TOGETHER]
             del self._waiting[: len(batch)]
 
     def _write_together(self, batch: list[_Waiting[W]]) -> None:
-        """Write the waiting writes in one transaction, and return them in `batch`."""
+        """Perform waiting writes in one transaction, and return them in `batch`."""
         raise NotImplementedError
 
 
@@ -120,7 +118,7 @@ _Work = Callable[[Connection], Any]
 
 
 class Grouping(_Group[_Work]):
-    """Share transactions on one database between threads.
+    """Group of threads that share transactions on one database.
 
     Parameters
     ----------
@@ -132,36 +130,32 @@ class Grouping(_Group[_Work]):
         self._database, self._map_number = database, map_number
 
     def run(self, do: Callable[[Connection], T]) -> T:
-        """Call a function in a writing transaction, and return when it is committed.
+        """Call a function in a write transaction, and return its result after the commit.
 
         Parameters
         ----------
-        do : function. It may be called several times, and must raise errors other than
+        do : function that writes. It may be called several times, and must raise errors other than
             `UnusableStore` before it writes, since other writes of the transaction continue
-
-        Raises
-        ------
-        errors of `do` and of `Database.write`
         """
-        own = copy_context()  # another thread may call it, with this thread's request
+        own = copy_context()  # another thread may call the function
         return cast(T, self._await(lambda connection: own.run(do, connection)))
 
     def _write_together(self, batch: list[_Waiting[_Work]]) -> None:
-        """Write the waiting writes in one transaction, or each alone."""
+        """Perform waiting writes in one transaction, or each in its own after an error."""
         try:
             with self._database.write(map_number=self._map_number) as connection:
-                self._take(batch)  # only in the turn, as more have arrived since
+                self._take(batch)  # after the wait for the lock, since more writes have arrived
                 for one in batch:
                     _do(one, connection)
         except Exception as error:
-            if not batch:  # the turn never came: the others have waited as long
+            if not batch:  # the lock was not acquired, so all waiting writes fail
                 self._take(batch, all_=True)
             of_all = isinstance(error, UnusableStore) and not is_conflict(error)
             if len(batch) == 1 or of_all:
                 for one in batch:
                     one.result, one.error = None, error
             else:
-                for one in batch:  # one write failed the transaction of all
+                for one in batch:  # one write made the shared transaction fail
                     self._write_alone(one)
                     one.done = True
         for one in batch:
@@ -187,7 +181,7 @@ def _do(one: _Waiting[_Work], connection: Connection) -> None:
 
 
 class NewFrames(_Group[NewFrame]):
-    """Insert new frames of many threads and maps by one statement on PostgreSQL.
+    """Group of threads that insert new frames of many maps by one statement on PostgreSQL.
 
     Parameters
     ----------
@@ -199,16 +193,16 @@ class NewFrames(_Group[NewFrame]):
         self._database = database
 
     def receive(self, frame: NewFrame) -> bool:
-        """Insert a frame, and return when it is committed.
+        """Insert a frame, and return after the commit.
 
         Returns
         -------
-        inserted : False, and nothing was written, if it must be written alone: see
-            `receive_frames`; or another frame of the statement failed, or a map was in use
+        inserted : whether the frame was inserted. If not, it must be written alone, because it is
+            not new (see `receive_frames`), another frame failed, or a map was locked
 
         Raises
         ------
-        UnusableStore : see `Database.write`.
+        UnusableStore : See `Database.write`.
         """
         return cast(bool, self._await(frame))
 
@@ -224,7 +218,7 @@ class NewFrames(_Group[NewFrame]):
         except UnusableStore as error:
             for one in batch:
                 one.error = error
-        except Exception:  # writing each alone shows which one is wrong
+        except Exception:  # separate writes show which frame is wrong
             for one in batch:
                 one.result = False
         for one in batch:

@@ -1,4 +1,4 @@
-"""Running jobs: claim the next one, do it, or put it back."""
+"""Execution of jobs: claim the next one, run it, or put it back."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from sceneprint_client.api import JobState
 
 
 class JobRunner:
-    """Runs the jobs of a store: signs frames, and does slices of long jobs.
+    """Runner of a store's jobs: signing of frames, and slices of long jobs.
 
     Attributes
     ----------
-    handlers : of long jobs, by kind
+    handlers : handlers of long jobs, by kind
     """
 
     def __init__(self, context: Context) -> None:
@@ -46,18 +46,18 @@ class JobRunner:
         self._tasks = Tasks(context.store, context.bell, self.handlers)
 
     def claim(self, worker: str) -> Work | LongJob | None:
-        """Take the next job, or None if there is none; see `signature_job.claim`."""
+        """Claim the next job; return None if there is none. See `signature_job.claim`."""
         return signature_job.claim(self._context.store, worker, self._context.settings.job_lease_s)
 
     def due_in_s(self) -> float | None:
-        """Return the seconds until the next job that waits can be claimed; None if none waits."""
+        """Return the seconds until the next queued job is due; None if no job is queued."""
         with self._context.store.database.read() as connection:
             return queue.due_in_s(connection)
 
     def run(self, work: Work | LongJob, broke: Callable[[], None] | None = None) -> JobState | None:
-        """Do a claimed job, or a slice of a long one; see `signature_job.run` and `Tasks.run`."""
+        """Run a claimed job or a slice of it; see `signature_job.run` and `Tasks.run`."""
         context, settings = self._context, self._context.settings
-        with work_of(work.job.tenant):  # so are jobs that it queues
+        with work_of(work.job.tenant):  # new jobs belong to the same tenant
             if isinstance(work, LongJob):
                 return self._tasks.run(work, settings.job_lease_s, settings.job_timeout_s, broke)
             return signature_job.run(
@@ -66,7 +66,7 @@ class JobRunner:
             )  # fmt: skip
 
     def put_back(self, work: Work | LongJob) -> None:
-        """Return a claimed job undone."""
+        """Return a claimed job to the queue."""
         if isinstance(work, LongJob):
             self._tasks.put_back(work)
         else:

@@ -1,4 +1,4 @@
-"""The life of jobs of single frames: release, reject, fail, cancel and retry; and lease renewal."""
+"""Transitions of jobs of single frames, such as cancellation and retry, and lease renewal."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
 log = logging.getLogger(__name__)
 
-#: Seconds until a job is due again whose result could not be stored.
+#: Seconds until a job whose result could not be stored is due again.
 LEFT_S = 5.0
 
 
@@ -73,7 +73,7 @@ def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
 
 
 def restart_jobs(store: Store, work: Work) -> JobState | None:
-    """Queue or cancel a job whose model its map no longer uses."""
+    """Queue or cancel a job whose model the map no longer uses."""
     if not work.again:
         put_back(store, work)
         return JobState.QUEUED
@@ -91,7 +91,7 @@ def record_job_event(connection: Connection, kind: str, work: Work) -> None:
 
 
 def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
-    """Reject a frame that holds nothing to sign, which another attempt would not change."""
+    """Reject a frame that cannot be signed, since another attempt would fail too."""
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
         with store.database.write(map_number=work.map.number) as connection:
@@ -109,7 +109,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
 
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
-    """Queue a failed job for another attempt, or declare it dead."""
+    """Queue a failed job for another attempt, or mark it dead."""
     reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
@@ -128,7 +128,7 @@ def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
 
 
 def failure_texts(error: Exception) -> tuple[str, str]:
-    """Return the message and traceback of an error that a job failed with."""
+    """Return the message and the traceback of a job's error."""
     reason = str(error)
     if not isinstance(error, SceneprintError):
         reason = f"{type(error).__name__}: {error}"
@@ -145,7 +145,7 @@ def about(work: Work, **more: object) -> dict[str, object]:
 
 @contextmanager
 def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> Iterator[None]:
-    """Renew a lease in another thread during the work."""
+    """Renew a lease in another thread during the work, for at most `longest_s` seconds."""
     done = threading.Event()
 
     def renew() -> None:
@@ -155,7 +155,7 @@ def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> It
                 with store.database.write(turn=False) as connection:
                     queue.renew(connection, claim, lease_s)
             except LostLease:
-                return  # storing the result will fail
+                return  # storing the result fails later
             except SceneprintError as error:  # the database may recover before the lease ends
                 log.warning("lease not renewed", extra={"error": str(error)})
 
@@ -179,11 +179,11 @@ def list_jobs(
     store: Store, state: JobState | None = None, cursor: str | None = None, limit: int = 100,
     kind: str | None = None, map_names: Collection[str] | None = None,
 ) -> Page[Job]:  # fmt: skip
-    """Return a page of jobs, the newest first; see `queue.list_jobs`.
+    """Return a page of jobs, newest first; see `queue.list_jobs`.
 
     Raises
     ------
-    InvalidRequest : the service did not issue the cursor.
+    InvalidRequest : If the service did not issue the cursor.
     """
     before = store.seals.row("job", cursor)
     with store.database.read() as connection:
@@ -202,41 +202,41 @@ def get_job(store: Store, job_id: str) -> Job:
 
 
 def cancel(store: Store, job_id: str) -> Job:
-    """Cancel a job that is not over; a cancelled job is returned unchanged.
+    """Cancel a job that is not over; return a cancelled job unchanged.
 
-    A worker that runs it continues, and its result is refused. The archive of an import is removed
-    at once.
+    A worker that runs the job continues, but its result is refused. The archive of an import is
+    removed immediately.
 
     Raises
     ------
-    UnknownJob : the job does not exist.
-    JobOver : the job is over.
+    UnknownJob : If the job does not exist.
+    JobOver : If the job has succeeded or failed.
     """
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
-        gone: list[str] = []
+        unused: list[str] = []
         if job.state != JobState.CANCELLED:
             queue.cancel(connection, job)
             record_change(connection, "job.cancelled", _map_name(connection, job), job.id)
             fail_frame(connection, job, CANCELLED)
-            gone = queue.remove_parts(connection, job.number, items=False, files=[ARCHIVE])
+            unused = queue.remove_parts(connection, job.number, items=False, files=[ARCHIVE])
         cancelled = _job_record(connection, queue.find_job(connection, job_id))
-    collect_deleted_blobs(store, gone)
+    collect_deleted_blobs(store, unused)
     return cancelled
 
 
 def retry(store: Store, bell: Wakeup, job_id: str) -> tuple[Job, bool]:
-    """Retry a job that failed or was cancelled, by a new job of the same priority.
+    """Retry a failed or cancelled job by a new job of the same priority.
 
     Returns
     -------
-    job : new job
-    new : False if another job retries the frame already, which is returned
+    job : new job, or an existing one that retries the frame already
+    is_new : whether the job is new
 
     Raises
     ------
-    UnknownJob : the job does not exist.
-    CannotRetry : the job succeeded, its frame has a later job that is over, or the upload is
+    UnknownJob : If the job does not exist.
+    CannotRetry : If the job succeeded, its frame has a later job that is over, or the upload is
         missing.
     """
     job, is_new = _retry(store, job_id)
@@ -257,8 +257,8 @@ def _retry(store: Store, job_id: str) -> tuple[Job, bool]:
             return _job_record(connection, latest), False
         if latest.number != job.number:
             raise CannotRetry(
-                f"Job {job.id} was replaced by {latest.id}, which is {latest.state}. Retry that "
-                "one."
+                f"Job {job.id} was replaced by {latest.id}, which is {latest.state}. Retry the "
+                "latter."
             )
         can_retry = frame.state in _GIVEN_UP
         if job.kind == REENCODE:
@@ -285,13 +285,13 @@ def retry_dead(
     store: Store, bell: Wakeup, cursor: str | None = None, limit: int = 100,
     map_names: Collection[str] | None = None,
 ) -> RetriedJobs:  # fmt: skip
-    """Retry a page of dead jobs, the newest first; ignore jobs that were retried already.
+    """Retry a page of dead jobs, newest first; ignore jobs that were already retried.
 
-    Each retry is a commit of its own, so those before an error stay.
+    Each retry has its own transaction, so retries before an error remain.
 
     Raises
     ------
-    InvalidRequest : the service did not issue the cursor.
+    InvalidRequest : If the service did not issue the cursor.
     """
     page = list_jobs(store, JobState.DEAD, cursor, limit, map_names=map_names)
     retried, refused = [], []
@@ -310,9 +310,9 @@ def retry_dead(
 def worker_died(
     store: Store, job_id: str, token: int, error: str, traceback: str, *, counts: bool
 ) -> JobState | None:
-    """Take a job from a dead worker, without waiting for the end of its lease.
+    """Release a job of a dead worker before the end of its lease.
 
-    Parameters as in `queue.fail_dead_worker`. Return the state of the job; None if nothing changed.
+    See `queue.fail_dead_worker` for parameters. Return the state of the job; None if unchanged.
     """
     with store.database.write() as connection:
         job = fail_dead_worker(connection, job_id, token, error, traceback, counts=counts)
@@ -342,7 +342,7 @@ def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
 
 
 def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
-    """Continue a long job where it stopped, as the same job."""
+    """Continue a failed long job after its last slice."""
     if not job.state.over:
         return _job_record(connection, job), False
     if job.state == JobState.SUCCEEDED:

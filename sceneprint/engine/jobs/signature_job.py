@@ -45,9 +45,9 @@ AWAY_S, AGAIN_S = 12.0, 0.5
 
 
 def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob | None:
-    """Claim the next job, or return None; declare jobs dead that kill every worker.
+    """Claim the next job; return None if there is none. Mark jobs dead that kill every worker.
 
-    A job without a single frame is a LongJob. See also `queue.claim`.
+    A job that does not belong to a frame is a LongJob. See also `queue.claim`.
     """
     with store.database.read() as connection:
         if not queue.has_due(connection):
@@ -59,16 +59,16 @@ def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob
                 if job.kind != REENCODE:
                     lifecycle.fail_frame(connection, job, job.error)
     with store.database.write(turn=False) as connection:
-        held = queue.claim(connection, worker, lease_s)
-        if held is None:
+        claimed = queue.claim(connection, worker, lease_s)
+        if claimed is None:
             return None
-        if held.frame_number is None:
-            number = held.map_number
-            return LongJob(held, None if number is None else map_of_number(connection, number))
-        frame = frame_of(connection, held.frame)
-        if held.kind != REENCODE:
+        if claimed.frame_number is None:
+            number = claimed.map_number
+            return LongJob(claimed, None if number is None else map_of_number(connection, number))
+        frame = frame_of(connection, claimed.frame)
+        if claimed.kind != REENCODE:
             set_state(connection, frame.number, FrameState.SIGNING)
-        return lifecycle.Work(held, frame, map_of_number(connection, frame.map_number))
+        return lifecycle.Work(claimed, frame, map_of_number(connection, frame.map_number))
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,11 @@ def run(
 
     Parameters
     ----------
-    work : job of `claim`
+    work : claimed job
     lease_s : seconds of each renewal
-    longest_s : seconds after which the lease is no longer renewed, as such work does not end
-    broke : function that is called after an unexpected error, when its result is stored: the state
-        of this process may be damaged
+    longest_s : seconds after which the lease is no longer renewed, as the work may never end
+    broke : function that is called after an unexpected error, since the state of this process may
+        be damaged
 
     Returns
     -------
@@ -115,8 +115,8 @@ def run(
     except errors.FrameError as error:
         state = lifecycle.reject(store, work, error)
     except errors.UnusableStore:  # a full disk does not count as a failure of the frame
-        with suppress(errors.UnusableStore):  # else the lease ends by itself
-            # later than others, as only this worker may be unable to write
+        with suppress(errors.UnusableStore):  # otherwise, the lease expires
+            # with a delay, so that another worker can claim it, whose disk may have room
             lifecycle.put_back(store, work, lifecycle.LEFT_S)
             if result is not None:
                 collect_blobs(store, [result.signature.geometry])
@@ -138,7 +138,7 @@ def run(
 
 
 def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> SigningResult:
-    """Sign a frame, and store its artifact."""
+    """Sign a frame and store its artifact."""
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
@@ -177,7 +177,7 @@ def _store(
 
     Returns
     -------
-    blobs : blobs that nothing refers to any more, if the frame is redundant
+    blobs : blobs of a redundant frame, which are unreferenced now
     """
     signature = result.signature
     if work.again:
@@ -238,7 +238,7 @@ def _replace_signature(store: Store, work: lifecycle.Work, signature: StoredSign
 
     Returns
     -------
-    blobs : blobs that the frame no longer refers to
+    blobs : former blobs of the frame
     """
     number = work.frame.number
     with store.database.write(map_number=work.frame.map_number) as connection:
@@ -257,22 +257,22 @@ def _replace_signature(store: Store, work: lifecycle.Work, signature: StoredSign
 
 # Novelty: `if_novel` of an upload rejects frames of places that the map has.
 #
-# signature  --find_nearest-->  Nearest, as of a revision  --why_redundant, in the commit-->  reason
+# signature  --find_nearest-->  Nearest, at a revision  --why_redundant, in the commit-->  reason
 #
-# The search holds no lock. The commit compares frames that were indexed since, so that of two
-# simultaneous frames of one place only one is stored.
+# The search holds no lock. The commit compares frames that were indexed after it, so that only one
+# of two simultaneous frames of a place is stored.
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """Number and distance of a map's nearest frame as of a revision; None in an empty map."""
+    """The number and the distance of a map's nearest frame at a revision; None in an empty map."""
 
     revision: int
     nearest: tuple[int, int] | None
 
 
 class Stale(Exception):
-    """The nearest frame was deleted since the search, so that the next one is unknown."""
+    """The nearest frame was deleted after the search, so the search must be repeated."""
 
 
 def find_nearest(
@@ -282,15 +282,15 @@ def find_nearest(
 
     Parameters
     ----------
-    row : map, as last read
+    row : row of the map, as last read
 
     Returns
     -------
-    nearest : None if the map has another model now, whose signatures cannot be compared
+    nearest : nearest frame; None if the map has another model now
 
     Raises
     ------
-    LostLease : the map was deleted, and the job with it.
+    LostLease : If the map was deleted together with the job.
     """
     with database.read() as connection:
         try:
@@ -314,7 +314,7 @@ def why_redundant(
 
     Raises
     ------
-    Stale : search again.
+    Stale : If the nearest frame was deleted, so the search must be repeated.
     """
     novelty = frame_of(connection, frame.number).novelty  # another upload may have relaxed it
     row = map_of_number(connection, frame.map_number)

@@ -1,9 +1,9 @@
-"""Long jobs, which are not about a single frame and run in slices.
+"""Long jobs, which do not belong to a single frame and run in slices.
 
     queue_task  -->  queued  --claim-->  LongJob  --Tasks.run-->  a SliceResult for each slice
 
-The results and progress of a slice are one commit, fenced by the job's token. If a worker dies, its
-slice is repeated.
+Results and progress of a slice are stored in one commit, which checks the job's token. The slice of
+a dead worker is repeated.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class LongJob:
     Parameters
     ----------
     job : job as claimed
-    map : its map; None: it has none
+    map : map of the job; None for a job without a map
     """
 
     job: JobRow
@@ -90,7 +90,7 @@ class SliceResult:
     items : items of this slice
     files : files of this slice, whose blobs exist
     result : summary, at the end
-    drop : names of files of the job that are no longer needed
+    drop : names of files of the job to remove
     event : kind of the event at the end, such as association.found; its data is `result`
     write : function that stores more in the commit, and returns blobs that may be unused
     blobs : existing blobs that `write` refers to
@@ -109,17 +109,17 @@ class SliceResult:
     after_s: float = 0.0
 
 
-#: Returns whether a slice must end, as its time is over or another job waits.
+#: Function that returns whether a slice must end, since its time is over or another job waits.
 IsOver = Callable[[], bool]
-#: Runs a slice of a job until it must end, at least one step; it may be repeated.
+#: Function that runs a slice, at least one step; a slice may be repeated.
 Handler = Callable[[LongJob, IsOver], SliceResult]
 
 
 log = logging.getLogger(__name__)
 
-#: Maximum seconds of a slice, and between two checks whether another job waits.
+#: Maximum duration of a slice, and interval of checks for waiting jobs, in seconds.
 SLICE_S, LOOK_S = 15.0, 0.1
-#: Errors that a retry does not help.
+#: Errors after which a retry would fail too.
 HOPELESS = (
     FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, QuotaExceeded,
 )  # fmt: skip
@@ -139,52 +139,52 @@ def queue_task(
 
     Parameters
     ----------
-    kind : of the job, such as associate
-    map_name : the map that the job works on, or None
-    data : the request, as JSON
-    priority : on the same scale as that of frames
-    files : that the job works on
-    once : the request that is to take effect once
+    kind : kind of the job, such as associate
+    map_name : map of the job; None for a job without a map
+    data : request as JSON
+    priority : priority, on the same scale as that of frames
+    files : files of the job, whose blobs exist
+    once : idempotent request
 
     Returns
     -------
-    job : the job as it is now
+    job : current state of the job
     replayed : whether an earlier request with the key of `once` queued the job
 
     Raises
     ------
-    UnknownMap : no such map.
-    Swept : a file is gone; put it once more.
-    IdempotencyConflict : an earlier request with the key of `once` differs from this one.
-    QuotaExceeded : the map has no room for an archive among the files.
+    UnknownMap : If the map does not exist.
+    Swept : If the blob of a file was removed, so it must be stored again.
+    IdempotencyConflict : If an earlier request with the key of `once` differs from this one.
+    QuotaExceeded : If the map has no room for an archive among the files.
     """
     with store.database.write() as connection:
         row = None if map_name is None else find_map(connection, map_name)
         before = None if once is None else once.stored_result(connection)
         if before is not None:
-            with suppress(UnknownJob):  # its map may have been deleted and made anew
-                there = queue.find_job(connection, before["job_id"])
-                return job_record(there, None, map_name), True
+            with suppress(UnknownJob):  # the map may have been deleted and created again
+                job_before = queue.find_job(connection, before["job_id"])
+                return job_record(job_before, None, map_name), True
         _check_files(store, files)
         size = sum(one.bytes for one in files if one.name == ARCHIVE)
-        gone = [] if row is None else make_room(connection, row, size, new=False)
+        unused = [] if row is None else make_room(connection, row, size, new=False)
         number = None if row is None else row.number
         job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)
         queue.add_files(connection, job.number, files)
         record_change(connection, "job.queued", map_name, job.id, kind=kind)
         if once is not None:
             once.store(connection, {"job_id": job.id})
-    collect_deleted_blobs(store, gone)
+    collect_deleted_blobs(store, unused)
     bell.ring()
     return job_record(job, None, map_name), False
 
 
 class Tasks:
-    """Runs slices of long jobs.
+    """Runner of slices of long jobs.
 
     Parameters
     ----------
-    handlers : by the kinds of jobs that this process can run
+    handlers : handlers by the kinds of jobs that this process can run
     """
 
     def __init__(self, store: Store, bell: Wakeup, handlers: Mapping[str, Handler]) -> None:
@@ -227,7 +227,7 @@ class Tasks:
         return state
 
     def _end_of_slice(self, job: JobRow) -> IsOver:
-        """Return when a slice that begins now must end."""
+        """Return the function that ends a slice which starts now."""
         until, look_at = time.monotonic() + SLICE_S, 0.0
 
         def is_over() -> bool:
@@ -242,24 +242,24 @@ class Tasks:
         return is_over
 
     def put_back(self, task: LongJob, after_s: float = 0.0) -> None:
-        """Queue a claimed job that was not started."""
+        """Return a claimed job to the queue, due after `after_s` seconds."""
         with suppress(LostLease, UnusableStore), self._store.database.write() as connection:
             queue.release_job(connection, task.job, after_s)
 
     def _store_result(self, task: LongJob, outcome: SliceResult) -> JobState:
         try:
-            gone = self._commit(task, outcome)
-        except Exception:  # nothing refers to the blobs
+            unused_now = self._commit(task, outcome)
+        except Exception:  # the blobs are unreferenced
             unused = [*(file.blob for file in outcome.files), *outcome.blobs]
             collect_deleted_blobs(self._store, unused)
             raise
-        collect_deleted_blobs(self._store, gone)
+        collect_deleted_blobs(self._store, unused_now)
         if not outcome.over:
             self._bell.ring()
         return JobState.SUCCEEDED if outcome.over else JobState.QUEUED
 
     def _commit(self, task: LongJob, outcome: SliceResult) -> list[str]:
-        """Store the results of a slice, and return blobs that may be unused now."""
+        """Store the results of a slice, and return blobs that may be unreferenced now."""
         job, number = task.job, None if task.map is None else task.map.number
         with self._store.database.write(map_number=number) as connection:
             if outcome.over:
@@ -277,14 +277,14 @@ class Tasks:
             _check_files(self._store, outcome.files)
             if not all(map(self._store.blobs.holds, outcome.blobs)):
                 raise Swept("A deletion removed the same bytes before they were stored.")
-            # after the job, which fails if the job was deleted
+            # after the changes of the job, which fail if it was deleted
             queue.append_items(connection, job.number, outcome.items)
             before = queue.files_of(connection, job.number)
-            gone = _make_room(connection, task.map, before, outcome.files)
+            unused = _make_room(connection, task.map, before, outcome.files)
             queue.add_files(connection, job.number, outcome.files)
-            gone += queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
-            gone += [before[one.name].blob for one in outcome.files if one.name in before]
-            return gone if outcome.write is None else [*gone, *outcome.write(connection)]
+            unused += queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
+            unused += [before[one.name].blob for one in outcome.files if one.name in before]
+            return unused if outcome.write is None else [*unused, *outcome.write(connection)]
 
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
         try:
@@ -305,12 +305,10 @@ class Tasks:
 
 
 def _check_files(store: Store, files: Collection[queue.JobFile]) -> None:
-    """Raise Swept if a file is gone, in the transaction that refers to them from now on."""
+    """Raise Swept if the blob of a file is missing in the transaction that refers to it."""
     for one in files:
         if not store.blobs.holds(one.blob):
-            raise Swept(
-                f"A deletion elsewhere swept the same {one.name} before its job was stored."
-            )
+            raise Swept(f"A deletion removed the blob of {one.name} before its job was stored.")
 
 
 def _make_room(

@@ -303,7 +303,8 @@ def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Pat
             )
         if row.next_model_id is None and row.model_id == next_model.id:
             raise errors.Conflict(
-                f"Map {row.name!r} is already signed with {next_model.label}. Nothing to do."
+                f"Map {row.name!r} is already signed with {next_model.label}. There is nothing "
+                "to do."
             )
         if row.next_model_id is None:
             store_model(connection, next_model.id, next_model.name, write_model(next_model))
@@ -373,7 +374,7 @@ class Reencodings:
             if not stored.is_complete(connection, row):
                 return False  # failed jobs wait for a retry or a cancellation by the operator
         try:
-            version = self._upkeep.ahead(row)
+            version = self._upkeep.publish_next(row)
         except errors.BusyIndex:
             return False  # a later call tries again
         return self._switch(row, version)
@@ -450,7 +451,7 @@ class Catalogue:
         self._database = database
         self._known: dict[str, Model] = {}
 
-    def tell(self, may_read: Callable[[str], bool]) -> list[ModelInfo]:
+    def list_all(self, may_read: Callable[[str], bool]) -> list[ModelInfo]:
         """Return the records of all models, presets first, then by label.
 
         Parameters

@@ -1,1 +1,1 @@
-"""What jobs compute from maps: coverage, associations and differences of sessions, surfaces."""
+"""Products of jobs: coverage, associations and differences of sessions, and reconstructions."""

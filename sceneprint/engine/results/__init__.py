@@ -1,1 +1,1 @@
-"""The log of queries, and what can be looked at after one."""
+"""The query log, and views of stored answers."""

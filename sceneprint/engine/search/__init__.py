@@ -1,1 +1,1 @@
-"""A query from its body to its answer."""
+"""Queries: retrieval, verification and answers."""

@@ -259,7 +259,7 @@ def _answer(
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
     """Return the answer for the last frame of a query, and the numbers of the frames of R."""
     prepared, searched, p = last.prepared, last.searched, model.parameters.validation
-    ranking, tried = searched.ranking, _all_tried(store, last, query, deadline, p)
+    ranking, tried = searched.ranking, _validate_more(store, last, query, deadline, p)
     clock.stage("validate")
     # rejected rivals are not matches
     rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
@@ -327,7 +327,7 @@ def _listed_matches(
     return match_records(candidates, [*chosen, *beyond], [*shown, *elsewhere])
 
 
-def _all_tried(
+def _validate_more(
     store: Store, last: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
 ) -> Validated:
     """Return the validations of all candidates, and validate more of them if `k` requires it."""

@@ -301,7 +301,7 @@ class IndexPlace:
 
         Raises
         ------
-        DamagedIndex : it is damaged in the store; it was withdrawn, and workers build it anew.
+        DamagedIndex : If it is damaged in the store; it was withdrawn, and workers build it anew.
         """
         folder, found = self.folder(row), self.head(row)
         if self._store is None or found is None or found.model_id != row.model_id:

@@ -147,7 +147,7 @@ class AppendBuffer:
 
         Raises
         ------
-        UnusableStore : there is no room on the disk.
+        UnusableStore : If there is no room on the disk.
         """
         n = len(self)
         if n + more > self._capacity:

@@ -1,1 +1,1 @@
-"""What a worker does between jobs: publish, purge, repair."""
+"""Tasks of workers between jobs: publication of indexes, purges and repairs."""

@@ -1,11 +1,11 @@
-"""Garbage collection of blobs: those that nothing refers to any more are removed.
+"""Garbage collection of unreferenced blobs.
 
-blobs  --collect_blobs-->  removed, or doomed while a snapshot is being taken
+blobs  --collect_blobs-->  removed, or doomed during a snapshot
 doomed blobs  --collect_doomed_blobs-->  removed
 
-Where a fleet keeps its blobs in an object store, no writer waits for that store: one turn dooms
-blobs, they are removed after it, and another turn settles them. Who comes to refer to one of them
-meanwhile waits for the end of the removal (`ObjectBlobs.holds`).
+With an object store, writers do not wait for removals: one transaction dooms the blobs, they are
+removed, and another transaction clears the marks. A new reference to a doomed blob waits for the
+end of its removal (`ObjectBlobs.holds`).
 """
 
 from __future__ import annotations
@@ -26,22 +26,27 @@ from sceneprint.store.frames import referred_blobs, refers_to
 
 log = logging.getLogger(__name__)
 
-#: Blobs that are found and removed at once, of a store of objects by one request: writers wait
-#: while they are found, and in a folder while they are removed.
+#: Number of blobs to check and remove at once. Writers wait during the check, and in a folder also
+#: during the removal.
 SWEPT_AT_ONCE = 200
-#: Seconds to wait for another removal.
+#: Seconds to wait for a removal by another process.
 _PATIENCE_S = 5.0
 #: Name of a file in quarantine.
 _BLOB = re.compile("blob-([0-9a-f]{64})")
-#: Blobs of deleted frames that are asked for at once.
+#: Number of doomed blobs to read at once.
 _LEFT_AT_ONCE = 1_000
 
 
 def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
-    """Remove blobs that nothing refers to any more. Short write transactions find them, so that no
-    upload can refer to one meanwhile. During a snapshot, which may refer to them, and while another
-    process removes blobs, they stay, and `collect_doomed_blobs` removes them later. Raise
-    UnusableStore if some could not be removed; those are doomed.
+    """Remove those of some blobs that are unreferenced.
+
+    The check is a write transaction, so that no upload can add a reference meanwhile. During a
+    snapshot or a removal by another process, blobs are only doomed, and `collect_doomed_blobs`
+    removes them later.
+
+    Raises
+    ------
+    UnusableStore : If some blobs could not be removed; they are doomed.
     """
     store.geometries.forget(blobs)
     if not blobs:
@@ -53,41 +58,41 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
 
 
 def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
-    """Remove those of some blobs that nothing refers to; False where they have to stay for now."""
+    """Remove unreferenced blobs in a transaction; return False if they are only doomed for now."""
     with store.database.write() as connection, store.blobs.removing() as allowed:
         if not allowed:
             doom(connection, block)
             return False
-        kept = referred_blobs(connection, block)
-        store.blobs.remove(*(blob for blob in block if blob not in kept))
+        referred = referred_blobs(connection, block)
+        store.blobs.remove(*(blob for blob in block if blob not in referred))
         clear_doomed(connection, block)
         return True
 
 
 def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
-    """As `_remove_in_turn`; they are doomed until they are known to be gone, whoever dies."""
+    """Remove unreferenced blobs after a transaction that dooms them; see `_remove_in_turn`."""
     with suppress(StoreLocked):
-        store.blobs.wait_for_removal(seconds=_PATIENCE_S)  # else these would be left for later
+        store.blobs.wait_for_removal(seconds=_PATIENCE_S)  # else the blobs would only be doomed
     with ExitStack() as removal:
         with store.database.write() as connection:
             if not removal.enter_context(store.blobs.removing()):
-                doom(connection, block)  # and settle nothing: it may be on its way out elsewhere
+                doom(connection, block)
                 return False
-            kept = referred_blobs(connection, block)
-            # a removal that lost its lock may still be at the others, and `holds` must know
-            clear_doomed(connection, [*kept], before=time.time() - LONGEST_S)
-            gone = [blob for blob in block if blob not in kept]
-            at = doom(connection, gone)
-        store.blobs.remove(*gone)
-    if not gone:
+            referred = referred_blobs(connection, block)
+            # younger marks may belong to a removal that lost its lock but still runs
+            clear_doomed(connection, [*referred], before=time.time() - LONGEST_S)
+            unreferenced = [blob for blob in block if blob not in referred]
+            at = doom(connection, unreferenced)
+        store.blobs.remove(*unreferenced)
+    if not unreferenced:
         return True
     with store.database.write() as connection:
-        clear_doomed(connection, gone, at)
+        clear_doomed(connection, unreferenced, at)
     return True
 
 
 def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:
-    """As `collect_blobs`, after a deletion that took effect already: failures are only logged."""
+    """Collect blobs after a committed deletion; log errors instead of raising them."""
     try:
         collect_blobs(store, blobs)
     except UnusableStore as error:
@@ -95,15 +100,11 @@ def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:
 
 
 def collect_quarantined(store: Store, folder: Path) -> int:
-    """Remove damaged bytes that were set aside, once what they belonged to is gone.
+    """Remove quarantined blobs that are unreferenced, and return their number.
 
     Parameters
     ----------
-    folder : with `blob-DIGEST`; what else lies there is none of ours
-
-    Returns
-    -------
-    removed : number of files
+    folder : folder with files `blob-DIGEST`; other files are ignored
     """
     removed = 0
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -121,17 +122,17 @@ def collect_quarantined(store: Store, folder: Path) -> int:
 def collect_doomed_blobs(
     store: Store, before: float | None = None, seconds: float = math.inf
 ) -> int:
-    """Remove what was doomed and is still there: its process died, or a snapshot was being taken.
+    """Remove doomed blobs that remain after a snapshot or after the death of a process.
 
     Parameters
     ----------
-    before : only what was doomed before this time, seconds since 1970: of what is younger,
-        somebody may be at it
-    seconds : after which the rest is left for another time
+    before : time before which blobs must be doomed, seconds since 1970, since another process may
+        be removing younger ones; None selects all
+    seconds : duration after which the rest remains
 
     Returns
     -------
-    swept : number of blobs that were looked at
+    count : number of checked blobs
     """
     until, last, count = time.monotonic() + seconds, "", 0
     while time.monotonic() < until:

@@ -1,4 +1,4 @@
-"""What workers do between jobs: publish indexes, switch models, and remove what has expired."""
+"""Housekeeping of workers between jobs: indexes, switches of models, and removal of old data."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from sceneprint.store.events import number_events
 
 
 def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
-    """Return what purges deleted frames.
+    """Return the object that purges deleted frames.
 
     Parameters
     ----------
-    upkeep : of the indexes; default: one of its own
+    upkeep : upkeep of the indexes; None creates one
     """
     settings, store = context.settings, context.store
     upkeep = upkeep or Upkeep(store, context.signers, settings, context.indexes)
@@ -35,7 +35,7 @@ def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
 
 
 class Housekeeping:
-    """The housekeeping of one process; any number of processes may do it."""
+    """The housekeeping of one process; any number of processes may run it."""
 
     def __init__(self, context: Context) -> None:
         settings, store, bell = context.settings, context.store, context.bell
@@ -51,9 +51,9 @@ class Housekeeping:
         self.purging = purging_of(context, self.upkeep)
 
     def run(self) -> int:
-        """Do what is due, and return how many indexes were published."""
+        """Run all tasks that are due, and return the number of published indexes."""
         store = self._context.store
-        number_events(store.database)  # where nobody reads them
+        number_events(store.database)  # in case that no reader does
         self.reencodings.run()
         self.retention.run()
         published = self.upkeep.run()

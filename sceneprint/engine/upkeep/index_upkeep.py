@@ -1,4 +1,4 @@
-"""Publishing indexes: a map with many frames or deletions that its index lacks gets a new one."""
+"""Publication of indexes for maps with many new or deleted frames, and verification of indexes."""
 
 from __future__ import annotations
 
@@ -47,25 +47,25 @@ from sceneprint.types import Bytes
 
 log = logging.getLogger(__name__)
 
-#: Seconds for which indexes are verified in one step: frames wait meanwhile.
+#: Seconds for which a step verifies indexes, while jobs wait.
 STEP_S = 0.25
-#: Its date is when the last round was begun, by whichever worker.
+#: Name of the file whose date is the start of the last round of any worker.
 _STAMP = ".scrubbed"
-#: Seconds between two looks for deletions that an index should know of, at most.
+#: Maximum seconds between two checks for old deletions that an index lacks.
 AGING_S = 3600.0
-#: Seconds until a host looks again at a map whose index another builds, or could not be shared.
+#: Seconds until the next attempt after another host built an index, or an error of a shared one.
 ELSEWHERE_S = 30.0
-#: In the folder of an index: read from its times, when it was purged, and when it may be again.
-_REST = ".rest"
+#: Name of the file in the folder of an index with the times of the last and the next purge.
+_PURGED = ".rest"
 
 
 class Scrubber:
-    """Verifies all indexes of the machine, one round after another, by one worker at a time.
+    """Verification of all indexes of the machine in rounds, each by one worker.
 
     Parameters
     ----------
     indexes : folder of all indexes
-    pause_s : seconds from the beginning of one round to that of the next
+    pause_s : seconds between the starts of two rounds
     """
 
     def __init__(self, indexes: Path, pause_s: float) -> None:
@@ -74,15 +74,15 @@ class Scrubber:
         self._looked = -pause_s
 
     def step(self, folders: Sequence[Path]) -> Path | None:
-        """Go on for a moment; begin a round where it is time.
+        """Verify indexes for STEP_S seconds; start a round if it is due.
 
         Parameters
         ----------
-        folders : of the indexes that there are
+        folders : folders of the indexes
 
         Returns
         -------
-        the folder of a file that was damaged and has been removed: its index must be built anew
+        folder : folder of a damaged file, which was removed, so its index must be rebuilt
         """
         if self._round is None and self._is_time():
             self._round = chain.from_iterable(map(scrub, folders))
@@ -95,7 +95,7 @@ class Scrubber:
                 return None
             if damaged is not None:
                 log.error("damaged index file removed", extra={"path": str(damaged)})
-                damaged.unlink(missing_ok=True)  # what names it is passed over from now on
+                damaged.unlink(missing_ok=True)  # readers skip the versions that list it
                 return damaged.parent
         return None
 
@@ -104,26 +104,25 @@ class Scrubber:
             return False
         self._looked = time.monotonic()
         stamp = self._indexes / _STAMP
-        with suppress(OSError):  # never yet
+        with suppress(OSError):  # no round was started yet
             if time.time() - stamp.stat().st_mtime < self._pause_s:
                 return False
         try:
             make_folder(self._indexes)
             stamp.touch(PRIVATE_FILE)
         except OSError:
-            return False  # a cache that cannot be written cannot be healed either
+            return False  # an index could not be rebuilt either
         return True
 
 
 class Upkeep:
-    """Keeps the indexes of one machine near the database.
+    """Publication and verification of the indexes of one machine.
 
     Parameters
     ----------
-    settings : an index may lack `tail_frames` frames, and as many deletions; after `scrub_s`
-        seconds all parts are read again, to see that they are sound; an index that lacks a deletion
-        of `deleted_rows_days` ago cannot be brought up to date
-    place : where the indexes are
+    settings : settings with the maximum number of unindexed frames, the interval of verification,
+        and the days after which deletions are forgotten, so that older indexes must be rebuilt
+    place : place of the indexes
     """
 
     def __init__(
@@ -131,48 +130,49 @@ class Upkeep:
     ) -> None:
         self._store, self._signers, self._place = store, signers, place
         self._tail_frames = settings.unindexed_frames
-        self._elsewhere: dict[int, float] = {}  # by map, when it may be looked at again
-        # map and model: number of their index, and revision
+        self._elsewhere: dict[int, float] = {}  # time of the next attempt, by map
+        # number and revision of the published index, by map and model
         self._published: dict[tuple[int, str], tuple[int, int]] = {}
-        # map and model: parts of their index that this process has verified, by name and inode; to
-        # read all of them for each thousand frames would take longer than to write
+        # inodes of verified parts by name, by map and model; verifying all parts for each version
+        # would take longer than writing it
         self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
         self._metrics: dict[str, Metric | None] = {}
         self._scrubber = Scrubber(settings.indexes, settings.index_check_interval_s)
         self._rows_s = DAY_S * settings.deleted_rows_days
-        # map and model: when it is looked next for deletions that the index should know of by now
+        # time of the next check for old deletions, by map and model
         self._aged = dict[tuple[int, str], float]()
 
     def run(self) -> int:
-        """Publish what is due, and verify a little; returns how many indexes were published.
+        """Publish indexes that are due, run a step of verification, and return the number of
+        published indexes.
 
-        What goes wrong with one map's index is logged, and costs neither the others nor any
-        frame: queries read from the database what no index holds.
+        Errors of single indexes are logged. They affect no answer, since queries read unindexed
+        frames from the database.
         """
         with self._store.database.read() as connection:
             rows = list_maps(connection)
         rows = [row for row in rows if self._metric(row.model_id) == "l2"]
         with self._store.database.read() as connection:
             due = [row for row in rows if self._is_due(connection, row)]
-        # of maps that no other host was at a moment ago
-        now, elsewhere = time.monotonic(), self._elsewhere
-        published = sum(self._tried(row) for row in due if now >= elsewhere.get(row.number, 0.0))
+        # without maps that another host has just handled
+        now, due_at = time.monotonic(), self._elsewhere
+        published = sum(self._try_publish(row) for row in due if now >= due_at.get(row.number, 0.0))
         self._place.remove_unknown()
         damaged = self._scrubber.step([self._place.folder(row) for row in rows])
         for row in rows:
             if self._place.folder(row) == damaged:
-                published += self._tried(row, anyway=True)
+                published += self._try_publish(row, force=True)
         return published
 
     def rebuild(self, row: MapRow) -> IndexVersion:
-        """Publish the index of a map from nothing.
+        """Build and publish the index of a map without reuse of earlier ones.
 
         Raises
         ------
-        UnknownMap : the map is gone.
-        InvalidRequest : there is no indexed frame in it, or its model's signatures are psi itself.
-        BusyIndex : another process is building it.
-        OSError : it cannot be written; what was there stays.
+        UnknownMap : If the map does not exist any more.
+        InvalidRequest : If the map has no indexed frame, or its model has no index.
+        BusyIndex : If another process is building the index.
+        OSError : If the index cannot be written; the former one remains.
         """
         if self._signers(row.model_id).model.metric != "l2":
             raise InvalidRequest(
@@ -180,65 +180,66 @@ class Upkeep:
                 "vectors, and queries compare all of them. If the map is too large for that, "
                 "switch its model with `sceneprint reencode`."
             )
-        version = self._publish(row, anyway=True, anew=True)
+        version = self._publish(row, force=True, rebuild=True)
         if version is None:
             raise BusyIndex(
                 f"The index of map {row.name!r} is being built by another process. Try again later."
             )
         return version
 
-    def ahead(self, row: MapRow) -> IndexVersion | None:
-        """Publish the index of the model that a map is about to switch to, where that is due.
+    def publish_next(self, row: MapRow) -> IndexVersion | None:
+        """Publish the index of a map's next model before the switch, if it is due.
 
-        Where it cannot be written, that is logged, and the map has to do without.
+        Errors of writing are logged, and the map switches without an index.
 
         Returns
         -------
-        the newest index of that model, if there is any; none of a model that has no index
+        version : newest index of the next model; None if there is none
 
         Raises
         ------
-        UnknownMap : the map is gone.
-        BusyIndex : another process is building it.
+        UnknownMap : If the map does not exist any more.
+        BusyIndex : If another process is building the index.
         """
         if row.next_model_id is None:
             raise ValueError(f"map {row.name} has no next model")
-        coming = replace(row, model_id=row.next_model_id)
-        model = self._signers(coming.model_id).model
+        next_row = replace(row, model_id=row.next_model_id)
+        model = self._signers(next_row.model_id).model
         if model.metric != "l2":
             return None
         try:
-            if self._publish(coming) is None:
+            if self._publish(next_row) is None:
                 with self._store.database.read() as connection:
-                    if self._is_due(connection, coming):
+                    if self._is_due(connection, next_row):
                         raise BusyIndex(
                             f"Another process is building the index of map {row.name!r} for the "
                             "model that it is switching to. Wait until the switch is done."
                         )
-            self._place.sync(coming)
-            return self._newest(coming, model)
+            self._place.sync(next_row)
+            return self._newest(next_row, model)
         except (OSError, ValueError, UnusableStore, DamagedIndex) as error:
             log.error("index publication failed", extra={"map": row.name, "error": str(error)})
             return None
 
-    def _tried(self, row: MapRow, *, anyway: bool = False) -> bool:
+    def _try_publish(self, row: MapRow, *, force: bool = False) -> bool:
         try:
-            if anyway and self._place.is_shared:
-                self._place.sync(row)  # what was damaged here is fetched again
+            if force and self._place.is_shared:
+                self._place.sync(row)  # fetches damaged parts again
                 return False
-            return self._publish(row, anyway=anyway) is not None
+            return self._publish(row, force=force) is not None
         except UnknownMap:
-            return False  # deleted in the meantime
+            return False  # the map was deleted meanwhile
         except (OSError, SceneprintError, ValueError) as error:
             log.error("index publication failed", extra={"map": row.name, "error": str(error)})
-            if self._place.is_shared:  # to build it all again each time would be too dear
+            if self._place.is_shared:  # frequent attempts would be too expensive
                 self._elsewhere[row.number] = time.monotonic() + ELSEWHERE_S
             return False
 
     def _metric(self, model_id: str) -> Metric | None:
-        """Return how the signatures of a model are compared; those of L1 have no index.
+        """Return the metric of a model, without an index for L1.
 
-        None where another version made the model, and looks after the indexes of its maps.
+        None if another version of sceneprint stored the model and maintains the indexes of its
+        maps.
         """
         if model_id not in self._metrics:
             self._metrics[model_id] = None
@@ -249,25 +250,25 @@ class Upkeep:
     def _is_due(self, connection: Connection, row: MapRow) -> bool:
         number, since = self._published.get((row.number, row.model_id), (None, 0))
         if not self._place.is_shared and newest_number(self._place.folder(row)) != number:
-            since = 0  # published by another process, or removed: to be looked at
-        return self._is_long(connection, row, since)
+            since = 0  # another process published or removed the index
+        return self._is_outdated(connection, row, since)
 
-    def _is_long(self, connection: Connection, row: MapRow, since: int) -> bool:
-        """Return whether an index of that revision lacks too many frames, or deletions; or will
-        soon be too old to be brought up to date.
+    def _is_outdated(self, connection: Connection, row: MapRow, since: int) -> bool:
+        """Return whether an index at a revision lacks too many frames or deletions, or is soon too
+        old to be updated.
         """
         if since < row.pruned_revision:
             since = 0
         if since and self._is_aging(connection, row, since):
             return True
-        if row.revision - since <= self._tail_frames:  # spares the counting
+        if row.revision - since <= self._tail_frames:  # avoids the counts
             return False
         return count_indexed(connection, row.number, since) > self._tail_frames or (
             count_gone(connection, row.number, since) > self._tail_frames
         )
 
     def _is_aging(self, connection: Connection, row: MapRow, since: int) -> bool:
-        """Return whether an index lacks a deletion whose row has had half of its days."""
+        """Return whether an index lacks a deletion whose row has reached half of its lifetime."""
         key = (row.number, row.model_id)
         if row.revision == since or time.monotonic() < self._aged.get(key, 0):
             return False
@@ -278,17 +279,17 @@ class Upkeep:
         return False
 
     def purge(self, row: MapRow) -> bool:
-        """Leave no byte of a deleted frame in the index of a map, be it here or shared.
+        """Remove all bytes of deleted frames from the local and the shared index of a map.
 
         Returns
         -------
-        whether an index had to be written again
+        is_rewritten : whether the index contained deleted frames
 
         Raises
         ------
-        UnknownMap : the map is gone, and with it soon its index.
-        BusyIndex : another process is building it, and may not know of the latest deletions.
-        OSError, UnusableStore : it cannot be written; what was there stays.
+        UnknownMap : If the map does not exist any more; its index is removed soon.
+        BusyIndex : If another process is building the index, possibly with deleted frames.
+        OSError, UnusableStore : If the index cannot be written; the former one remains.
         """
         if self._metric(row.model_id) == "l1":
             return False
@@ -302,8 +303,8 @@ class Upkeep:
         stale = head is not None and bool(self._place.stale_keys(now, head))
         done = True
         if stale and not empty:
-            done = self._publish(row, anyway=True, clean=True) is not None
-        if done and older:  # also what a builder left that died
+            done = self._publish(row, force=True, clean=True) is not None
+        if done and older:  # also files that a killed builder left
             head = None if empty else self._place.head(row)
             done = self._place.remove_all_but(row, head)
         if not done:
@@ -314,78 +315,78 @@ class Upkeep:
         return stale
 
     def sweep(self, *, now: bool = False) -> None:
-        """Remove shared indexes of maps that are gone, and of models that they had."""
+        """Remove shared indexes of deleted maps and of former models."""
         self._place.sweep(now=now)
 
-    def rest(self, row: MapRow, seconds: float) -> None:
-        """Leave the index of a map in peace for so long, whichever process looks after it."""
+    def postpone_purge(self, row: MapRow, seconds: float) -> None:
+        """Postpone the next purge of a map's index in all processes."""
         now = time.time()
-        with suppress(OSError):  # removed meanwhile: then there is nothing to be left in peace
-            mark = self._place.folder(row) / _REST
+        with suppress(OSError):  # the index was removed meanwhile
+            mark = self._place.folder(row) / _PURGED
             mark.touch(PRIVATE_FILE)
             os.utime(mark, (now, now + seconds))
 
-    def is_rested(self, row: MapRow) -> bool:
-        """Return whether that time is over."""
+    def is_purge_due(self, row: MapRow) -> bool:
+        """Return whether the index of a map may be purged again; see `postpone_purge`."""
         try:
-            found = (self._place.folder(row) / _REST).stat()
+            times = (self._place.folder(row) / _PURGED).stat()
         except OSError:
             return True
-        return not found.st_atime <= time.time() < found.st_mtime  # nor has the clock been set back
+        return not times.st_atime <= time.time() < times.st_mtime  # or the clock was set back
 
     def _publish(
-        self, row: MapRow, *, anyway: bool = False, anew: bool = False, clean: bool = False
+        self, row: MapRow, *, force: bool = False, rebuild: bool = False, clean: bool = False
     ) -> IndexVersion | None:
-        """Publish the index of a map where it is due, or anyway; None where it is not published."""
-        if not anyway and self._is_up_to_date(row):
+        """Publish the index of a map if it is due or forced; return None without publication."""
+        if not force and self._is_up_to_date(row):
             return None
         with self._place.turn(row) as require:
-            if require is None:  # another host builds it
+            if require is None:  # another host is building it
                 self._elsewhere[row.number] = time.monotonic() + ELSEWHERE_S
                 return None
-            if not anew:
+            if not rebuild:
                 self._place.sync(row)
 
             def share(manifest: IndexManifest) -> bool:
                 require()
                 return self._place.share(row, manifest)
 
-            made = self._build(row, share, anyway=anyway, anew=anew, clean=clean)
-            if made is None:
+            version = self._build(row, share, force=force, rebuild=rebuild, clean=clean)
+            if version is None:
                 return None
             self._place.prune(row, clean=clean)
-        self._published[row.number, row.model_id] = made.number, made.revision
-        self._verified[row.number, row.model_id] = made.inodes
+        self._published[row.number, row.model_id] = version.number, version.revision
+        self._verified[row.number, row.model_id] = version.inodes
         log.info(
             "index published",
-            extra={"map": row.name, "version": made.number, "frames": len(made)},
+            extra={"map": row.name, "version": version.number, "frames": len(version)},
         )
-        return made
+        return version
 
     def _build(
-        self, row: MapRow, share: Callable[[IndexManifest], bool], *, anyway: bool,
-        anew: bool, clean: bool,
+        self, row: MapRow, share: Callable[[IndexManifest], bool], *, force: bool,
+        rebuild: bool, clean: bool,
     ) -> IndexVersion | None:  # fmt: skip
-        model = self._signers(row.model_id).model  # before a connection is held: it takes one
+        model = self._signers(row.model_id).model  # outside of a transaction, as it opens one
         after, damaged = self._place.last_number(row), list[int]()
         with self._store.database.read() as connection:
-            allow(connection, 0)  # it does nothing itself, for as long as building takes
+            allow(connection, 0)  # the connection is idle while the index is built
             now = find_map(connection, row.name)
             if row.model_id == now.next_model_id and is_complete(connection, now):
-                now = replace(now, model_id=row.model_id)  # about to be the map's own
+                now = replace(now, model_id=row.model_id)  # the map is about to switch
             if (now.number, now.model_id) != (row.number, row.model_id):
-                return None  # made anew, or signed anew, in the meantime; next time
-            previous = trusted(connection, now, None if anew else self._newest(now, model))
+                return None  # the map was replaced or has switched; the next call tries again
+            previous = trusted(connection, now, None if rebuild else self._newest(now, model))
             since = 0 if previous is None else previous.revision
-            if not anyway and not self._is_long(connection, now, since):
+            if not force and not self._is_outdated(connection, now, since):
                 return None  # another worker was first
             if previous is None and count_indexed(connection, now.number, 0) == 0:
-                if not anew:
+                if not rebuild:
                     return None
                 raise InvalidRequest(
                     f"Map {now.name!r} has no indexed frame, so there is nothing to build."
                 )
-            made = publish(
+            version = publish(
                 self._place.folder(now),
                 model_id=now.model_id,
                 revision=now.revision,
@@ -398,35 +399,35 @@ class Upkeep:
                 share=share,
             )
         resign_frames(self._store, now, damaged, now.model_id)
-        return made
+        return version
 
     def _is_up_to_date(self, row: MapRow) -> bool:
-        """Return whether the newest index of a map, by its manifest, is near enough to it."""
+        """Return whether the newest index of a map needs no update, according to its manifest."""
         head = self._place.head(row)
         with self._store.database.read() as connection:
             now = replace(find_map(connection, row.name), model_id=row.model_id)
-            found = trusted(connection, now, head)
-            since = 0 if found is None else found.revision
-            if found is not None:
-                self._published[row.number, row.model_id] = found.number, since
-            return not self._is_long(connection, now, since)
+            usable = trusted(connection, now, head)
+            since = 0 if usable is None else usable.revision
+            if usable is not None:
+                self._published[row.number, row.model_id] = usable.number, since
+            return not self._is_outdated(connection, now, since)
 
     def _newest(self, row: MapRow, model: Model) -> IndexVersion | None:
-        """Return the newest sound index here; what this process has verified is not read again."""
+        """Return the newest sound local index, without verifying its parts again."""
         sound = self._verified.get((row.number, row.model_id))
-        found = newest(self._place.folder(row), row.model_id, model.signature_bytes, sound=sound)
-        if found is not None:
-            self._verified[row.number, row.model_id] = found.inodes
-        return found
+        version = newest(self._place.folder(row), row.model_id, model.signature_bytes, sound=sound)
+        if version is not None:
+            self._verified[row.number, row.model_id] = version.inodes
+        return version
 
 
 def _blocks(
     connection: Connection, row: MapRow, since: int, damaged: list[int]
 ) -> Iterator[tuple[NDArray[np.int64], Bytes]]:
-    """Yield keys and signatures of what was indexed after a revision; note those left out."""
+    """Yield keys and signatures of frames since a revision, and add damaged frames to `damaged`."""
     for block in changes_since(connection, row, since):
         damaged += [one.number for one in block if one.vector is None and not one.deleted]
-        made = [(one.number, one.vector) for one in block if one.vector is not None]
-        if made:
-            rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in made])
-            yield np.array([number for number, _ in made], np.int64), rows
+        signed = [(one.number, one.vector) for one in block if one.vector is not None]
+        if signed:
+            rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in signed])
+            yield np.array([number for number, _ in signed], np.int64), rows

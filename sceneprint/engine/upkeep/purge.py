@@ -1,12 +1,12 @@
-"""Frames that are too old are deleted, and no byte of a deleted frame is left some time later.
+"""Retention of frames, and purges that remove all bytes of deleted frames.
 
-maps with `retention_days`  --Retention.run-->  frames deleted for good, each with its event
-frames deleted or redundant for some days  --Retention.run-->  no row of them or of their jobs
+maps with `retention_days`  --Retention.run-->  old frames are deleted permanently, with events
+frames deleted or redundant for some days  --Retention.run-->  their rows and jobs are removed
 
-A deletion takes the frame out of all searches at once, and its rows and blobs when it can no longer
-be undone. Left are then blobs of a process that died half way, surfaces, differences and answers
-that the frame is part of, this node's indexes and what readers hold of it, and pages and log of
-SQLite. On PostgreSQL dead rows are VACUUM's.
+Searches exclude a deleted frame immediately. Its rows and blobs are removed when its deletion
+cannot be undone any more. A purge removes the remaining data: blobs of killed processes, products
+and answers that show the frame, its signature in local indexes and readers, and pages and log of
+SQLite. On PostgreSQL, VACUUM removes dead rows.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ from sceneprint.store.tables import MapRow
 
 log = logging.getLogger(__name__)
 
-#: Frames deleted in one commit: writers wait meanwhile, for some 20 ms.
+#: Maximum number of frames to delete in one commit, for which writers wait about 20 ms.
 AT_ONCE = 100
-#: Seconds that one turn takes at most: frames are waiting to be signed.
+#: Maximum duration of a call in seconds, since jobs wait meanwhile.
 TURN_S = 2.0
-#: Seconds between two looks where nothing was left to do.
+#: Seconds between two checks after all old frames were deleted.
 LOOK_S = 60.0
-#: What the events say of why.
+#: Reason of the deletion in events.
 REASON = "retention"
 
 
 class Retention:
-    """Deletes frames that are too old, and rows of deleted and redundant frames after `rows_days`;
-    any number of processes may.
+    """Deletion of old frames, and removal of rows of deleted and redundant frames after
+    `rows_days`; any number of processes may run it.
     """
 
     def __init__(self, store: Store, rows_days: float) -> None:
@@ -69,25 +69,24 @@ class Retention:
         self._next = 0.0
 
     def run(self, now: float | None = None) -> int:
-        """Delete some of what is too old, where it is time to look; returns how many frames and
-        rows of frames.
+        """Delete old frames and rows if it is due, and return their number.
 
-        Where that cannot be written, it is logged and tried again.
+        Errors are logged, and a later call tries again.
 
         Parameters
         ----------
-        now : seconds since 1970; default: by the clock of the database, as that of one host that
-            is wrong would delete what is young
+        now : seconds since 1970; None reads the clock of the database, since that of a host may be
+            wrong
         """
         if time.monotonic() < self._next:
             return 0
         self._next = time.monotonic() + LOOK_S
         try:
             until, removed = time.monotonic() + TURN_S, 0
-            for found in chain(self._old_frames(now), self._ended_rows(now)):
-                removed += found
-                if found and time.monotonic() > until:
-                    self._next = 0.0  # the next turn goes on
+            for count in chain(self._old_frames(now), self._ended_rows(now)):
+                removed += count
+                if count and time.monotonic() > until:
+                    self._next = 0.0  # the next call continues
                     break
             return removed
         except SceneprintError as error:
@@ -95,42 +94,42 @@ class Retention:
             return 0
 
     def _old_frames(self, at: float | None) -> Iterator[int]:
-        """Delete frames, block by block; how many each."""
+        """Delete old frames, and yield the size of each block."""
         with self._store.database.read() as connection:
             rows = aging_maps(connection)
         for row in rows:
-            while (found := self._block(row, at)) > 0:
-                yield found
+            while (count := self._block(row, at)) > 0:
+                yield count
 
     def _ended_rows(self, at: float | None) -> Iterator[int]:
-        """Remove rows, block by block; how many each."""
+        """Remove old rows, and yield the size of each block."""
         with self._store.database.read() as connection:
             before = (read_clock(connection) if at is None else at) - self._rows_s
             rows = maps_with_ended(connection, before)
         for row in rows:
-            while found := self._write(row, lambda c, of: remove_ended(c, of, before, BLOCK)):
-                log.info("ended rows removed", extra={"map": row.name, "frames": found})
-                yield found
+            while count := self._write(row, lambda c, of: remove_ended(c, of, before, BLOCK)):
+                log.info("ended rows removed", extra={"map": row.name, "frames": count})
+                yield count
 
     def _write(self, row: MapRow, do: Callable[[Connection, int], int]) -> int:
         with self._store.database.write(map_number=row.number) as connection:
             return do(connection, row.number)
 
     def _block(self, row: MapRow, at: float | None) -> int:
-        """Delete the oldest frames of a map, a few of them; returns how many."""
+        """Delete a block of the oldest frames of a map, and return its size."""
         if row.retention_days is None:
             return 0
-        with self._store.database.read() as connection:  # most often there is none: no lock
+        with self._store.database.read() as connection:  # usually none is due, so no lock
             now = read_clock(connection) if at is None else at
             if not old_frames(connection, row.number, now - DAY_S * row.retention_days, 1):
                 return 0
         with self._store.database.write(map_number=row.number) as connection:
-            found = find_map(connection, row.name)  # it may have been told to keep them since
-            if found.number != row.number or found.retention_days is None:
+            current = find_map(connection, row.name)  # its retention may have changed
+            if current.number != row.number or current.retention_days is None:
                 return 0
-            before = now - DAY_S * found.retention_days
-            numbers = old_frames(connection, found.number, before, AT_ONCE)
-            blobs = delete_frames(connection, found, numbers, REASON)
+            before = now - DAY_S * current.retention_days
+            numbers = old_frames(connection, current.number, before, AT_ONCE)
+            blobs = delete_frames(connection, current, numbers, REASON)
         collect_deleted_blobs(self._store, blobs)
         if numbers:
             log.info("old frames deleted", extra={"map": row.name, "frames": len(numbers)})
@@ -138,16 +137,16 @@ class Retention:
 
 
 class MemoryPurging:
-    """Drops what this process holds of deleted maps and frames."""
+    """Removal of deleted maps and frames from the memory of this process."""
 
     def __init__(self, context: Context) -> None:
         self._context, self._every_s = context, context.settings.purge_deadline_s / 2
         self._purged = time.monotonic()
 
     def run(self) -> None:
-        """Drop what is held of deleted maps, and of deleted frames if it is time to look."""
+        """Release deleted maps, and deleted frames if it is due."""
         context, readers = self._context, self._context.readers
-        context.query_log.tidy()  # this node may have no worker
+        context.query_log.tidy()  # in case that this node has no worker
         with context.store.database.read() as connection:
             if time.monotonic() - self._purged < self._every_s:
                 readers.tidy(connection)
@@ -159,24 +158,24 @@ class MemoryPurging:
             readers.purge(connection)
 
 
-#: Seconds for which a deletion is left to whoever began it.
+#: Seconds for which blobs of a deletion are left to the deleting process.
 _YOUNG_S = 60.0
-#: Longest time for blobs that were left: frames wait to be signed.
+#: Maximum seconds to remove doomed blobs, since jobs wait meanwhile.
 _SWEEP_S = 20.0
-#: Times that making an index anew takes, for which its map is left in peace afterwards: of a large
-#: one it costs hours, and a deletion an hour would keep the workers at it forever.
+#: Pause before the next purge of an index, as a multiple of the duration of the last one, so that
+#: frequent deletions from a large map do not occupy the workers.
 PAUSE = 10.0
 
 
 @dataclass(frozen=True)
 class Purged:
-    """What was removed.
+    """Numbers of removed objects.
 
     Parameters
     ----------
-    blobs : that were doomed, and left behind; with files in quarantine
-    answers, products : that showed what is gone
-    indexes : that were made anew or removed
+    blobs : doomed blobs and files in quarantine
+    answers, products : answers and products that showed deleted frames
+    indexes : indexes that were rebuilt
     """
 
     blobs: int
@@ -186,12 +185,12 @@ class Purged:
 
 
 class Purging:
-    """Removes what deletions leave behind on this node; any number of processes may.
+    """Purge of deleted frames on this node; any number of processes may run it.
 
     Parameters
     ----------
-    purge_s : seconds after which nothing may be left
-    quarantine : folder of damaged bytes that were set aside
+    purge_s : maximum seconds between a deletion and the removal of the last byte
+    quarantine : folder of quarantined blobs
     """
 
     def __init__(
@@ -201,38 +200,41 @@ class Purging:
         self._store, self._upkeep, self._log = store, upkeep, query_log
         self._tombstones, self._quarantine = tombstones, quarantine
         self._products = products
-        self._every_s = purge_s / 2  # what is deleted just after a look is gone in time too
+        self._every_s = purge_s / 2  # so that deletions just after a purge are also in time
         self._next = time.monotonic() + self._every_s
 
     def run(self) -> Purged | None:
-        """Remove what is left, where it is time; what goes wrong is logged and tried again."""
+        """Purge deleted frames if it is due; log errors, after which a later call tries again."""
         if time.monotonic() < self._next:
             return None
         self._next = time.monotonic() + self._every_s
         self._store.geometries.forget_older(self._every_s)
         before = time.time() - min(_YOUNG_S, self._every_s)
-        return self._all(before, self._upkeep.is_rested, seconds=min(_SWEEP_S, self._every_s))
+        return self._all(before, self._upkeep.is_purge_due, seconds=min(_SWEEP_S, self._every_s))
 
     def now(self) -> Purged:
-        """Remove at once everything that deletions have left; none can be undone afterwards. Raise
-        BusyIndex if another process is building an index that must be rebuilt, and StoreError or
-        OSError if something cannot be removed; the rest is.
+        """Purge all deleted frames now, so that no deletion can be undone any more.
+
+        Raises
+        ------
+        BusyIndex : If another process is building an index that must be rebuilt.
+        StoreError, OSError : If something cannot be removed, after the removal of the rest.
         """
         failed: list[Exception] = []
-        found = self._all(None, lambda _: True, failed)
+        purged = self._all(None, lambda _: True, failed)
         if failed:
             raise failed[0]
-        return found
+        return purged
 
     def _all(
-        self, before: float | None, wanted: Callable[[MapRow], bool],
+        self, before: float | None, selects: Callable[[MapRow], bool],
         failed: list[Exception] | None = None, seconds: float = math.inf,
     ) -> Purged:  # fmt: skip
-        def tried(do: Callable[[], int]) -> int:
+        def attempt(do: Callable[[], int]) -> int:
             try:
                 return do()
             except (UnknownMap, UnknownJob):
-                return 0  # deleted meanwhile: the next time
+                return 0  # a map or a product was deleted meanwhile
             except (SceneprintError, OSError, ValueError) as error:
                 level = logging.INFO if isinstance(error, BusyIndex) else logging.ERROR
                 log.log(level, "purge incomplete", extra={"error": str(error)})
@@ -240,30 +242,29 @@ class Purging:
                     failed.append(error)
                 return 0
 
-        tried(lambda: self._tombstones.purge(everything=before is None))
+        attempt(lambda: self._tombstones.purge(everything=before is None))
         with self._store.database.read() as connection:
-            rows = [row for row in list_maps(connection) if wanted(row)]
-        found = Purged(
-            blobs=tried(lambda: collect_doomed_blobs(self._store, before, seconds))
-            + tried(lambda: collect_quarantined(self._store, self._quarantine)),
-            products=sum(tried(one.forget) for one in self._products),
-            answers=tried(self._log.purge),
-            indexes=tried(lambda: self._swept(now=before is None))
-            + sum(tried(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
+            rows = [row for row in list_maps(connection) if selects(row)]
+        purged = Purged(
+            blobs=attempt(lambda: collect_doomed_blobs(self._store, before, seconds))
+            + attempt(lambda: collect_quarantined(self._store, self._quarantine)),
+            products=sum(attempt(one.forget) for one in self._products),
+            answers=attempt(self._log.purge),
+            indexes=attempt(lambda: self._sweep_shared(now=before is None))
+            + sum(attempt(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
         )
         self._store.database.shrink_log()
-        return found
+        return purged
 
-    def _swept(self, *, now: bool) -> int:
-        """Of maps that are gone, nothing is shared."""
+    def _sweep_shared(self, *, now: bool) -> int:
         self._upkeep.sweep(now=now)
         return 0
 
     def _index(self, row: MapRow) -> int:
         start = time.monotonic()
         done = self._upkeep.purge(row)
-        took = time.monotonic() - start
+        seconds = time.monotonic() - start
         if done:
-            log.info("index purged", extra={"map": row.name, "seconds": round(took, 1)})
-            self._upkeep.rest(row, PAUSE * took)
+            log.info("index purged", extra={"map": row.name, "seconds": round(seconds, 1)})
+            self._upkeep.postpone_purge(row, PAUSE * seconds)
         return int(done)

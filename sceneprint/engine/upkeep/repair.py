@@ -1,6 +1,4 @@
-"""Repair of frames: what is damaged is signed again from its upload, and a lost upload is replaced
-when the same content comes again.
-"""
+"""Repair of frames: new signatures from uploads, and replacement of lost uploads."""
 
 from __future__ import annotations
 
@@ -30,20 +28,23 @@ from sceneprint_client.api import FrameState
 
 log = logging.getLogger(__name__)
 
-#: Of jobs that heal: before what robots have just sent, which can wait a moment longer.
+#: Priority of repair jobs, above that of new uploads.
 PRIORITY = 5
-#: Seconds until a frame is signed again once more: where that does not help, a crowd of queries
-#: should not keep all workers at it.
+#: Minimum seconds between two repairs of a frame, so that queries of an irreparable frame do not
+#: occupy the workers.
 PAUSE_S = 600.0
-#: Frames that one query has signed again; the next one finds the others.
+#: Maximum number of frames that one query schedules for repair.
 MOST = 16
 
 _LOST = re.compile(r"its upload is (lost|damaged): .* upload it again to heal")
 
 
 def reason_of_loss(condition: Condition, *, found: bool) -> str:
-    """Return the `reason` of a frame whose upload is missing or damaged, and which queries may
-    still find.
+    """Return the `reason` of a frame whose upload is missing or damaged.
+
+    Parameters
+    ----------
+    found : whether queries can find the frame
     """
     what = "lost" if condition == "missing" else "damaged"
     but = "it can be found, but not signed again" if found else "it cannot be signed"
@@ -51,30 +52,30 @@ def reason_of_loss(condition: Condition, *, found: bool) -> str:
 
 
 def is_known_loss(reason: str | None) -> bool:
-    """Whether the reason of a frame says that its upload is gone."""
+    """Return whether the reason of a frame contains that of `reason_of_loss`."""
     return reason is not None and _LOST.search(reason) is not None
 
 
 def without_loss(reason: str | None) -> str | None:
-    """A reason without what `reason_of_loss` put there."""
+    """Return a reason without the text of `reason_of_loss`; None if nothing else is left."""
     return _LOST.sub("", reason or "").rstrip("; ") or None
 
 
 def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: str) -> int:
-    """Have frames signed again whose artifact or signature is damaged; they stay found meanwhile.
+    """Queue jobs that sign frames with damaged artifacts or signatures again.
 
-    For use beside a query: what goes wrong is logged, and nothing is raised. A frame that is being
-    signed again, or was a while ago, is left as it is.
+    Queries still find the frames meanwhile. Errors are only logged, since queries call this.
+    Frames whose repair is pending or recent are skipped.
 
     Returns
     -------
-    how many jobs were queued
+    queued : number of queued jobs
     """
     if not numbers or store.database.read_only:
         return 0
     try:
-        with store.database.read() as connection:  # most often all is done already: no lock
-            # at random: some may never be healed, and must not keep others from it
+        with store.database.read() as connection:  # usually no repair is due, so no lock
+            # a random sample, so that irreparable frames do not prevent other repairs
             some = random.sample(list(numbers), min(MOST, len(numbers)))
             due = _due(connection, some, model_id)
         if not due:
@@ -93,18 +94,17 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
 
 
 def rebuild_frame(store: Store, signer: Signer, frame: FrameRow) -> tuple[Bytes, bytes]:
-    """What signing makes of a stored frame, for a request that meets it damaged: a worker stores
-    it later, see `resign_frames`.
+    """Sign a damaged frame for a request, without storing the results; see `resign_frames`.
 
     Returns
     -------
-    vector : of its signature
-    artifact : bytes of its geometry, the same that were stored
+    vector : signature
+    artifact : bytes of the geometry, equal to the bytes that were stored
 
     Raises
     ------
-    DamagedBlob : its upload is lost or damaged too.
-    FrameError : nothing in it can be signed.
+    DamagedBlob : If the upload is lost or damaged too.
+    FrameError : If the frame cannot be signed.
     """
     read = read_stored(store.blobs.get(frame.blob), frame, store.decoders)
     signature, geometry = prepare(read, signer)
@@ -112,39 +112,40 @@ def rebuild_frame(store: Store, signer: Signer, frame: FrameRow) -> tuple[Bytes,
 
 
 def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[int]:
-    found = frames_of(connection, numbers)
+    frames = frames_of(connection, numbers)
     now, due = time.time(), []
     for number in dict.fromkeys(numbers):
         job = latest_job(connection, REENCODE, number, model_id)
-        # a job of the future was made before the clock was set back
+        # a job may be in the future after the clock was set back
         busy = job is not None and (not job.state.over or abs(now - job.created_at) < PAUSE_S)
-        if number not in found or busy or is_known_loss(found[number].reason):
-            continue  # or nothing is left to sign it from
-        if found[number].state == FrameState.INDEXED:
+        if number not in frames or busy or is_known_loss(frames[number].reason):
+            continue
+        if frames[number].state == FrameState.INDEXED:
             due.append(number)
     return due
 
 
 def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list[str]:
-    """Keep an upload in the place of the one that a frame had, where that is lost or damaged.
+    """Replace the upload of a frame if it is lost or damaged.
 
     Parameters
     ----------
-    map_name, frame_id : of a frame that has the content of the upload
+    map_name, frame_id : map and id of a frame with the same content
+    data : bytes of the new upload
 
     Returns
     -------
-    blobs : that nothing may refer to any more; none where nothing was wrong
+    blobs : blobs that may be unreferenced now; none if the upload was sound
     """
     try:
         with store.database.read() as connection:
             row = find_map(connection, map_name)
             frame = find_frame(connection, row, frame_id)
-    except UnknownFrame:  # its map was made anew meanwhile
+    except UnknownFrame:  # the map was created again meanwhile
         return []
     if store.database.read_only or frame.state == FrameState.DELETED:
         return []
-    store.blobs.wait_for_removal(frame.blob)  # one that began before its commit
+    store.blobs.wait_for_removal(frame.blob)  # a removal may have started before the commit
     if not is_known_loss(frame.reason) and store.blobs.condition(frame.blob) == "sound":
         return []
     while True:
@@ -153,7 +154,7 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
             now = frames_of(connection, [frame.number]).get(frame.number)
             if now is None:
                 return [blob, frame.blob]
-            if store.blobs.holds(blob):  # a deletion may have removed it
+            if store.blobs.holds(blob):  # a deletion may have removed the blob
                 renew_upload(connection, now.number, blob, len(data), without_loss(now.reason))
                 artifacts = geometry_blobs(connection, [now.number], row.model_id)
                 break
