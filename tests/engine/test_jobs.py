@@ -131,7 +131,7 @@ def test_all_dead_jobs_are_tried_again_page_by_page(
         first.retried[0].job_id, second.retried[0].job_id
     }  # fmt: skip
     counted = {"dead": 1, "queued": 2, "succeeded": 1}  # of retried jobs only the latest
-    assert empty.statistics.tell(1, "hall").jobs == counted == empty.statistics.tell(1).jobs
+    assert empty.statistics.collect(1, "hall").jobs == counted == empty.statistics.collect(1).jobs
     again = empty.retry_dead_jobs()
     assert (again.retried, [one.job_id for one in again.refused]) == ([], [ids[1]])
     assert empty.retry_dead_jobs(map_names=("elsewhere",)).refused == []
