@@ -1,13 +1,12 @@
-"""The index of one map: a cache on disk of the signatures that the database holds.
+"""The index of a map: a cache on disk of the signatures in the database.
 
     blocks of (keys, signatures)  --publish-->  IndexVersion --\\
-    frames newer than that        ----------->  Tail       ---+--search-->  Hits
+    newer frames                  ----------->  Tail        ---+--search-->  SearchHits
 
-A published index is numbered and never changes: the signatures of the map in a few segments, each
-a FAISS file that all processes of a machine share in memory, and that the next one most often
-shares too. A search compares all of them; a map of more than `segment.FLAT_BYTES` has sketches as
-well, which select the frames that are compared. The database is the truth: deleting the folder
-loses nothing but the time to publish it again.
+A published version never changes. It has the signatures of the map in a few segments, which are
+FAISS files that all processes of a machine map into memory, and that the next version usually
+reuses. A search compares all signatures; in a map with more than `segment.FLAT_BYTES`, sketches
+select the signatures to compare. An index that is deleted can be rebuilt from the database.
 """
 
 from sceneprint.index.index_manifest import manifests, newest_number, scrub

@@ -1,8 +1,8 @@
-"""FAISS over stored signatures: bytes as they are, squared Euclidean distance, all compared.
+"""FAISS indexes of signatures, which compare all signatures by squared Euclidean distance.
 
-Of what FAISS offers this kind was measured to be right, and nobody else names one: some kinds are
-silently wrong, some abort the process. Its codes are the signatures themselves, so its distances
-are those of `geometry.retrieval`, integers as long as 32 bits of floating point hold them.
+Tests showed that this type of FAISS index is correct, while some types return wrong results or
+abort the process. Its codes are the signatures, so its distances equal those of
+`geometry.retrieval` up to the integers that single precision represents exactly.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from sceneprint.types import Bytes
 if TYPE_CHECKING:
     from faiss import IndexBinaryFlat, IndexScalarQuantizer
 
-#: Distances from here on may be rounded: the first integers that 32 bits of floats do not all hold.
+#: Distances from this one on may be rounded in single precision.
 ROUNDED = 1 << 24
 
 
 def library() -> Any:
-    """FAISS, on one thread: requests are what runs side by side. Imported late: it takes 0.3 s."""
-    import faiss  # its own stubs contradict it
+    """Return the module FAISS, set to one thread, since requests run concurrently."""
+    import faiss  # late, as it takes 0.3 s
 
     faiss.omp_set_num_threads(1)  # of this thread
     return faiss
 
 
 def allocate(n: int, dimension: int) -> tuple[IndexScalarQuantizer, Bytes]:
-    """Return an index of n signatures that are yet to be written, and where: (n, d) uint8."""
+    """Return an index of n unset signatures, and a view of its memory (n, d) uint8 to set them."""
     faiss = library()
     index = faiss.IndexScalarQuantizer(
         dimension, faiss.ScalarQuantizer.QT_8bit_direct, faiss.METRIC_L2
@@ -44,12 +44,12 @@ def allocate(n: int, dimension: int) -> tuple[IndexScalarQuantizer, Bytes]:
 
 
 def codes_of(index: IndexScalarQuantizer) -> Bytes:
-    """Return the signatures (n, d) of an index, where they are, read-only."""
+    """Return a read-only view of the signatures (n, d) of an index."""
     return _view(index, read_only=True)
 
 
 class _Codes:
-    """The memory of an index, as numpy reads it; it keeps the index alive."""
+    """The memory of an index for NumPy, with a reference that keeps the index alive."""
 
     def __init__(self, index: Any, read_only: bool) -> None:
         self._index = index
@@ -58,7 +58,7 @@ class _Codes:
 
 
 def _view(index: Any, *, read_only: bool) -> Bytes:
-    if index.ntotal == 0:  # of no memory
+    if index.ntotal == 0:  # the index has no memory
         return np.empty((0, index.d), np.uint8)
     return np.asarray(_Codes(index, read_only))
 
@@ -66,7 +66,7 @@ def _view(index: Any, *, read_only: bool) -> Bytes:
 def write_index(
     index: IndexScalarQuantizer | IndexBinaryFlat, take: Callable[[bytes], None]
 ) -> None:
-    """Pass an index to `take` as bytes, block by block; raises what `take` raises."""
+    """Pass the bytes of an index to `take`, block by block; raise the errors of `take`."""
     faiss = library()
     binary = isinstance(index, faiss.IndexBinaryFlat)
     write = faiss.write_index_binary if binary else faiss.write_index
@@ -74,16 +74,17 @@ def write_index(
 
 
 def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
-    """Map an index into memory that processes share; it survives the unlinking of its file.
+    """Map an index into shared memory, which remains valid after its file is unlinked.
 
     Parameters
     ----------
-    path : of a file whose checksum the caller has checked: FAISS crashes on bytes that mean harm
-    n, dimension : that it must have
+    path : file whose checksum the caller has verified, since FAISS crashes on malicious bytes
+    n, dimension : expected number and length of the signatures
 
     Raises
     ------
-    DamagedIndex : missing, another kind or shape, or of a FAISS that this one cannot read.
+    DamagedIndex : If the file is missing, has another type or shape, or cannot be read by this
+        version of FAISS.
     """
     faiss = library()
     index = _map_file(path, faiss.read_index)
@@ -93,19 +94,19 @@ def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
         or index.sq.qtype != faiss.ScalarQuantizer.QT_8bit_direct
         or index.codes.size() != n * dimension
     ):
-        raise DamagedIndex(f"{path}: no FAISS index of {n} signatures of {dimension} bytes.")
-    found: IndexScalarQuantizer = index
-    return found
+        raise DamagedIndex(f"{path}: not a FAISS index of {n} signatures of {dimension} bytes.")
+    result: IndexScalarQuantizer = index
+    return result
 
 
 def map_binary(path: Path, n: int, bits: int) -> IndexBinaryFlat:
-    """Map an index over bits into memory, as `map_index` does."""
+    """Map an index of bits into memory, as `map_index` does."""
     faiss = library()
     index = _map_file(path, faiss.read_index_binary)
     if not isinstance(index, faiss.IndexBinaryFlat) or (index.d, index.ntotal) != (bits, n):
-        raise DamagedIndex(f"{path}: no FAISS index of {n} sketches of {bits} bits.")
-    found: IndexBinaryFlat = index
-    return found
+        raise DamagedIndex(f"{path}: not a FAISS index of {n} sketches of {bits} bits.")
+    result: IndexBinaryFlat = index
+    return result
 
 
 def _map_file(path: Path, read: Callable[[str, int], Any]) -> Any:
@@ -116,7 +117,7 @@ def _map_file(path: Path, read: Callable[[str, int], Any]) -> Any:
 
 
 def selection(free: NDArray[np.bool_] | None) -> Any:
-    """Return the parameters of a search of the rows (n,) that are free; None: all of them."""
+    """Return the parameters of a search of the rows where `free` (n,) is True; None selects all."""
     if free is None:
         return None
     faiss = library()
@@ -126,22 +127,22 @@ def selection(free: NDArray[np.bool_] | None) -> Any:
 def nearest(
     index: IndexScalarQuantizer, query: Bytes, count: int, free: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-    """Return the rows nearest to a query, and their distances, in no order that is promised.
+    """Return the rows nearest to a query and their distances, in any order.
 
     Parameters
     ----------
     query : (d,) uint8
-    count : of rows; there must be so many
-    free : (n,) which rows may be found; all of them if None
+    count : number of rows, of which at least as many must be searchable
+    free : (n,) which rows are searchable; None selects all
 
     Returns
     -------
-    (count,) rows, of which the earlier wins where distances are equal, and (count,) distances;
-    None where FAISS may have rounded one of them
+    (count,) rows, those with lower numbers if distances are equal, and (count,) distances; None if
+    FAISS may have rounded a distance
     """
     if count == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    found, rows = index.search(query[None].astype(np.float32), count, params=selection(free))
-    if found.max() >= ROUNDED:
+    distances, rows = index.search(query[None].astype(np.float32), count, params=selection(free))
+    if distances.max() >= ROUNDED:
         return None
-    return rows[0], found[0].astype(np.int64)
+    return rows[0], distances[0].astype(np.int64)

@@ -1,10 +1,9 @@
-"""Manifests of an index: the segments that it consists of, and the parts of each.
+"""Manifests of indexes, which list the segments of a version and their parts.
 
-    NUMBER.json    one published state of a map's index, written after all parts that it names
+    NUMBER.json    manifest of a version, written after all of its parts
 
-Folders and object stores hold them under the same names, beside their parts. Each schema has
-folders of its own: two versions of the product beside each other neither read nor remove what the
-other wrote.
+Folders and object stores use the same names for manifests and parts. Each schema has its own
+folders, so that different versions of sceneprint do not affect each other's indexes.
 """
 
 from __future__ import annotations
@@ -23,28 +22,27 @@ from sceneprint.errors import DamagedIndex
 from sceneprint.index.part_files import KINDS, PART_NAME, unreadable, verify
 from sceneprint.sealed_record import StrictRecord, seal, unseal
 
-#: Of the parts of an index and of what they mean. Raise it when either changes.
+#: Version of the format of manifests and parts; raise it when the format changes.
 SCHEMA_VERSION = 2
-#: A manifest names five parts of each segment at most; a larger file is refused unread.
+#: Maximum size of a manifest in bytes; larger files are not read.
 MAXIMUM_BYTES = 1 << 16
 _MANIFEST = re.compile(r"(\d{10})\.json")
 
-#: The name of a part, and its bytes.
+#: Name and size in bytes of a part.
 PartOfIndex = tuple[Annotated[str, Field(pattern=PART_NAME)], Annotated[int, Field(ge=0)]]
 
 
 class Recall(StrictRecord):
-    """What a search of a segment, or of a whole index, finds.
+    """The recall of searches in a segment or a whole index.
 
     Parameters
     ----------
-    share : of the `near` nearest by the exact scan that a search finds too
-    near : neighbours that were looked for
-    sample : frames that were looked up, each without itself; 0 where a search compares every
-        frame, so that there is nothing to miss
-    probes : frames that a search compares at least, selected by their sketches; 0 where there are
-        no sketches
-    frames : that were measured
+    share : share of the `near` exact nearest neighbours that a search finds
+    near : number of neighbours
+    sample : number of measured queries, each by a frame without itself; 0 if a search compares
+        every frame
+    probes : minimum number of frames that sketches select for a search; 0 without sketches
+    frames : number of frames at the time of the measurement
     """
 
     share: float
@@ -59,9 +57,8 @@ class SegmentFiles(StrictRecord):
 
     Parameters
     ----------
-    files : its keys, the FAISS index of their signatures, their sketches and the means, if there
-        are any, and the keys that count no longer, if there are any
-    recall : as measured when it was written
+    files : parts: keys, FAISS index, and optionally sketches, means and removed keys
+    recall : recall, measured when the segment was written
     """
 
     files: tuple[PartOfIndex, ...]
@@ -71,31 +68,31 @@ class SegmentFiles(StrictRecord):
     def _has_its_kinds(self) -> SegmentFiles:
         kinds = [kind for kind in KINDS if self.file(kind) is not None]
         if len(kinds) != len(self.files) or kinds[:2] != ["keys", "faiss"]:
-            raise ValueError("names files that no segment has")
+            raise ValueError("the files of a segment are not complete")
         return self
 
     @property
     def frames(self) -> int:
-        """How many of its frames count."""
+        """Number of frames in the segment that were not removed."""
         keys, gone = self.file("keys"), self.file("gone")
         return ((0 if keys is None else keys[1]) - (0 if gone is None else gone[1])) // 8
 
     def file(self, kind: str) -> PartOfIndex | None:
-        """Return the part of a kind; None where there is none."""
+        """Return the part of a kind; None if there is none."""
         return next((one for one in self.files if one[0].endswith(f".{kind}")), None)
 
 
 class IndexManifest(StrictRecord):
-    """One published state of a map's index.
+    """The manifest of a version of a map's index.
 
     Parameters
     ----------
-    number : larger than that of the state before
-    revision : of the map, up to which the index holds its frames
-    model_id : of the model that signed them
-    dimension : D, bytes of a signature
-    anchor : by which the publisher recognises the state of the database
-    segments : that together hold each frame once; a frame counts in one of them only
+    number : number, larger than that of the previous version
+    revision : revision of the map up to which the index contains its frames
+    model_id : id of the model that signed the frames
+    dimension : D, length of a signature in bytes
+    anchor : anchor by which the publisher recognises the state of the database
+    segments : segments, which together contain each frame once
     """
 
     schema_version: Annotated[int, Field(ge=SCHEMA_VERSION, le=SCHEMA_VERSION)] = SCHEMA_VERSION
@@ -108,32 +105,32 @@ class IndexManifest(StrictRecord):
 
     @property
     def name(self) -> str:
-        """Its name in a folder or an object store."""
+        """Name of the manifest in a folder or an object store."""
         return f"{self.number:010d}.json"
 
     @property
     def files(self) -> tuple[PartOfIndex, ...]:
-        """All parts, each once."""
+        """All distinct parts."""
         return tuple(dict.fromkeys(each for one in self.segments for each in one.files))
 
     @property
     def frames(self) -> int:
-        """How many it holds."""
+        """Number of frames."""
         return sum(one.frames for one in self.segments)
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Names of the parts with keys, of those too that count no longer."""
+        """Names of the parts with keys."""
         return tuple(name for name, _ in self.files if name.endswith(".keys"))
 
     @property
     def worn_keys(self) -> tuple[str, ...]:
-        """Names of the parts with the keys of those segments of which some frames are gone."""
+        """Names of the parts with the keys of segments from which frames were removed."""
         return tuple(one.files[0][0] for one in self.segments if one.file("gone") is not None)
 
     @property
     def recall(self) -> Recall:
-        """What a search finds: the least of its segments."""
+        """Recall of a search, which is the minimum over the segments."""
         each = [one.recall for one in self.segments]
         return Recall(
             share=min((one.share for one in each), default=1.0),
@@ -145,34 +142,34 @@ class IndexManifest(StrictRecord):
 
 
 def manifest_number(name: str) -> int | None:
-    """Return the number of a manifest by its name; None for any other name."""
-    found = _MANIFEST.fullmatch(name)
-    return None if found is None else int(found[1])
+    """Return the number in the name of a manifest; None for other names."""
+    match = _MANIFEST.fullmatch(name)
+    return None if match is None else int(match[1])
 
 
 def manifests(folder: Path) -> list[tuple[int, Path]]:
-    """Return number and path of every manifest in a folder, sound or not, the newest first."""
+    """Return numbers and paths of all manifests in a folder, sound or damaged, newest first."""
     try:
-        found = [(manifest_number(path.name), path) for path in folder.iterdir()]
-    except OSError:  # a cache that cannot be read is none
+        numbered = [(manifest_number(path.name), path) for path in folder.iterdir()]
+    except OSError:  # an unreadable cache counts as empty
         return []
-    return sorted(((number, path) for number, path in found if number is not None), reverse=True)
+    return sorted(((number, path) for number, path in numbered if number is not None), reverse=True)
 
 
 def newest_number(folder: Path) -> int | None:
-    """Return the number of the newest manifest, sound or not: a cheap sign of something new."""
+    """Return the number of the newest manifest, sound or damaged; None if there is none."""
     return next((number for number, _ in manifests(folder)), None)
 
 
 def write_manifest(folder: Path, manifest: IndexManifest) -> Path:
-    """Write a manifest durably, after everything that it names."""
+    """Write a manifest durably, after all of its parts."""
     path = folder / manifest.name
     write_durable(path, seal(manifest))
     return path
 
 
 def read_manifest(path: Path) -> IndexManifest:
-    """Read a manifest; DamagedIndex where it is missing, unreadable, changed, or another's."""
+    """Read a manifest; raise DamagedIndex if it is missing, unreadable or damaged."""
     try:
         data = path.read_bytes() if path.stat().st_size <= MAXIMUM_BYTES else b""
     except OSError as error:
@@ -185,21 +182,21 @@ def decode_manifest(name: str, data: bytes, place: str) -> IndexManifest:
 
     Parameters
     ----------
-    name : under which it lies
-    place : to show
+    name : name of its file or object
+    place : path or key for errors
 
     Raises
     ------
-    DamagedIndex : they are none, changed, of another schema or number.
+    DamagedIndex : If the manifest is damaged, or has another schema or number.
     """
     try:
-        found = IndexManifest.model_validate_json(json.dumps(unseal(data)))
+        manifest = IndexManifest.model_validate_json(json.dumps(unseal(data)))
     except (ValueError, RecursionError) as error:
-        said = str(error).partition("\n")[0]
-        raise DamagedIndex(f"{place}: no manifest of an index, or damaged ({said}).") from error
-    if found.name != name:
-        raise DamagedIndex(f"{place}: the manifest of another number, {found.number}.")
-    return found
+        reason = str(error).partition("\n")[0]
+        raise DamagedIndex(f"{place}: the manifest is damaged ({reason}).") from error
+    if manifest.name != name:
+        raise DamagedIndex(f"{place}: the manifest has another number, {manifest.number}.")
+    return manifest
 
 
 def scrub(folder: Path) -> Iterator[Path | None]:
@@ -207,13 +204,13 @@ def scrub(folder: Path) -> Iterator[Path | None]:
 
     Yields
     ------
-    None after each block that was read, so that the caller may stop in between; the path of a file
-    that is damaged or missing, once
+    path : None after each block, so that the caller may pause; the path of each damaged or missing
+        file, once
     """
     for _, path in manifests(folder):
         try:
             manifest = read_manifest(path)
-        except DamagedIndex as error:  # an older one is used in its place meanwhile
+        except DamagedIndex as error:  # readers use an older version
             yield path if _is_lasting(error) and path.exists() else None
             continue
         for name, size in manifest.files:
@@ -221,12 +218,12 @@ def scrub(folder: Path) -> Iterator[Path | None]:
                 yield from verify(folder, name, size)
             except DamagedIndex as error:
                 if not _is_lasting(error) or not path.exists():
-                    return  # out of reach, or a builder has replaced it meanwhile
+                    return  # temporarily unreadable, or replaced by a builder
                 yield folder / name
         return
 
 
 def _is_lasting(error: DamagedIndex) -> bool:
-    """Return whether a file is damaged or missing, and not merely out of reach for the moment."""
+    """Return whether an error persists, unlike that of a temporarily unreadable file."""
     cause = error.__cause__
     return not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EIO)

@@ -1,9 +1,8 @@
-"""Published states of an index: opened, searched together with newer frames, and published.
+"""Versions of an index: their publication, opening, and search together with newer frames.
 
-A published state is a list of segments. The next one adds a segment of what is new, and merges
-some; most parts stay what they are. Every part is durable before the manifest that names it, and
-the manifest comes last: a builder killed at any moment leaves the state before, and parts that the
-next builder removes.
+A version is a list of segments. The next version adds a segment of new frames and merges some of
+the others; most parts remain. All parts are durable before their manifest is written. A builder
+that is killed leaves the former version intact, and parts that the next builder removes.
 """
 
 from __future__ import annotations
@@ -48,14 +47,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class IndexVersion:
-    """One published state of an index: immutable, and usable by any number of threads.
+    """A published version of an index; immutable, and safe to share between threads.
 
-    It stays usable after its parts have been removed: they are mapped, and processes share them.
+    It remains usable after its parts were removed, since they are mapped into memory.
 
     Parameters
     ----------
-    segments : that together hold each frame once
-    inodes : of the parts by their names: another file may have taken a name since
+    segments : segments that together contain each frame once
+    inodes : inodes of the parts by name, since a part may be written again under its name
     """
 
     manifest: IndexManifest
@@ -67,39 +66,39 @@ class IndexVersion:
 
     @property
     def number(self) -> int:
-        """Of its manifest."""
+        """Number of the version."""
         return self.manifest.number
 
     @property
     def revision(self) -> int:
-        """Of the map, up to which the index holds its frames."""
+        """Revision of the map up to which the index contains its frames."""
         return self.manifest.revision
 
     @property
     def anchor(self) -> str:
-        """By which the publisher recognises the state of the database."""
+        """Anchor by which the publisher recognises the state of the database."""
         return self.manifest.anchor
 
     @property
     def model_id(self) -> str:
-        """Of the model that signed them."""
+        """Id of the model that signed the frames."""
         return self.manifest.model_id
 
     @cached_property
     def keys(self) -> Keys:
-        """Keys of the frames (N,), rising."""
+        """Keys (N,) of the frames in ascending order."""
         standing = [one.keys[one.standing_rows(one.gone)] for one in self.segments]
         return np.sort(np.concatenate([np.empty(0, np.int64), *standing]))
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Return which frames (n,) it holds."""
-        held = np.zeros(len(keys), np.bool_)
+        """Return which frames (n,) the index contains."""
+        contained = np.zeros(len(keys), np.bool_)
         for one in self.segments:
-            held |= one.rows_of(keys) >= 0
-        return held
+            contained |= one.rows_of(keys) >= 0
+        return contained
 
     def vectors_of(self, keys: Keys) -> Bytes:
-        """Return a copy of the signatures (r, D) of frames; ValueError where one is missing."""
+        """Return a copy of the signatures (r, D) of frames; raise ValueError if one is missing."""
         result = np.empty((len(keys), self.manifest.dimension), np.uint8)
         missing = np.ones(len(keys), np.bool_)
         for one in self.segments:
@@ -120,41 +119,41 @@ def newest(
     known: IndexVersion | None = None,
     sound: Mapping[str, int] | None = None,
 ) -> IndexVersion | None:
-    """Open the newest sound index of a folder; None where there is none.
+    """Open the newest sound version in a folder; return None if there is none.
 
-    Every part is read and verified before it is used. An index with a damaged one is skipped with a
-    warning in the log, and an older one is used.
+    All parts are verified before use. A version with a damaged part is logged and skipped, and an
+    older one is used.
 
     Parameters
     ----------
-    folder : of the map; it need not exist
-    model_id, dimension : of the signatures; indexes of others are passed over
-    known : an index of this folder that is open: its parts are not verified again, and where it is
-        the newest it is returned itself
-    sound : inodes, by name, of parts that this process has verified before
+    folder : folder of the map's index, which need not exist
+    model_id, dimension : model and length of the signatures; versions of other models are skipped
+    known : open version of this folder, whose parts are not verified again, and which is returned
+        itself if it is the newest
+    sound : inodes by name of parts that this process has verified
     """
     while True:
-        listed, found, errors = manifests(folder), None, []
+        listed, version, errors = manifests(folder), None, []
         for _, path in listed:
             try:
                 manifest = read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    found = open_version(folder, manifest, known, sound)
+                    version = open_version(folder, manifest, known, sound)
                     break
             except DamagedIndex as error:
                 errors.append(error)
-        # what a builder removed after it was listed is not damaged, and something newer is there
+        # a part may be missing because a builder has just removed it; then there is a newer version
         if not errors or manifests(folder) == listed:
             for each in errors:
                 log.warning("Damaged index skipped; it will be rebuilt: %s", each)
-            return found
+            return version
 
 
 def open_version(
     folder: Path, manifest: IndexManifest, known: IndexVersion | None = None,
     sound: Mapping[str, int] | None = None,
 ) -> IndexVersion:  # fmt: skip
-    """Open the parts that a manifest names; DamagedIndex where one is missing or damaged.
+    """Open the parts in a manifest; raise DamagedIndex if one is missing or damaged.
 
     Parameters
     ----------
@@ -168,8 +167,7 @@ def open_version(
         if inodes[name] != verified.get(name, -1):
             for _ in verify(folder, name, size):
                 pass
-    # what is open has its rows by key, and its pages, at hand; but where a damaged part was written
-    # again under its name, what is mapped is the damaged one
+    # open segments are reused with their caches, unless a damaged part was written again
     open_ones = {} if known is None else {one.record: one for one in known.segments}
     segments = tuple(
         open_ones[record]
@@ -183,7 +181,7 @@ def open_version(
 
 
 def _inode(path: Path) -> int:
-    """0 where there is no such file."""
+    """Return the inode of a file, 0 if it does not exist."""
     try:
         return path.stat().st_ino
     except OSError:
@@ -192,22 +190,22 @@ def _inode(path: Path) -> int:
 
 # Search: the nearest frames of a map by exact distance of signatures, Sec. III-C.
 #
-# The tail is compared whole, and so is each segment; of one with sketches only the frames whose
-# sketches are nearest to that of the query. What they miss is measured when it is published.
+# All frames of the tail and of segments without sketches are compared. Of a segment with sketches,
+# only the frames with the nearest sketches are compared; their recall is measured at publication.
 
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """Frames newer than an index. A frame that is in both counts once, with its signature here.
+    """Frames that are newer than an index, and replace frames of the index with the same keys.
 
     Parameters
     ----------
-    keys : (n,) int64, none twice
+    keys : (n,) int64, distinct
     signatures : (n, D) uint8
 
     Raises
     ------
-    ValueError : other arrays, or a key that is there twice.
+    ValueError : If the arrays have other shapes or types, or a key occurs twice.
     """
 
     keys: Keys
@@ -222,7 +220,7 @@ class Tail:
 
     @classmethod
     def empty(cls, dimension: int) -> Tail:
-        """Return a tail of no frames, of signatures of that many bytes."""
+        """Return a tail without frames, for signatures of `dimension` bytes."""
         return cls(np.empty(0, np.int64), np.empty((0, dimension), np.uint8))
 
     @cached_property
@@ -231,7 +229,7 @@ class Tail:
         return Places(self.keys)
 
     def rows_among(self, gone: Keys, among: Keys | None) -> NDArray[np.int64]:
-        """Return the rows of frames among some (None: all) that are not gone; both lists rise."""
+        """Return the rows of frames in `among` (None: all) and not in `gone`; both ascending."""
         free = np.full(len(self), among is None)
         if among is not None:
             free[self.places.found(among)] = True
@@ -240,11 +238,11 @@ class Tail:
 
 
 def signatures_of(keys: Keys, version: IndexVersion | None, tail: Tail) -> Bytes:
-    """Return the signatures (r, D) of frames (r,), in their order; the tail's where it has one.
+    """Return the signatures (r, D) of frames (r,) in their order, preferably from the tail.
 
     Raises
     ------
-    ValueError : a frame is in neither, or the lengths of signatures differ.
+    ValueError : If a frame is missing, or the lengths of signatures differ.
     """
     check_lengths(tail.signatures.shape[1], version, tail)
     in_tail = tail.places.of(keys)
@@ -259,22 +257,22 @@ def signatures_of(keys: Keys, version: IndexVersion | None, tail: Tail) -> Bytes
 
 
 def check_lengths(dimension: int, version: IndexVersion | None, tail: Tail) -> None:
-    """Raise ValueError where signatures of the index or the tail have not that many bytes."""
-    found = {tail.signatures.shape[1]}
+    """Raise ValueError unless signatures of the index and the tail have `dimension` bytes."""
+    lengths = {tail.signatures.shape[1]}
     if version is not None:
-        found.add(version.manifest.dimension)
-    if found != {dimension}:
-        raise ValueError(f"signatures of {sorted(found)} bytes where {dimension} were expected")
+        lengths.add(version.manifest.dimension)
+    if lengths != {dimension}:
+        raise ValueError(f"signatures of {sorted(lengths)} bytes where {dimension} were expected")
 
 
 @dataclass(frozen=True, eq=False)
 class SearchHits:
-    """The nearest frames that a search found: keys (r,), and their distances (r,), which rise.
+    """The results of a search: keys (r,) and distances (r,) of the nearest frames, ascending.
 
     Parameters
     ----------
-    exact : every frame of the map was compared, so that these are the nearest
-    compared : frames whose exact distance was computed
+    exact : whether every searchable frame was compared
+    compared : number of frames whose distance was computed
     """
 
     keys: Keys
@@ -297,22 +295,22 @@ def search(
     among: Keys | None = None,
     exact: bool = False,
 ) -> SearchHits:
-    """Find the nearest frames of a map. Any number of threads may search one index.
+    """Return the nearest frames of a map; any number of threads may search an index.
 
     Parameters
     ----------
-    query : (D,) uint8, a signature of the model of the map
-    version : the index; None where there is none
-    tail : frames newer than that; where a frame is in both, this one counts
-    size : of the answer; all frames where there are fewer
-    metric : of the model of the map
-    dead : keys of frames that were deleted since
-    among : keys of the frames that may be found, where not all may; others are no matter
-    exact : compare every frame, of those that may be found
+    query : (D,) uint8, signature of the map's model
+    version : version of the index; None without an index
+    tail : newer frames, which replace frames of the index with the same keys
+    size : maximum number of results
+    metric : metric of the map's model
+    dead : keys of deleted frames
+    among : keys of the searchable frames; None selects all
+    exact : whether to compare every searchable frame
 
     Raises
     ------
-    ValueError : no signature of that length, or a negative size.
+    ValueError : If the query has another length or type, or the size is negative.
     """
     if query.ndim != 1 or query.dtype != np.uint8 or size < 0:
         raise ValueError(f"{size} for a query {query.dtype} {query.shape}")
@@ -321,7 +319,7 @@ def search(
     among = None if among is None else np.sort(among)
     alive = tail.rows_among(gone, among)
     keys, whole, compared = [tail.keys[alive]], True, len(alive)
-    found = [distances(query, tail.signatures, metric, alive)]
+    parts = [distances(query, tail.signatures, metric, alive)]
     if version is not None and len(version):
         gone = np.sort(np.concatenate([gone, tail.keys]))
         for one in version.segments:
@@ -329,20 +327,20 @@ def search(
                 query, size, gone, among, metric=metric, exact=exact
             )
             keys.append(own)
-            found.append(distant)
+            parts.append(distant)
             whole, compared = whole and all_of_it, compared + count
-    every, distant = np.concatenate(keys), np.concatenate(found)
+    every, distant = np.concatenate(keys), np.concatenate(parts)
     first = _nearest(every, distant, size)
     return SearchHits(every[first], distant[first], whole, compared)
 
 
-def _nearest(keys: Keys, found: NDArray[np.int64], size: int) -> NDArray[np.intp]:
-    """Return the places of the smallest `size`, rising, ties by key."""
+def _nearest(keys: Keys, values: NDArray[np.int64], size: int) -> NDArray[np.intp]:
+    """Return the positions of the `size` smallest distances in ascending order, ties by key."""
     size = min(size, len(keys))
     if size == 0:
         return np.empty(0, np.intp)
-    candidates = np.flatnonzero(found <= np.partition(found, size - 1)[size - 1])
-    order = np.lexsort((keys[candidates], found[candidates]))
+    candidates = np.flatnonzero(values <= np.partition(values, size - 1)[size - 1])
+    order = np.lexsort((keys[candidates], values[candidates]))
     chosen: NDArray[np.intp] = candidates[order[:size]]
     return chosen
 
@@ -361,40 +359,38 @@ def publish(
     after: int = 0,
     share: Callable[[IndexManifest], bool] = lambda _: True,
 ) -> IndexVersion | None:
-    """Publish the index that follows `previous`.
+    """Publish the version that follows `previous`.
 
-    One process builds in a folder at a time. The two newest indexes are kept, and parts that only
-    older ones need removed; readers that hold them go on undisturbed. What is new is written, and
-    the segments that it is merged with; all others stay. Memory holds the signatures of what is
-    written, one segment at a time.
+    Only one process builds in a folder at a time. The two newest versions remain; parts of older
+    ones are removed, while readers may still use them. Only new frames, and the segments with which
+    they are merged, are written. Memory holds the signatures of one written segment at a time.
 
     Parameters
     ----------
-    folder : of the map; made if need be
-    model_id : of the model that signed the frames
-    revision : of the map, up to which `blocks` and `previous` hold its frames
-    blocks : keys (n,) int64 and signatures (n, D) uint8 of the frames that are not in `previous`;
-        a key that is there replaces the signature there. It is read once, and block by block.
-    previous : the newest index of the folder, or None to build from nothing
-    drop : keys of frames that are no longer in the map
-    anchor : called once `blocks` are read: marks that state of the database or a later one
-    clean : leave no part that has a byte of a frame that is no longer there: the index before is
-        not kept
-    flat_bytes : of signatures, above which there are sketches
-    after : its number is larger than that
-    share : called with the manifest once all parts are there and before it is: False where another
-        index was published by that number elsewhere, so that this one is not published
+    folder : folder of the map's index, which is created if it is missing
+    model_id : id of the model that signed the frames
+    revision : revision of the map up to which `blocks` and `previous` contain its frames
+    blocks : keys (n,) int64 and signatures (n, D) uint8 of the frames that are not in `previous`,
+        or whose signatures replace those in `previous`; it is read once, block by block
+    previous : newest version in the folder; None builds an index without reuse
+    drop : keys of deleted frames
+    anchor : function that returns the anchor; it is called after `blocks` were read
+    clean : whether to remove all bytes of deleted frames, and therefore the previous version
+    flat_bytes : size of signatures in bytes above which there are sketches
+    after : number that the new version's number must exceed
+    share : function that is called with the manifest before it is written; it returns False, which
+        cancels the publication, if another host published a version with this number
 
     Returns
     -------
-    the index, open; None where somebody else is building or has published, or `previous` is no
-    longer the newest of the folder: then open the newest and try again
+    version : open version; None if another process is building, or `previous` is not the newest
+        version any more, so that the caller must open the newest and try again
 
     Raises
     ------
-    ValueError : blocks that are none, that have a key twice, or signatures of another model or
-        length than `previous`; no frames and no `previous`.
-    OSError : a file cannot be written; the index before remains.
+    ValueError : If blocks are malformed or have a key twice, if signatures have another model or
+        length than `previous`, or if there are no frames and no `previous`.
+    OSError : If a file cannot be written; the previous version remains.
     """
     if previous is not None and previous.model_id != model_id:
         raise ValueError(f"frames of model {model_id} appended to those of {previous.model_id}")
@@ -415,7 +411,7 @@ def publish(
             remove_unneeded(folder)
             return None
         write_manifest(folder, manifest)
-        # the one before is known to be sound, whatever lies between
+        # the previous version is known to be sound, unlike versions after it
         before = last if previous is None else previous.number
         keep_only(folder, {manifest.number} if clean else {manifest.number, before})
         known = {} if previous is None else previous.inodes
@@ -427,11 +423,11 @@ def _write_segments(
     folder: Path, previous: IndexVersion | None, blocks: Iterable[Block], drop: frozenset[int],
     clean: bool, flat_bytes: int,
 ) -> tuple[tuple[SegmentFiles, ...], int]:  # fmt: skip
-    """Write what is new and what it is merged with; all segments, and bytes of a signature."""
+    """Write new and merged segments; return all segments, and the length of signatures."""
     dimension = None if previous is None else previous.manifest.dimension
     new_keys, stored = spool_blocks(folder, blocks, dimension)
     if previous is None and len(new_keys) == 0:
-        raise ValueError("an index of no frames that follows none")
+        raise ValueError("there are no frames and no previous version")
     sources = segment_sources(() if previous is None else previous.segments, new_keys, stored, drop)
     is_large = sum(len(each) * each.vectors.shape[1] for each in sources) > flat_bytes
     most = FLAT_SHARE * flat_bytes if is_large else np.inf
@@ -444,15 +440,14 @@ def _write_segments(
 
 
 def _is_overtaken(folder: Path, previous: IndexVersion) -> bool:
-    """Return whether another was published, or the folder emptied, since `previous` was opened."""
-    found = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
-    return found is None or found.number != previous.number
+    """Return whether the newest version in a folder is not `previous` any more."""
+    version = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
+    return version is None or version.number != previous.number
 
 
 def clear(folder: Path, but: int | None = None) -> bool:
-    """Remove all manifests of a folder, or all but one, and the parts that only they need.
-
-    Readers that hold them go on undisturbed. Returns False where somebody is building there.
+    """Remove all versions of an index, except number `but`, while readers may still use them;
+    return False if another process is building.
     """
     with folder_turn(folder) as mine:
         if mine:
@@ -461,18 +456,18 @@ def clear(folder: Path, but: int | None = None) -> bool:
 
 
 def remove_unneeded(folder: Path) -> None:
-    """Remove the parts that no manifest of a folder needs; for whoever has its turn."""
+    """Remove the parts that no manifest in a folder lists; the caller holds its lock."""
     keep_only(folder, [number for number, _ in manifests(folder)])
 
 
 def keep_only(folder: Path, numbers: Collection[int]) -> None:
-    """Remove all manifests but some, and the parts these do not need; for whoever has the turn."""
+    """Remove all versions except some numbers; the caller holds the lock of the folder."""
     needed: set[str] = set()
     for number, path in manifests(folder):
-        if number not in numbers:  # before its parts: a manifest should not promise what is gone
+        if number not in numbers:  # before its parts, so that manifests list only existing ones
             path.unlink(missing_ok=True)
             continue
-        with suppress(DamagedIndex):  # nothing will be read by it
+        with suppress(DamagedIndex):  # a damaged manifest needs no parts
             needed |= {name for name, _ in read_manifest(path).files}
     for path in folder.iterdir():
         if is_ours(path.name) and path.name not in needed:

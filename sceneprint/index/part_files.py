@@ -1,7 +1,7 @@
-"""Parts of an index: files in a folder, each named by the SHA-256 of its bytes.
+"""Parts of indexes: files that are named by the SHA-256 of their bytes.
 
-A name that is the checksum needs no second place to keep it: a manifest that lists names lists
-checksums, two manifests that share a part name one file, and no file ever changes.
+The names in a manifest are thus checksums, manifests with the same part share one file, and files
+never change.
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from sceneprint.atomic_files import create_private, sync_folder
 from sceneprint.errors import DamagedIndex
 from sceneprint.types import Bytes
 
-#: Endings of the parts of a segment: its keys, FAISS indexes of its signatures and of their
-#: sketches, the means by which those were made, and the deleted keys.
+#: Suffixes of the parts of a segment: keys, FAISS indexes of signatures and of sketches, means for
+#: the sketches, and removed keys.
 KINDS = ("keys", "faiss", "sketches", "means", "gone")
-#: The name of a part: its digest and its kind.
+#: Pattern of the name of a part: digest and kind.
 PART_NAME = rf"^[0-9a-f]{{64}}\.({'|'.join(KINDS)})$"
-#: Bytes that are read at once where a part is verified.
+#: Number of bytes to read at once when a part is verified.
 BLOCK_BYTES = 8 << 20
-#: A part, or what a killed builder left of one.
+#: Pattern of the names of parts and of unfinished parts.
 _OURS = re.compile(rf"{PART_NAME}|^\.[0-9a-f]{{12}}\.part$")
 
 Keys = NDArray[np.int64]
-#: Keys (n,) int64 of frames, and their signatures (n, D) uint8.
+#: Keys (n,) int64 and signatures (n, D) uint8 of frames.
 Block = tuple[Keys, Bytes]
 
 
 def is_ours(name: str) -> bool:
-    """Return whether a file was made here, and may be removed where no manifest needs it."""
+    """Return whether a name is that of a part or an unfinished part."""
     return _OURS.match(name) is not None
 
 
 def unfinished(folder: Path) -> Path:
-    """Return a new name for a file that is not yet whole."""
+    """Return a new path for an unfinished file."""
     return folder / f".{secrets.token_hex(6)}.part"
 
 
 def put(
     folder: Path, kind: str, write: Callable[[Callable[[bytes], None]], object]
 ) -> tuple[str, int]:
-    """Write a part durably; return its name and its bytes.
+    """Write a part durably; return its name and size in bytes.
 
     Parameters
     ----------
-    folder : must exist
+    folder : existing folder
     kind : one of KINDS
-    write : is called with a function that takes the bytes of the part, block by block
+    write : function that passes the bytes of the part to its argument, block by block
 
     Raises
     ------
-    OSError : it cannot be written; nothing is left behind.
+    OSError : If the part cannot be written; no file remains.
     """
     part, digest = unfinished(folder), hashlib.sha256()
     try:
@@ -72,7 +72,7 @@ def put(
             write(take)
             size = file.tell()
             file.flush()
-            os.fsync(file.fileno())  # before its name: a name must never lead to half a file
+            os.fsync(file.fileno())  # before the rename, so that named files are complete
         name = f"{digest.hexdigest()}.{kind}"
         os.replace(part, folder / name)  # noqa: PTH105  (the one call that is atomic by contract)
         sync_folder(folder)
@@ -83,33 +83,33 @@ def put(
 
 
 def verify(folder: Path, name: str, size: int) -> Iterator[None]:
-    """Read a part, and check its bytes; yields after each block, so that the caller may stop.
+    """Verify a part, and yield after each block, so that the caller may stop.
 
     Raises
     ------
-    DamagedIndex : missing, unreadable, of another size, or with bytes that give another name.
+    DamagedIndex : If the part is missing, unreadable or damaged.
     """
     path, digest = folder / name, hashlib.sha256()
     try:
         with path.open("rb") as file:
-            found = os.fstat(file.fileno()).st_size
-            if found != size:
-                raise DamagedIndex(f"{path}: {found} bytes, where {size} were written.")
+            actual = os.fstat(file.fileno()).st_size
+            if actual != size:
+                raise DamagedIndex(f"{path}: the file has {actual} bytes instead of {size}.")
             while block := file.read(BLOCK_BYTES):
                 digest.update(block)
                 yield
     except OSError as error:
         raise unreadable(path, error) from error
     if digest.hexdigest() != path.stem:
-        raise DamagedIndex(f"{path}: its bytes are not those that were written.")
+        raise DamagedIndex(f"{path}: the bytes are damaged.")
 
 
 def mapped(path: Path) -> mmap.mmap | bytes:
-    """Map a file into memory that processes share, also after it is unlinked.
+    """Map a file into shared memory, which remains valid after the file is unlinked.
 
     Raises
     ------
-    DamagedIndex : missing or unreadable.
+    DamagedIndex : If the file is missing or unreadable.
     """
     try:
         with path.open("rb") as file:
@@ -121,12 +121,12 @@ def mapped(path: Path) -> mmap.mmap | bytes:
 
 
 def unreadable(path: Path, error: OSError) -> DamagedIndex:
-    """Return the error of a file that is missing or cannot be read."""
+    """Return the error for a missing or unreadable file."""
     return DamagedIndex(f"{path}: cannot be read ({error.strerror or error}).")
 
 
 def check_block(keys: Keys, signatures: Bytes, length: int) -> None:
-    """Raise ValueError where these are not keys, and signatures of that many bytes."""
+    """Raise ValueError unless arrays are keys and signatures of `length` bytes."""
     if keys.dtype != np.int64 or signatures.dtype != np.uint8:
         raise ValueError(f"keys of {keys.dtype} and signatures of {signatures.dtype}")
     if keys.ndim != 1 or length < 1 or signatures.shape != (len(keys), length):

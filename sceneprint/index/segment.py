@@ -1,14 +1,13 @@
-"""Segments: the immutable parts of a version, searched one by one and merged as they grow many.
+"""Segments of a version of an index, which are searched separately and merged when there are many.
 
-    frames that are new  --\\
-    segments of the version before  --merge_plan-->  sources  --write_segment-->  segments
+    new frames  --\\
+    segments of the previous version  --merge_plan-->  sources  --write_segment-->  segments
 
-A publication writes what is new as one segment, and merges into it what is not at least `RATIO`
-times as large as the next smaller: each time a frame is written again, its segment is larger by a
-third at least, so that all writing together is in O(n log n) (the logarithmic method of Bentley and
-Saxe).
-Frames that are gone stay in the file, and in a list beside it, until their segment is written
-again.
+A publication writes new frames as one segment, and merges segments that are not at least `RATIO`
+times as large as the next smaller one. Each time a frame is written again, its segment has grown by
+at least a third, so the total cost is O(n log n) (the logarithmic method of Bentley and Saxe).
+Removed frames remain in the files of a segment, and are listed in another file, until the segment
+is written again.
 """
 
 from __future__ import annotations
@@ -51,21 +50,21 @@ from sceneprint.types import Bytes
 if TYPE_CHECKING:
     from faiss import IndexScalarQuantizer
 
-#: A segment has at least this many times the frames of the next smaller one. By 2 a map of 100,000
-#: frames has up to 7 segments, a search takes a fifth longer, and a fifth less is written.
+#: Minimum ratio of the sizes of consecutive segments. With 2, a map of 100,000 frames would have up
+#: to 7 segments, a search would take a fifth longer, and a fifth less would be written.
 RATIO = 3
-#: Segments of a version, at most: of more, the two smallest are merged.
+#: Maximum number of segments of a version; with more, the two smallest are merged.
 MOST_SEGMENTS = 8
-#: Share of a segment's frames that may be gone before it is written again without them.
+#: Share of removed frames above which a segment is written again without them.
 GONE_SHARE = 0.25
-#: Bytes of signatures up to which a map has no sketches: comparing all takes 3 ms.
+#: Size of signatures in bytes up to which a map has no sketches; comparing all of them takes 3 ms.
 FLAT_BYTES = 1 << 24
-#: Of a larger map, segments of at most this share of FLAT_BYTES have none.
+#: Size of segments without sketches in a larger map, as a share of FLAT_BYTES.
 FLAT_SHARE = 1 / 8
-#: Where fewer than one in this many frames may be found, they are compared one by one: FAISS reads
-#: all of them.
+#: If fewer than one in this many frames is searchable, only these are compared, not by FAISS, since
+#: it would read all frames.
 FEW = 8
-#: Longest answer that FAISS gives: of a longer one, ordering costs more than comparing.
+#: Maximum size of a search by FAISS; for larger ones, sorting costs more than comparing.
 LONGEST = 2048
 
 #: Rows or keys of frames, and their distances.
@@ -73,15 +72,15 @@ Found = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 class Places:
-    """The places of keys in a list, found by bisection.
+    """The positions of keys in a list, by binary search.
 
     Parameters
     ----------
-    keys : (n,) in their order; a rising list is not copied
+    keys : (n,) keys in any order; an ascending array is not copied
 
     Raises
     ------
-    ValueError : a key is there twice.
+    ValueError : If a key occurs twice.
     """
 
     def __init__(self, keys: Keys) -> None:
@@ -92,10 +91,10 @@ class Places:
             self._rising = keys[self._order]
             again = self._rising[1:] == self._rising[:-1]
             if again.any():
-                raise ValueError(f"the keys {self._rising[1:][again][:5].tolist()} are there twice")
+                raise ValueError(f"the keys {self._rising[1:][again][:5].tolist()} occur twice")
 
     def of(self, keys: Keys) -> NDArray[np.int64]:
-        """Places (m,) of keys (m,); -1 for a key that is not there."""
+        """Return the positions (m,) of keys (m,); -1 for a missing key."""
         if len(self._rising) == 0:
             return np.full(len(keys), -1, np.int64)
         at = np.minimum(np.searchsorted(self._rising, keys), len(self._rising) - 1)
@@ -103,10 +102,10 @@ class Places:
         return np.where(self._rising[at] == keys, places, -1)
 
     def found(self, keys: Keys) -> NDArray[np.int64]:
-        """Places of those of some keys, rising, that are there."""
+        """Return the positions of the existing ones of ascending keys."""
         if len(self._rising) == 0 or len(keys) == 0:
             return np.empty(0, np.int64)
-        # most keys of a long list are of other segments, which hold frames of other times
+        # most keys of a long list belong to other segments, which have frames of other times
         first = keys.searchsorted(self._rising[0])
         last = keys.searchsorted(self._rising[-1], "right")
         if first == last:
@@ -117,16 +116,16 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Signatures of some frames, in parts that are mapped.
+    """Signatures of some frames in mapped parts.
 
     Parameters
     ----------
-    record : the names of its parts
-    keys : (N,) int64, rising, of all frames in its parts
-    index : of FAISS, over their signatures in the same order
-    sketches : of its frames; None where all of them are compared
-    gone : (g,) int64, rising, of the frames that do not count: deleted since, or signed anew and
-        in another segment
+    record : names of the parts
+    keys : (N,) int64, ascending keys of all frames in the parts
+    index : FAISS index of the signatures in the same order
+    sketches : sketches of the frames; None if all frames are compared
+    gone : (g,) int64, ascending keys of removed frames: deleted, or signed again and in another
+        segment
     """
 
     record: SegmentFiles
@@ -140,17 +139,17 @@ class Segment:
 
     @cached_property
     def vectors(self) -> Bytes:
-        """Signatures (N, D) uint8, read-only, in the order of the keys."""
+        """Read-only signatures (N, D) uint8 in the order of the keys."""
         return codes_of(self.index)
 
     @cached_property
     def places(self) -> Places:
-        """Rows by keys, of the frames too that are gone."""
+        """Rows of all frames by their keys, including removed ones."""
         return Places(self.keys)
 
     @cached_property
     def gone_rows(self) -> NDArray[np.int64]:
-        """Rows (g,) of the frames that are gone."""
+        """Rows (g,) of removed frames."""
         return self.places.of(self.gone)
 
     @cached_property
@@ -158,53 +157,53 @@ class Segment:
         return Places(self.gone)
 
     def rows_of(self, keys: Keys) -> NDArray[np.int64]:
-        """Rows (n,) of frames; -1 for one that is not there, or gone."""
+        """Return the rows (n,) of frames; -1 for missing or removed ones."""
         rows = self.places.of(keys)
         if len(self.gone):
             rows[self._gone_places.of(keys) >= 0] = -1
         return rows
 
     def standing_rows(self, gone: Keys) -> NDArray[np.int64]:
-        """Rows of all frames but some, all rising."""
+        """Return the rows of all frames except `gone`, ascending."""
         return np.delete(np.arange(len(self.keys)), self.places.found(gone))
 
     def nearest(
         self, query: Bytes, size: int, gone: Keys, among: Keys | None, *, metric: Metric,
         exact: bool,
     ) -> tuple[Found, bool, int]:  # fmt: skip
-        """Find the nearest frames of those that may be found.
+        """Return candidates that include the nearest searchable frames.
 
         Parameters
         ----------
         query : (D,) uint8
-        size : of the answer
-        gone : (g,) rising, of frames that may not be found
-        among : (a,) rising, of those that may; None: all others
-        exact : compare every frame that may be found
+        size : number of nearest frames
+        gone : (g,) ascending keys of excluded frames
+        among : (a,) ascending keys of searchable frames; None selects all others
+        exact : whether to compare every searchable frame
 
         Returns
         -------
-        keys among which the nearest are, and their distances; whether every frame was compared;
-        and how many were
+        keys and distances of the candidates; whether every searchable frame was compared; number of
+        compared frames
         """
         free = self._free_rows(gone, among)
         count = len(self.keys) if free is None else int(np.count_nonzero(free))
-        rows: NDArray[np.int64] | None = None  # None: all that are free
+        rows: NDArray[np.int64] | None = None  # None: all searchable rows
         if free is not None and count < len(free) // FEW:
             rows = np.flatnonzero(free)
         elif self.sketches is not None and not exact:
             rows = self.sketches.candidates(query, min(size, count), free)
         elif size <= LONGEST and metric == "l2":
-            found = nearest(self.index, query, min(size, count), free)
-            if found is not None:
-                return (self.keys[found[0]], found[1]), True, count
+            hits = nearest(self.index, query, min(size, count), free)
+            if hits is not None:
+                return (self.keys[hits[0]], hits[1]), True, count
         if rows is None:
             rows = np.arange(len(self.keys)) if free is None else np.flatnonzero(free)
         distant = distances(query, self.vectors, metric, rows)
         return (self.keys[rows], distant), len(rows) == count, len(rows)
 
     def _free_rows(self, gone: Keys, among: Keys | None) -> NDArray[np.bool_] | None:
-        """Which rows (N,) may be found; None: all."""
+        """Return which rows (N,) are searchable; None if all are."""
         rows = self.places.found(gone)
         if among is None and len(rows) == len(self.gone) == 0:
             return None
@@ -220,36 +219,33 @@ def open_segment(folder: Path, record: SegmentFiles, dimension: int) -> Segment:
 
     Raises
     ------
-    DamagedIndex : one of them is missing, or not what its kind is.
+    DamagedIndex : If a part is missing or inconsistent.
     """
     names = {name.rpartition(".")[2]: folder / name for name, _ in record.files}
     keys, sketches = _rising_keys(names["keys"]), None
     index = map_index(names["faiss"], len(keys), dimension)
     if "sketches" in names:
         if "means" not in names:
-            raise DamagedIndex(f"{names['sketches']}: of no means.")
+            raise DamagedIndex(f"{names['sketches']}: the means are missing.")
         files, probes = (names["sketches"], names["means"]), record.recall.probes
         sketches = map_sketches(*files, len(keys), dimension, probes)
     gone = np.empty(0, np.int64)
     if "gone" in names:
         gone = _rising_keys(names["gone"])
         if not np.isin(gone, keys).all():
-            raise DamagedIndex(f"{names['gone']}: names frames that its segment has not.")
+            raise DamagedIndex(f"{names['gone']}: a removed frame is not in the segment.")
     return Segment(record, keys, index, sketches, gone)
 
 
 def _rising_keys(path: Path) -> Keys:
     keys = np.frombuffer(mapped(path), "<i8")
     if (keys[1:] <= keys[:-1]).any():
-        raise DamagedIndex(f"{path}: its keys are not in order.")
+        raise DamagedIndex(f"{path}: the keys are not in ascending order.")
     return keys
 
 
-# Publication: what becomes of the segments before, and of what is new.
-
-
 def merge_plan(sizes: Sequence[int]) -> list[list[int]]:
-    """Return the groups of places in `sizes`, the smallest first, that each become one segment."""
+    """Return the groups of indexes of `sizes` that become one segment each, smallest first."""
     groups: list[list[int]] = []
     total = 0
     for at in sorted(range(len(sizes)), key=lambda each: sizes[each]):
@@ -266,9 +262,12 @@ def merge_plan(sizes: Sequence[int]) -> list[list[int]]:
 
 @dataclass(frozen=True, eq=False)
 class SegmentSource:
-    """Frames that go into a segment: `rows` (r,) of `keys` (N,) and `vectors` (N, D).
+    """Frames for a new segment: `rows` (r,) of `keys` (N,) and `vectors` (N, D).
 
-    `segment` holds them now, None where they are new; of it `gone` (g,) will not count.
+    Parameters
+    ----------
+    segment : current segment of the frames; None for new frames
+    gone : (g,) removed keys of that segment
     """
 
     keys: Keys
@@ -284,26 +283,26 @@ class SegmentSource:
 def segment_sources(
     segments: Sequence[Segment], new_keys: Keys, stored: Bytes, drop: frozenset[int]
 ) -> list[SegmentSource]:
-    """Return what stays of segments, and what is new; nothing of which nothing stays."""
+    """Return the remaining frames of segments, and the new frames, without empty sources."""
     none, dropped = np.empty(0, np.int64), np.fromiter(drop, np.int64, len(drop))
     changed = np.union1d(dropped, new_keys)
-    found = []
+    sources = []
     for one in segments:
         gone = np.union1d(one.gone, one.keys[one.places.found(changed)])
-        found.append(SegmentSource(one.keys, one.vectors, one.standing_rows(gone), one, gone))
+        sources.append(SegmentSource(one.keys, one.vectors, one.standing_rows(gone), one, gone))
     new = np.flatnonzero(~np.isin(new_keys, dropped))
-    found.append(SegmentSource(new_keys, stored, new, None, none))
-    return [each for each in found if len(each)]
+    sources.append(SegmentSource(new_keys, stored, new, None, none))
+    return [each for each in sources if len(each)]
 
 
 def spool_blocks(
     folder: Path, blocks: Iterable[Block], dimension: int | None
 ) -> tuple[Keys, Bytes]:
-    """Return keys (n,) and signatures (n, D) in a file without a name, not in memory.
+    """Return keys (n,) and signatures (n, D) of blocks; the signatures are in an unnamed file.
 
     Raises
     ------
-    ValueError : they are none, or of several lengths, or have a key twice.
+    ValueError : If blocks are malformed, have several lengths, or have a key twice.
     """
     keys, path = [np.empty(0, np.int64)], unfinished(folder)
     with os.fdopen(create_private(path), "w+b") as file:
@@ -317,25 +316,25 @@ def spool_blocks(
             file.write(np.ascontiguousarray(signatures).data)
             keys.append(own)
         file.flush()
-        found = np.concatenate(keys)
-        Places(found)  # raises where a key is there twice
-        if len(found) == 0:
-            return found, np.empty((0, dimension or 1), np.uint8)
+        all_keys = np.concatenate(keys)
+        Places(all_keys)  # raises if a key occurs twice
+        if len(all_keys) == 0:
+            return all_keys, np.empty((0, dimension or 1), np.uint8)
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    return found, np.frombuffer(data, np.uint8).reshape(len(found), -1)
+    return all_keys, np.frombuffer(data, np.uint8).reshape(len(all_keys), -1)
 
 
 def write_segment(
     folder: Path, sources: Sequence[SegmentSource], *, clean: bool, flat_bytes: float
 ) -> SegmentFiles:
-    """Write the frames of some sources as one segment, in the order of their keys.
+    """Write the frames of sources as one segment in the order of their keys.
 
-    A segment that is not to change is not read, and its parts are named again.
+    The parts of an unchanged segment are reused without reading them.
 
     Parameters
     ----------
-    clean : leave nothing of frames that are gone
-    flat_bytes : of signatures, above which there are sketches
+    clean : whether to write a segment again if it has any removed frames
+    flat_bytes : size of signatures in bytes above which there are sketches
     """
     only = sources[0]
     may_be_gone = 0 if clean else GONE_SHARE * len(only.keys)
@@ -378,20 +377,20 @@ def _flat_recall(frames: int) -> Recall:
 
 
 def _keep_segment(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> SegmentFiles:
-    """Return the parts of a segment that stays, with other frames gone, and sketches if need be.
+    """Return the parts of a remaining segment, with updated removed keys.
 
-    Of a map that has become large its older segments get sketches, which no search needed before.
+    An older segment of a map that has grown gets sketches.
     """
-    kept, recall, more = ["keys", "faiss"], segment.record.recall, list[PartOfIndex]()
+    kinds, recall, more = ["keys", "faiss"], segment.record.recall, list[PartOfIndex]()
     if segment.vectors.nbytes <= flat_bytes:
         recall = _flat_recall(len(segment.keys))
     elif segment.sketches is not None:
-        kept += ["sketches", "means"]
+        kinds += ["sketches", "means"]
     else:
         more, recall = _put_sketches(folder, segment.vectors)
     if len(gone) == len(segment.gone):
-        kept.append("gone")
+        kinds.append("gone")
     else:
         more.append(put(folder, "gone", lambda take: take(gone.astype("<i8").tobytes())))
-    files = [one for one in segment.record.files if one[0].rpartition(".")[2] in kept]
+    files = [one for one in segment.record.files if one[0].rpartition(".")[2] in kinds]
     return SegmentFiles(files=(*files, *more), recall=recall)

@@ -1,12 +1,12 @@
-"""Sketches: one bit for each byte of a signature, which select the frames that a search compares.
+"""Sketches of signatures, with one bit per byte, which select the frames that a search compares.
 
-    signatures (N, d) uint8  --write_segment-->  FAISS's IndexBinaryFlat, in a file beside them
-    query (d,)  --Sketches.candidates-->  rows whose sketches differ from its own in the fewest bits
+    signatures (N, d) uint8  --write_segment-->  FAISS's IndexBinaryFlat in a file
+    query (d,)  --Sketches.candidates-->  rows with the most similar sketches
 
-A bit says whether a byte is above the mean of its segment. A sketch takes an eighth of its
-signature, and to compare two takes an xor and a count of bits. All sketches of a segment are
-compared with a query, and the nearest signatures are then found among the rows selected, by their
-exact distances. How many to select is measured when the segment is written.
+A bit is set if the byte is above its mean in the segment. A sketch has an eighth of the size of its
+signature, and comparing two takes an xor and a count of bits. A search compares all sketches of a
+segment with the query, and then the exact distances of the selected rows. The number of rows to
+select is measured when the segment is written.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from sceneprint.types import Bytes, Floats32
 if TYPE_CHECKING:
     from faiss import IndexBinaryFlat
 
-#: Frames of which the means are taken, at most.
+#: Maximum number of frames to compute means.
 MEASURED = 1 << 16
-#: Frames that a search selects: at least so many, and so many times those it wants.
+#: Minimum number of selected frames of a search, and minimum multiple of its size.
 LEAST_SELECTED, TIMES_WANTED = 256, 4
-#: Neighbours by which recall is measured, and the share of them that a search has to find.
+#: Number of neighbours to measure recall, and the required recall.
 NEAR, ENOUGH = 10, 0.995
-#: Frames looked up: at most, at least, and so many that they are compared with no more bytes.
+#: Maximum and minimum number of measured queries, and maximum number of bytes to compare.
 MOST, LEAST, COMPARED_BYTES = 100, 10, 1 << 36
 
 
@@ -45,9 +45,9 @@ class Sketches:
 
     Parameters
     ----------
-    means : (d,) uint8; a bit is set where the byte is larger
-    index : of FAISS, over the bits of each row; bits beyond d are 0
-    probes : rows that a search selects at least
+    means : (d,) uint8, thresholds of the bits
+    index : FAISS index of the bits; bits beyond d are 0
+    probes : minimum number of rows that a search selects
     """
 
     means: Bytes
@@ -60,13 +60,13 @@ class Sketches:
     def nearest(
         self, query: Bytes, count: int, free: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
-        """Return the rows (count,) whose sketches differ in the fewest bits, fewest first.
+        """Return the rows (count,) with the most similar sketches, most similar first.
 
         Parameters
         ----------
         query : (d,) uint8
-        count : number of rows; there must be as many
-        free : (N,) which rows count; all of them if None
+        count : number of rows, of which at least as many must be searchable
+        free : (N,) which rows are searchable; None selects all
         """
         if count == 0:
             return np.empty(0, np.int64)
@@ -77,23 +77,23 @@ class Sketches:
     def candidates(
         self, query: Bytes, size: int, free: NDArray[np.bool_] | None
     ) -> NDArray[np.int64]:
-        """Return the rows (r,), rising, that a query is compared with.
+        """Return the rows (r,) to compare with a query, ascending.
 
         Parameters
         ----------
         query : (d,) uint8
-        size : rows that are wanted
-        free : (N,) which rows may be found; all of them if None
+        size : number of nearest rows to find
+        free : (N,) which rows are searchable; None selects all
         """
         there = len(self) if free is None else int(np.count_nonzero(free))
         return np.sort(self.nearest(query, min(max(self.probes, TIMES_WANTED * size), there), free))
 
 
 def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
-    """Return at most `limit` of n rows: one at random from each of as many equal stretches.
+    """Return at most `limit` of n rows, a random one from each of `limit` equal intervals.
 
-    Even, so that every place of a map counts alike; at random, so that nothing periodic in the
-    order of the frames (two robots in turn) is missed.
+    Intervals represent all places of a map equally; random choice avoids aliasing with periodic
+    orders of frames, such as of alternating robots.
     """
     if n <= limit:
         return np.arange(n)
@@ -102,12 +102,12 @@ def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
 
 
 def sketch(signatures: Bytes, means: Bytes) -> Bytes:
-    """Return the sketches (n, ceil(d / 8)) of signatures (n, d): see `Sketches`."""
+    """Return the sketches (n, ceil(d / 8)) of signatures (n, d); see `Sketches`."""
     return np.packbits(signatures > means, axis=1, bitorder="little")
 
 
 def make_sketches(vectors: Bytes) -> Sketches:
-    """Return the sketches of signatures (N, d), N >= 1: the same of the same signatures."""
+    """Return the sketches of signatures (N, d), N >= 1; the result is deterministic."""
     n, d = vectors.shape
     means = vectors[draw(n, MEASURED, 0)].mean(axis=0, dtype=np.float64).astype(np.uint8)
     index = library().IndexBinaryFlat(8 * -(-d // 8))
@@ -118,49 +118,50 @@ def make_sketches(vectors: Bytes) -> Sketches:
 
 
 def measure_sketches(sketches: Sketches, vectors: Bytes, seed: int = 0) -> tuple[Sketches, Recall]:
-    """Look up some frames, and select so many that a search finds ENOUGH of the nearest.
+    """Increase the probes of sketches until the recall of a sample of queries reaches ENOUGH.
 
     Returns
     -------
-    the sketches with their `probes`, LEAST_SELECTED times a power of two; and what a search finds
+    sketches : sketches with `probes`, which are LEAST_SELECTED times a power of two
+    recall : measured recall
     """
     n, d = vectors.shape
     chosen = draw(n, min(max(COMPARED_BYTES // (n * d), LEAST), MOST), seed)
-    near, wanted = min(NEAR, n - 1), list[tuple[int, NDArray[np.int64]]]()
+    near, expected = min(NEAR, n - 1), list[tuple[int, NDArray[np.int64]]]()
     for row, others in neighbours(vectors, chosen, 2 * near) if near else ():
         exact = distances(vectors[row], vectors, "l2", others)
-        # an equal distance is as good: which of two equal frames is meant is nobody's concern
-        wanted.append((row, others[exact <= np.partition(exact, near - 1)[near - 1]]))
+        # frames at the same distance count as equally good
+        expected.append((row, others[exact <= np.partition(exact, near - 1)[near - 1]]))
     probes = LEAST_SELECTED
-    while (share := _share_found(sketches, vectors, wanted, probes)) < ENOUGH and probes < n:
+    while (share := _share_found(sketches, vectors, expected, probes)) < ENOUGH and probes < n:
         probes *= 2
     recall = Recall(share=share, near=NEAR, sample=len(chosen), probes=probes, frames=n)
     return replace(sketches, probes=probes), recall
 
 
 def _share_found(
-    sketches: Sketches, vectors: Bytes, wanted: list[tuple[int, NDArray[np.int64]]], probes: int
+    sketches: Sketches, vectors: Bytes, expected: list[tuple[int, NDArray[np.int64]]], probes: int
 ) -> float:
-    """Return the share of the nearest frames that are among as many rows, each without itself."""
-    near, found = min(NEAR, len(vectors) - 1), 0
-    for row, others in wanted:
+    """Return the share of the nearest frames among the first `probes` rows of each query."""
+    near, count = min(NEAR, len(vectors) - 1), 0
+    for row, others in expected:
         rows = sketches.nearest(vectors[row], min(probes + 1, len(vectors)))
-        found += min(int(np.isin(others, rows[rows != row][:probes]).sum()), near)
-    return found / (near * len(wanted)) if wanted else 1.0
+        count += min(int(np.isin(others, rows[rows != row][:probes]).sum()), near)
+    return count / (near * len(expected)) if expected else 1.0
 
 
 def neighbours(
     vectors: Bytes, chosen: NDArray[np.int64], most: int
 ) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Return each of some rows (c,) and the others nearest to it, at most `most`, in no order.
+    """Return each of some rows (c,) with its nearest other rows, at most `most`, in any order.
 
-    They are compared with all signatures (N, d), N > 1, by products of matrices, in a third of the
-    time that `distances` takes. Of rows whose distances hardly differ, rounding may choose another.
+    Rows are compared with all signatures (N, d), N > 1, by matrix products, which take a third of
+    the time of `distances`. Rounding may affect the order of almost equal distances.
     """
     n, d = vectors.shape
     most, step = min(most, n - 1), max(BLOCK_BYTES // d, 1)
     queries = vectors[chosen].astype(np.float32)
-    near, found = np.empty((len(chosen), 0), np.float32), np.empty((len(chosen), 0), np.int64)
+    near, rows = np.empty((len(chosen), 0), np.float32), np.empty((len(chosen), 0), np.int64)
     for start in range(0, n, step):
         block = vectors[start : start + step].astype(np.float32)
         squares: Floats32 = np.einsum("ij,ij->i", block, block) - 2 * (queries @ block.T)
@@ -168,20 +169,20 @@ def neighbours(
         squares[own, chosen[own] - start] = np.inf
         first = np.argpartition(squares, min(most, len(block)) - 1, axis=1)[:, :most]
         near = np.hstack([near, np.take_along_axis(squares, first, axis=1)])
-        found = np.hstack([found, first + start])
+        rows = np.hstack([rows, first + start])
     first = np.argpartition(near, most - 1, axis=1)[:, :most]
-    return zip(chosen.tolist(), np.take_along_axis(found, first, axis=1), strict=True)
+    return zip(chosen.tolist(), np.take_along_axis(rows, first, axis=1), strict=True)
 
 
 def map_sketches(path: Path, means: Path, n: int, dimension: int, probes: int) -> Sketches:
-    """Map the sketches of n signatures, and their means, from parts that the caller has verified.
+    """Map the sketches of n signatures and their means from verified parts.
 
     Raises
     ------
-    DamagedIndex : missing, or of other signatures.
+    DamagedIndex : If a part is missing or belongs to other signatures.
     """
     index = map_binary(path, n, 8 * -(-dimension // 8))
     data = mapped(means)
     if len(data) != dimension:
-        raise DamagedIndex(f"{means}: no means of signatures of {dimension} bytes.")
+        raise DamagedIndex(f"{means}: not the means of signatures of {dimension} bytes.")
     return Sketches(np.frombuffer(data, np.uint8), index, probes)

@@ -220,7 +220,7 @@ def test_another_kind_of_faiss_index_is_refused(
     index.train(rows)
     index.add(rows)
     faiss.write_index(index, str(tmp_path / "other"))
-    with pytest.raises(DamagedIndex, match="no FAISS index of 45"):
+    with pytest.raises(DamagedIndex, match="not a FAISS index of 45"):
         map_index(tmp_path / "other", 45, LENGTH)
 
 
@@ -228,9 +228,9 @@ def test_sketches_of_other_signatures_are_refused(folder: Path, tmp_path: Path) 
     path, means = (own_files(folder)[kind] for kind in ("sketches", "means"))
     assert len(map_sketches(path, means, 45, LENGTH, 1)) == 45
     for n, dimension in ((44, LENGTH), (45, LENGTH + 8)):
-        with pytest.raises(DamagedIndex, match=rf"no FAISS index of {n} sketches"):
+        with pytest.raises(DamagedIndex, match=rf"not a FAISS index of {n} sketches"):
             map_sketches(path, means, n, dimension, 1)
-    with pytest.raises(DamagedIndex, match="no means of signatures of 31 bytes"):
+    with pytest.raises(DamagedIndex, match="not the means of signatures of 31 bytes"):
         map_sketches(path, means, 45, LENGTH - 1, 1)  # as many bytes of bits
     data = path.read_bytes()
     for wrong in (b"", data[:20], data[:-1], b"X" + data[1:]):
@@ -239,5 +239,5 @@ def test_sketches_of_other_signatures_are_refused(folder: Path, tmp_path: Path) 
             map_sketches(path, means, 45, LENGTH, 1)
     other = faiss.IndexBinaryHash(LENGTH, 8)
     faiss.write_index_binary(other, str(tmp_path / "other"))
-    with pytest.raises(DamagedIndex, match="no FAISS index of 0 sketches"):
+    with pytest.raises(DamagedIndex, match="not a FAISS index of 0 sketches"):
         map_sketches(tmp_path / "other", means, 0, LENGTH, 1)

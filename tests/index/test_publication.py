@@ -286,7 +286,7 @@ def test_mistakes_leave_the_version_before(walk: Walk, published: Publish, tmp_p
 
     with pytest.raises(ConnectionError):
         attempt(broken())
-    with pytest.raises(ValueError, match=r"\[10\] are there twice"):
+    with pytest.raises(ValueError, match=r"\[10\] occur twice"):
         attempt([(np.array([10, 11, 10]), signatures[10:13])])
     with pytest.raises(ValueError, match=r"\[255, 256\] bytes in one map"):
         attempt([(np.arange(10, 12), signatures[10:12, 1:])])
@@ -296,7 +296,7 @@ def test_mistakes_leave_the_version_before(walk: Walk, published: Publish, tmp_p
         attempt([(np.arange(10, 13), signatures[10:12])])
     with pytest.raises(ValueError, match="model other appended to those of model"):
         attempt([], "other")
-    with pytest.raises(ValueError, match="of no frames"):
+    with pytest.raises(ValueError, match="there are no frames"):
         publish(folder, model_id="model", revision=1, blocks=[], previous=None)
     assert files(folder) == before
     assert holds(newest(folder, "model", LENGTH), frames_of(np.arange(10), signatures[:10]))

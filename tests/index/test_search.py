@@ -141,7 +141,7 @@ def test_mistakes_are_refused(published: Publish, walk: Walk) -> None:
         search_l2(query[1:], version, empty, 1)
     with pytest.raises(ValueError, match=r"\[255, 256\]"):
         signatures_of(np.array([1]), version, Tail.empty(255))
-    with pytest.raises(ValueError, match=r"\[4\] are there twice"):
+    with pytest.raises(ValueError, match=r"\[4\] occur twice"):
         Tail(np.array([4, 3, 4]), signatures[:3])
     with pytest.raises(ValueError, match="keys"):
         Tail(np.arange(3), signatures[:2])

@@ -1,15 +1,14 @@
-"""Where the indexes of all maps are: a folder of this machine, and a store that a fleet shares.
+"""Place of the indexes of all maps: a local folder, and optionally an object store of a fleet.
 
     builder  --share-->  PREFIX/index/MAP/  --sync-->  INDEXES/MAP/, which all other code reads
 
     MAP/SHA256.faiss        parts, see `sceneprint/index/part_files.py`
-    MAP/0000000007.json     a manifest, written last; the store never replaces it
-    index/.swept            when the store was last searched for indexes of maps that are gone
+    MAP/0000000007.json     a manifest, written last and never replaced
+    index/.swept            mark of the last removal of indexes of deleted maps
 
-Without SCENEPRINT_INDEX_URL there is no store, and the folder is all there is. With it the folder
-caches the store: a part that is there is neither put nor fetched. A manifest without bytes stands
-for an index that was withdrawn: its number is not used again. What is fetched is verified as it is
-written. Nobody needs the store to answer a query: whoever cannot reach it goes on with the folder.
+The object store is used if SCENEPRINT_INDEX_URL is set. The folder is a cache of it, and fetched
+parts are verified. An empty manifest marks an index that was withdrawn; its number is not reused.
+Queries use the folder, even if the object store is not reachable.
 """
 
 from __future__ import annotations
@@ -55,18 +54,18 @@ from sceneprint.store.tables import MapRow
 log = logging.getLogger(__name__)
 
 _FOLDER, _SWEPT, _USED = "index/", "index/.swept", ".used"
-#: Seconds between two looks for a newer index of a map that is queried, and after an error.
+#: Seconds between two checks for a newer index of a queried map, and after an error.
 LOOK_S = 30.0
-#: Seconds after which what no manifest needs is removed: somebody may be fetching it.
+#: Age in seconds above which unlisted parts are removed, since others may be fetching newer ones.
 GRACE_S = 600.0
-#: Seconds after its last query for which the index of a map is not removed to make room.
+#: Seconds after the last query during which the index of a map is not evicted.
 IN_USE_S = 600.0
 
 
 class IndexPlace:
     """The indexes of all maps; safe to share between threads.
 
-    Methods that use the object store raise UnusableStore where it cannot be used.
+    Methods that use the object store raise UnusableStore if it cannot be used.
     """
 
     def __init__(self, store: Store, settings: Settings) -> None:
@@ -84,16 +83,16 @@ class IndexPlace:
 
     @property
     def is_shared(self) -> bool:
-        """Whether a fleet shares the indexes."""
+        """Whether there is an object store that a fleet shares."""
         return self._store is not None
 
     def close(self) -> None:
-        """End fetching, within a block of a part."""
+        """Stop fetching after the current block."""
         self._stop.set()
         self.finish()
 
     def finish(self) -> None:
-        """Wait until nothing is being fetched for queries."""
+        """Wait until all indexes for queries are fetched."""
         thread = self._thread
         if thread is not None:
             thread.join()
@@ -102,10 +101,8 @@ class IndexPlace:
         """Return the folder of the index of a map."""
         return index_folder(self._indexes, row)
 
-    # the newest index, for whoever builds the next one
-
     def head(self, row: MapRow) -> IndexManifest | None:
-        """Return the newest manifest of a map; None where there is none, or it was withdrawn."""
+        """Return the newest manifest of a map; None if there is none or it was withdrawn."""
         if self._store is not None:
             numbered = _numbered(self._list(row))
             return self._read(numbered[-1]) if numbered else None
@@ -115,20 +112,20 @@ class IndexPlace:
         return None
 
     def last_number(self, row: MapRow) -> int:
-        """Return the last number that the store has of an index of a map; 0 where none."""
+        """Return the last number of a map's index in the object store, 0 if there is none."""
         numbered = _numbered(self._list(row))
         return _number(numbered[-1]) or 0 if numbered else 0
 
     def stale_keys(self, row: MapRow, manifest: IndexManifest) -> frozenset[str]:
-        """Return the names of the keys of segments that hold frames that are gone."""
-        if manifest.revision < row.pruned_revision:  # no row says any more which frames are gone
+        """Return the names of the parts with keys of segments that contain deleted frames."""
+        if manifest.revision < row.pruned_revision:  # rows of deleted frames were removed
             return frozenset(manifest.keys)
         with self._database.read() as connection:
             deleted = deleted_since(connection, row.number, manifest.revision)
         gone, stale = np.fromiter(deleted, np.int64, len(deleted)), set(manifest.worn_keys)
         for name in manifest.keys if deleted else ():
             data = self._part(row, name)
-            # of damaged keys nobody knows whose they are
+            # damaged keys may include deleted frames
             is_sound = hashlib.sha256(data).hexdigest() == name.partition(".")[0]
             if not is_sound or np.isin(np.frombuffer(data, "<i8"), gone).any():
                 stale.add(name)
@@ -142,36 +139,34 @@ class IndexPlace:
                 return self._store.get(f"{self._prefix(row)}{name}")
         return b""
 
-    # publication
-
     @contextmanager
     def turn(self, row: MapRow) -> Iterator[Callable[[], None] | None]:
-        """Have the turn to build a map's index, of all hosts; see `index_turn`."""
-        if self._store is None:  # of one host, whose builders have the lock of the folder
+        """Lock the index of a map against builders on other hosts; see `index_turn`."""
+        if self._store is None:  # builders of one host lock the folder
             yield lambda: None
             return
         with index_turn(self._database, row.number) as mine:
             yield mine
 
     def share(self, row: MapRow, manifest: IndexManifest) -> bool:
-        """Put an index into the store, if there is one; False where another has its number."""
+        """Store an index in the object store, if any; return False if its number exists already."""
         if self._store is None:
             return True
         prefix = self._prefix(row)
-        there = {one.key: one.size for one in self._list(row)}
+        sizes = {one.key: one.size for one in self._list(row)}
         for name, size in manifest.files:
-            if there.get(f"{prefix}{name}") != size:
+            if sizes.get(f"{prefix}{name}") != size:
                 self._store.put_file(f"{prefix}{name}", self.folder(row) / name)
         key, data = f"{prefix}{manifest.name}", seal(manifest)
-        # one that was put by a try whose answer was lost is ours
+        # an earlier attempt whose response was lost may have stored the same manifest
         return self._store.put(key, data, create=True) or self._store.get(key) == data
 
     def prune(self, row: MapRow, *, clean: bool = False) -> None:
-        """Remove from the store what no manifest needs that somebody may be fetching; in its turn.
+        """Remove old manifests and unlisted parts from the object store; the caller holds the lock.
 
         Parameters
         ----------
-        clean : all but the newest at once, and not after some time
+        clean : whether to remove all old versions now, instead of after GRACE_S
         """
         listed = self._list(row)
         numbered = _numbered(listed)
@@ -179,23 +174,23 @@ class IndexPlace:
             return
         now = max(one.changed_at for one in listed)  # by the clock of the store
         before = math.inf if clean else now - GRACE_S
-        kept = [one for one, after in pairwise(numbered) if after.changed_at >= before]
+        fetchable = [one for one, after in pairwise(numbered) if after.changed_at >= before]
         needed = set[str]()
-        for one in (*kept, numbered[-1]):
-            found = self._read(one)
-            files = () if found is None else found.files
+        for one in (*fetchable, numbered[-1]):
+            manifest = self._read(one)
+            files = () if manifest is None else manifest.files
             needed |= {one.key, *(f"{self._prefix(row)}{name}" for name, _ in files)}
         self._delete(o.key for o in listed if o.key not in needed and o.changed_at < before)
 
     def withdraw(self, row: MapRow) -> None:
-        """Remove the indexes of a map from the store; their numbers are not used again."""
+        """Remove the index of a map from the object store; its number is not reused."""
         number = self.last_number(row)
         if self._store is not None and number:
             self._store.put(f"{self._prefix(row)}{number:010d}.json", b"")
             self.prune(row, clean=True)
 
     def remove_all_but(self, row: MapRow, head: IndexManifest | None) -> bool:
-        """Leave one index of a map, or none; False where somebody else is building there."""
+        """Remove all versions of a map's index but one; return False if another process builds."""
         with self.turn(row) as mine:
             if mine is None:
                 return False
@@ -206,18 +201,16 @@ class IndexPlace:
         folder = self.folder(row)
         if not manifests(folder):
             return True
-        found = None if head is None else self.sync(row)
-        number = None if found is None else found.number
+        manifest = None if head is None else self.sync(row)
+        number = None if manifest is None else manifest.number
         return [one for one, _ in manifests(folder)] == [number] or clear(folder, but=number)
 
-    # indexes of maps that are gone
-
     def sweep(self, *, now: bool = False) -> None:
-        """Remove from the store the indexes of maps that are gone, once in the fleet at a time.
+        """Remove indexes of deleted maps from the object store, on one host at a time.
 
         Parameters
         ----------
-        now : also where somebody did it a moment ago
+        now : whether to ignore the interval since the last removal
         """
         if self._store is None:
             return
@@ -227,23 +220,23 @@ class IndexPlace:
             return
         self._store.put(_SWEPT, b"")
         keys = [one.key for one in self._store.list(_FOLDER)]
-        kept = self._known()
+        known = self._known()
         self._delete(
             key for key in keys
-            if is_index_folder(name := key.split("/")[1]) and name not in kept
+            if is_index_folder(name := key.split("/")[1]) and name not in known
         )  # fmt: skip
 
     def remove_unknown(self) -> None:
-        """Remove from the folder the indexes of maps that are gone, and of models they had."""
-        there = self._folders()
-        known = self._known() if there else {}
-        for folder in there:
+        """Remove local indexes of deleted maps and of former models."""
+        folders = self._folders()
+        known = self._known() if folders else {}
+        for folder in folders:
             if folder.name not in known:
                 shutil.rmtree(folder, ignore_errors=True)
                 log.info("index removed", extra={"folder": folder.name})
 
     def _known(self) -> dict[str, MapRow]:
-        """Return the maps that there are by the folders of their indexes, coming models' too."""
+        """Return all maps by the names of their folders, including those of next models."""
         with self._database.read() as connection:
             rows = list_maps(connection)
         rows += [replace(r, model_id=r.next_model_id) for r in rows if r.next_model_id is not None]
@@ -252,15 +245,13 @@ class IndexPlace:
     def _folders(self) -> list[Path]:
         return [one for one in self._indexes.glob("*") if is_index_folder(one.name)]
 
-    # the folder as a cache of the store
-
     def want(self, row: MapRow, version: IndexVersion | None) -> None:
-        """Look for a newer index of a map that is queried, in the background, if it is time.
+        """Fetch a newer index of a queried map in the background, if it is due.
 
         Parameters
         ----------
-        row : of the map
-        version : that is used here
+        row : row of the map
+        version : current local version; None without an index
         """
         folder = self.folder(row)
         since = 0 if version is None else version.revision
@@ -270,7 +261,7 @@ class IndexPlace:
             self._looked[folder.name] = time.monotonic()
             _mark_used(folder)
             if row.revision - since <= self._tail_frames:
-                return  # nobody has published a newer one
+                return  # a newer version is not due yet
             self._wanted[folder.name] = row
             if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._fetch, daemon=True, name="index")
@@ -285,68 +276,68 @@ class IndexPlace:
                 _, row = self._wanted.popitem()
             try:
                 self.sync(row, needed=False)
-            except (OSError, SceneprintError, ValueError) as error:  # queries go on without it
+            except (OSError, SceneprintError, ValueError) as error:  # queries do not need it
                 log.warning("index not fetched", extra={"map": row.name, "error": str(error)})
 
     def sync(self, row: MapRow, *, needed: bool = True) -> IndexManifest | None:
-        """Fetch the newest index of a map into the folder, if it is not there.
+        """Fetch the newest index of a map into the folder, unless it exists.
 
         Parameters
         ----------
-        needed : even where there is no room for it beside what is in use
+        needed : whether to fetch it even if the cache has no room
 
         Returns
         -------
-        the manifest of what is here now; None where there is none that the database stands by
+        manifest : manifest of the local version; None if there is none that the database confirms
 
         Raises
         ------
-        DamagedIndex : If it is damaged in the store; it was withdrawn, and workers build it anew.
+        DamagedIndex : If the shared index is damaged; it is withdrawn, and workers rebuild it.
         """
-        folder, found = self.folder(row), self.head(row)
-        if self._store is None or found is None or found.model_id != row.model_id:
-            return found if self._store is None else None
+        folder, manifest = self.folder(row), self.head(row)
+        if self._store is None or manifest is None or manifest.model_id != row.model_id:
+            return manifest if self._store is None else None
         with self._database.read() as connection:
             now = find_map(connection, row.name)
-            if now.number != row.number or trusted(connection, now, found) is None:
+            if now.number != row.number or trusted(connection, now, manifest) is None:
                 return None
-        lacking = [one for one in found.files if not _is_here(folder, *one)]
+        missing = [one for one in manifest.files if not _is_here(folder, *one)]
         with suppress(DamagedIndex):
-            if not lacking and read_manifest(folder / found.name) == found:
-                return found
-        if not self._make_room(sum(size for _, size in lacking), folder) and not needed:
+            if not missing and read_manifest(folder / manifest.name) == manifest:
+                return manifest
+        if not self._make_room(sum(size for _, size in missing), folder) and not needed:
             log.warning("no room for an index", extra={"map": row.name, "bytes": self._most_bytes})
             return None
         with folder_turn(folder) as mine:
             if not mine:
-                return None  # somebody fetches or builds it
+                return None  # another process is fetching or building it
             try:
-                # small ones first: they are merged soon, and then removed from the store
-                for name, size in sorted(found.files, key=lambda each: each[1]):
+                # small parts first, since they are soon merged and removed from the object store
+                for name, size in sorted(manifest.files, key=lambda each: each[1]):
                     if not _is_here(folder, name, size):
                         self._get(self._store, folder, name, size)
             except UnusableStore:
-                remove_unneeded(folder)  # a part of an index is nobody's, and nobody would purge it
+                remove_unneeded(folder)  # purges ignore unlisted parts
                 raise
             except (DamagedIndex, FileNotFoundError) as error:
                 remove_unneeded(folder)
-                if self.last_number(row) == found.number and not self._stop.is_set():
+                if self.last_number(row) == manifest.number and not self._stop.is_set():
                     self.withdraw(row)
                     raise DamagedIndex(
-                        f"{self._store.url}: index {found.number} of map {row.name!r} is damaged "
-                        "there, and was withdrawn. A worker builds it anew."
+                        f"{self._store.url}: index {manifest.number} of map {row.name!r} is "
+                        "damaged and was withdrawn. A worker will rebuild it."
                     ) from error
-                return None  # another has taken its place
-            write_manifest(folder, found)
-            keep_only(folder, {found.number})
+                return None  # a newer version has replaced it
+            write_manifest(folder, manifest)
+            keep_only(folder, {manifest.number})
         _mark_used(folder)
-        return found
+        return manifest
 
     def purge_local(self) -> None:
-        """Remove from the folder indexes that have held deleted frames since the last call.
+        """Remove local indexes that have contained deleted frames since the last call.
 
-        For a node without workers: those publish an index without these frames meanwhile. Each half
-        of the time after which nothing may be left.
+        A node without workers calls this in intervals of half the purge deadline, during which
+        workers publish an index without these frames.
         """
         if self._store is None:
             return
@@ -361,17 +352,17 @@ class IndexPlace:
                     log.warning("purge incomplete", extra=extra)
 
     def _purge_folder(self, row: MapRow, folder: Path) -> None:
-        with suppress(UnusableStore, DamagedIndex):  # then without what is newer
+        with suppress(UnusableStore, DamagedIndex):  # a newer index is optional
             self.sync(row)
         number, path = manifests(folder)[0]
-        # by the parts with keys: a segment that has lost more frames since has the same
+        # by names of the parts with keys, which remain when more frames are removed
         stale = self.stale_keys(row, read_manifest(path))
         if stale & self._stale.get(folder.name, frozenset()) or len(manifests(folder)) > 1:
             clear(folder, but=None if stale else number)
         self._stale[folder.name] = stale
 
     def _make_room(self, size: int, keep: Path) -> bool:
-        """Remove indexes that were not used for long, the longest first; whether there is room."""
+        """Evict the least recently used indexes; return whether there is room for `size` bytes."""
         sizes = {o: sum(file.stat().st_size for file in o.glob("*.*")) for o in self._folders()}
         total = size + sum(sizes.values())
         for folder in sorted(sizes, key=_used_at):
@@ -386,15 +377,13 @@ class IndexPlace:
         def write(take: Callable[[bytes], None]) -> None:
             for chunk in store.chunks(f"{_FOLDER}{folder.name}/{name}"):
                 if self._stop.is_set():
-                    raise DamagedIndex(f"{name}: fetching was ended.")
+                    raise DamagedIndex(f"{name}: fetching was stopped.")
                 take(chunk)
 
-        made, length = put(folder, name.rpartition(".")[2], write)
-        if (made, length) != (name, size):
-            (folder / made).unlink(missing_ok=True)
-            raise DamagedIndex(f"{name}: its bytes are not those that were written.")
-
-    # objects of the store
+        written, length = put(folder, name.rpartition(".")[2], write)
+        if (written, length) != (name, size):
+            (folder / written).unlink(missing_ok=True)
+            raise DamagedIndex(f"{name}: the bytes are damaged.")
 
     def _prefix(self, row: MapRow) -> str:
         return f"{_FOLDER}{self.folder(row).name}/"
@@ -416,7 +405,7 @@ class IndexPlace:
             return None
 
     def _delete(self, keys: Iterable[str]) -> None:
-        """Remove objects, manifests first: they should not promise what is gone."""
+        """Remove objects, manifests first, so that they list only existing parts."""
         if self._store is not None:
             self._store.delete(*sorted(keys, key=lambda key: not key.endswith(".json")))
 
@@ -431,7 +420,7 @@ def _number(listed: ListedObject) -> int | None:
 
 
 def _numbered(listed: Iterable[ListedObject]) -> list[ListedObject]:
-    """Return the manifests among objects, the newest last."""
+    """Return the manifests among objects, newest last."""
     return sorted((one for one in listed if _number(one) is not None), key=lambda one: one.key)
 
 
@@ -443,7 +432,7 @@ def _is_here(folder: Path, name: str, size: int) -> bool:
 
 
 def _mark_used(folder: Path) -> None:
-    """Note that the index of a map is in use, if it is here."""
+    """Set the time of last use of a local index, if it exists."""
     with suppress(OSError):
         (folder / _USED).touch(PRIVATE_FILE)
 

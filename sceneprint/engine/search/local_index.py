@@ -1,9 +1,9 @@
-"""What queries search: each map's signatures, caught up with the database before every query.
+"""Readers of local indexes, which include all signatures of the database at the time of a query.
 
-A `Reader` holds one map: the newest version of its index, and the tail of frames indexed after
-it. What it hands out is an `IndexView`, which never changes; catching up makes a new one beside it.
-A map without an index on this node is all tail: its signatures are read from the database once, and
-compared exactly until a worker has published its index. Signatures compared by L1 never have one.
+A `Reader` holds the newest version of a map's index and a tail of newer frames. It provides
+immutable `IndexView`s, and creates a new view when the map has changed. If there is no local index,
+all signatures are in the tail and are compared exactly until a worker publishes an index.
+Signatures with the metric L1 have no index.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class IndexView:
-    """A map as of one revision: an index, and the frames that are newer.
+    """A map at one revision: a version of its index, and newer frames.
 
     Parameters
     ----------
-    model_id : of the model that made all signatures
-    metric : how they are compared
-    revision : of the map
-    size : frames that can be found
-    dead : frames that it holds and that are deleted
-    damaged : frames that were passed over, as their signature is damaged
-    version : of its index, or None
-    tail : frames newer than it
+    model_id : id of the model of the signatures
+    metric : metric of the model
+    revision : revision of the map
+    size : number of searchable frames
+    dead : deleted frames in the index or the tail
+    damaged : frames that were skipped because their signatures are damaged
+    version : version of the index; None without an index
+    tail : newer frames
     """
 
     model_id: str
@@ -74,7 +74,7 @@ class IndexView:
 
     @property
     def number(self) -> int:
-        """Number of the version of the index; 0 where none is used."""
+        """Number of the version of the index; 0 without an index."""
         return 0 if self.version is None else self.version.number
 
     def search(
@@ -91,47 +91,44 @@ class IndexView:
         self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
         among: Keys | None = None,
     ) -> int:  # fmt: skip
-        """Count the frames that come before one in the order of exact distance, then of keys."""
+        """Return the number of frames before one in the order of exact distances, then of keys."""
         hits = self.search(query, max(self.size, 1), dead=dead, among=among, exact=True)
         same = (hits.distances == distance) & (hits.keys < key)
         return int(((hits.distances < distance) | same).sum())
 
     def signatures(self, keys: Keys) -> Bytes:
-        """Return the signatures (r, D) of frames that it has; see `index.signatures_of`."""
+        """Return the signatures (r, D) of frames; see `index.signatures_of`."""
         return signatures_of(keys, self.version, self.tail)
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Return which frames (n,) can be found."""
-        known = self.tail.places.of(keys) >= 0
+        """Return which frames (n,) are searchable."""
+        included = self.tail.places.of(keys) >= 0
         if self.version is not None:
-            known |= self.version.has(keys)
-        alive: NDArray[np.bool_] = known & ~np.isin(keys, list(self.dead))
+            included |= self.version.has(keys)
+        alive: NDArray[np.bool_] = included & ~np.isin(keys, list(self.dead))
         return alive
 
 
-# The tail of a reader while it grows: appended to behind what has been handed out of it.
-
-#: Bytes of signatures up to which they are held in memory. More go to a file that has no name,
-#: whose pages the kernel drops and reads again as it likes: a map that has lost its index is
-#: scanned whole, and may be larger than the machine's memory.
+#: Size of signatures in bytes up to which they are in memory. Larger tails are in a mapped file,
+#: whose pages the kernel can evict, since a map without an index may exceed the memory.
 IN_MEMORY = 256 << 20
 
 
 class AppendBuffer:
-    """Signatures in the order of their revisions; a tail that it returns never changes.
+    """A growing buffer of signatures by revision, whose returned tails never change.
 
     Parameters
     ----------
-    length : bytes of a signature
-    folder : where a file for many of them may be created, else the system's temporary folder
-    capacity : signatures to make room for at first
+    length : length of a signature in bytes
+    folder : folder for a mapped file; the system's temporary folder is the fallback
+    capacity : initial capacity in signatures
     """
 
     def __init__(self, length: int, folder: Path, capacity: int = 64) -> None:
         self._folder, self._capacity = folder, max(capacity, 64)
         self._keys: NDArray[np.int64] = np.empty(self._capacity, np.int64)
         self._revisions: NDArray[np.int64] = np.empty(self._capacity, np.int64)
-        self._rows = self._room(self._capacity, length)
+        self._rows = self._allocate(self._capacity, length)
         self._places: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -139,59 +136,59 @@ class AppendBuffer:
 
     @property
     def bytes_held(self) -> int:
-        """Memory that the signatures take and nobody but this process can give back."""
+        """Memory in bytes that the kernel cannot evict."""
         return self._rows.nbytes if self._rows.nbytes <= IN_MEMORY else 0
 
     def reserve(self, more: int) -> None:
-        """Make room for that many more at once: growing step by step would copy all each time.
+        """Reserve capacity for more signatures, which avoids repeated copies.
 
         Raises
         ------
-        UnusableStore : If there is no room on the disk.
+        UnusableStore : If the disk has no room for the file.
         """
         n = len(self)
         if n + more > self._capacity:
             length = self._rows.shape[1]
-            # twice as many, but no more than memory would be used for at once
+            # double the capacity, but by at most IN_MEMORY bytes
             step = min(self._capacity, max(IN_MEMORY // length, 64))
             capacity = max(n + more, self._capacity + step)
-            rows = self._room(capacity, length)  # where this fails, all is as it was
-            rows[:n] = self._rows[:n]  # views keep the old arrays
+            rows = self._allocate(capacity, length)  # first, since it may fail
+            rows[:n] = self._rows[:n]  # views still use the old arrays
             new = np.empty(capacity - n, np.int64)
             self._keys = np.concatenate([self._keys[:n], new])
             self._revisions = np.concatenate([self._revisions[:n], new])
             self._capacity, self._rows = capacity, rows
 
     def append(self, change: SignatureChange, row: Bytes) -> None:
-        """Take the signature of a frame that is not there yet."""
+        """Append the signature of a frame that the buffer lacks."""
         self.reserve(1)
         n = len(self)
         self._keys[n], self._revisions[n], self._rows[n] = change.number, change.revision, row
         self._places[change.number] = n
 
     def copy(self, after: int, without: Collection[int] = ()) -> AppendBuffer:
-        """Return the signatures indexed after a revision, without some keys, in other arrays."""
+        """Return a copy with the signatures after a revision, without some keys."""
         n = len(self)
-        wanted = (self._revisions[:n] > after) & ~np.isin(self._keys[:n], list(without))
-        places = np.flatnonzero(wanted)
+        selected = (self._revisions[:n] > after) & ~np.isin(self._keys[:n], list(without))
+        places = np.flatnonzero(selected)
         n = len(places)
-        kept = AppendBuffer(self._rows.shape[1], self._folder, n)
-        kept._keys[:n], kept._revisions[:n] = self._keys[places], self._revisions[places]
-        np.take(self._rows, places, axis=0, out=kept._rows[:n], mode="clip")  # no copy beside
-        kept._places = {key: place for place, key in enumerate(kept._keys[:n].tolist())}
-        return kept
+        result = AppendBuffer(self._rows.shape[1], self._folder, n)
+        result._keys[:n], result._revisions[:n] = self._keys[places], self._revisions[places]
+        np.take(self._rows, places, axis=0, out=result._rows[:n], mode="clip")
+        result._places = {key: place for place, key in enumerate(result._keys[:n].tolist())}
+        return result
 
     def revision_of(self, key: int) -> int:
-        """Return the revision of the signature of a frame; 0 where it is not there."""
+        """Return the revision of a frame's signature; 0 if the frame is missing."""
         place = self._places.get(key)
         return 0 if place is None else int(self._revisions[place])
 
     def tail(self) -> Tail:
-        """Return all that is there now."""
+        """Return the current content as a tail."""
         n = len(self)
         return Tail(self._keys[:n], self._rows[:n])
 
-    def _room(self, capacity: int, length: int) -> Bytes:
+    def _allocate(self, capacity: int, length: int) -> Bytes:
         size = capacity * length
         if size <= IN_MEMORY:
             return np.empty((capacity, length), np.uint8)
@@ -200,36 +197,35 @@ class AppendBuffer:
 
 
 def _nameless(folder: Path, size: int) -> mmap.mmap:
-    """A file of that size, mapped, that the kernel removes with its last user."""
+    """Return a new mapped file of `size` bytes, which is removed with its last user."""
     failed: OSError | None = None
     for place in (folder, Path(tempfile.gettempdir())):
         try:
             make_folder(place)
             with tempfile.TemporaryFile(dir=place) as file:
-                # set aside now: a page that has no room when it is written kills the process
+                # allocated now, since a full disk would kill the process when a page is written
                 os.posix_fallocate(file.fileno(), 0, size)
                 return mmap.mmap(file.fileno(), size)
         except OSError as error:
             failed = error
     raise UnusableStore(
-        f"{folder}: no room for {size >> 20} MB of unindexed signatures "
+        f"{folder}: the disk has no room for {size >> 20} MB of unindexed signatures "
         f"({failed and failed.strerror}). Free some space, or let a worker publish an index."
     ) from failed
 
 
-#: Frames that a reader may be behind before it begins again with a newer index, if there is one.
+#: Number of new frames above which a reader starts again with a newer index, if there is one.
 READ_MOST = 20_000
-#: Seconds between two looks for a newer version, and until one that is damaged, or out of reach
-#: for a moment, is read again.
+#: Seconds between two checks for a newer version, and until a damaged or unreadable version is
+#: tried again.
 _LOOK_S, _AGAIN_S = 1.0, 60.0
 
 
 def index_folder(indexes: Path, row: MapRow) -> Path:
     """Return the folder of the index of a map.
 
-    No other map has it, even one that had the same name, and no other model, whose signatures are
-    not comparable. No other schema has it: a version of the product that runs beside this one has
-    a folder of its own.
+    The name is unique to the map (even among maps with the same name), the model, since signatures
+    of models are not comparable, and the schema, so that versions of sceneprint can coexist.
     """
     created = f"{row.number}-{round(1e6 * row.created_at):x}"
     return indexes / f"{row.name}-{created}-{row.model_id[:12]}.{SCHEMA_VERSION}"
@@ -241,62 +237,64 @@ _FOLDER_NAME = re.compile(
 
 
 def is_index_folder(name: str) -> bool:
-    """Return whether a name is one of `index_folder`."""
+    """Return whether a name was created by `index_folder`."""
     return _FOLDER_NAME.fullmatch(name) is not None
 
 
-#: A version, or its manifest alone.
+#: A version or its manifest.
 Published = TypeVar("Published", IndexVersion, IndexManifest)
 
 
-def trusted(connection: Connection, row: MapRow, found: Published | None) -> Published | None:
-    """A version, unless the database was put back to a state before it, and went on; or rows of
-    frames that were deleted since are gone, so that nobody can tell which.
+def trusted(connection: Connection, row: MapRow, published: Published | None) -> Published | None:
+    """Return a version if it is consistent with the database, else None.
+
+    It is not if the database was restored to an earlier state, or rows of frames that were deleted
+    after the version have been removed.
     """
-    if found is None or found.revision < row.pruned_revision:
+    if published is None or published.revision < row.pruned_revision:
         return None
-    if found.revision <= row.revision and holds_anchor(connection, found.anchor):
-        return found
+    if published.revision <= row.revision and holds_anchor(connection, published.anchor):
+        return published
     return None
 
 
 class Reader:
-    """One map, searched by many threads.
+    """Reader of a map's signatures for many threads.
 
     Parameters
     ----------
     connection, row : see `view`
-    folder : of its index
-    model : of its signatures
+    folder : folder of the index
+    model : model of the signatures
     """
 
     def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model
         self._looked = self._asked = time.monotonic()
         self._lock = threading.Lock()
-        self._unsound = 0, 0.0  # number of a version that cannot be used, until the next try
+        self._unsound = 0, 0.0  # number of an unusable version, and time of the next attempt
         self._begin(connection, row)
 
     def _begin(self, connection: Connection, row: MapRow) -> None:
-        """Hold the newest version, and nothing else."""
+        """Start with the newest version and an empty tail."""
         self._tail = AppendBuffer(self._model.signature_bytes, self._folder.parent)
-        self._dead: dict[int, int] = {}  # what was deleted after the version, and when
+        self._dead: dict[int, int] = {}  # revisions of frames that were deleted after the version
         self._damaged: set[int] = set()
-        found = self._newest(connection, row, None)
-        self._publish(found, 0 if found is None else found.revision)
+        version = self._newest(connection, row, None)
+        self._publish(version, 0 if version is None else version.revision)
 
     @property
     def version(self) -> IndexVersion | None:
-        """That is used."""
+        """Current version of the index."""
         return self._view.version
 
     @property
     def bytes_held(self) -> int:
-        """Memory of the tail."""
+        """Memory of the tail in bytes."""
         return self._tail.bytes_held
 
     def is_outdated(self) -> bool:
-        """Whether there is an index that this reader does not use."""
+        """Return whether there is another usable version."""
         number = self._newest_number()
         unsound, until = self._unsound
         return number not in (None, self._view.number) and (
@@ -304,15 +302,15 @@ class Reader:
         )
 
     def lost_index(self, idle_s: float) -> bool:
-        """Whether nobody asked for so long, and the index that it uses is not on the disk."""
+        """Return whether the reader was idle for `idle_s` seconds and its index was removed."""
         idle = time.monotonic() - self._asked > idle_s
         return idle and self._view.number > 0 and newest_number(self._folder) is None
 
     def view(self, connection: Connection, row: MapRow) -> IndexView:
-        """The map as of the row's revision, or later."""
+        """Return a view at the row's revision or later."""
         self._asked = time.monotonic()
         behind = self._view.revision < row.revision
-        # who only looks for a newer version waits for nobody
+        # a mere check for a newer version does not wait for the lock
         if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
             try:
                 if self._view.revision < row.revision:
@@ -324,14 +322,14 @@ class Reader:
         return self._view
 
     def purge(self, connection: Connection, row: MapRow) -> None:
-        """Hold no signature of a deleted frame any more, but what the newest index has of it."""
+        """Remove signatures of deleted frames from the tail, and switch to the newest version."""
         with self._lock:
             if self._view.revision < row.revision:
                 self._catch_up(connection, row)
             self._swap(connection, row)
-            gone = {number for number in self._dead if self._tail.revision_of(number)}
-            if gone:
-                self._tail = self._tail.copy(0, without=gone)
+            deleted = {number for number in self._dead if self._tail.revision_of(number)}
+            if deleted:
+                self._tail = self._tail.copy(0, without=deleted)
                 self._publish(self._view.version, self._view.revision)
 
     def _is_time(self) -> bool:
@@ -351,37 +349,37 @@ class Reader:
     def _take(self, change: SignatureChange) -> None:
         self._damaged.discard(change.number)
         if change.deleted:
-            self._dead[change.number] = change.revision  # a newer version may hold it
+            self._dead[change.number] = change.revision  # a newer version may contain it
         elif change.vector is None:
-            # one frame must not cost the others; a worker's log says it too
+            # the other frames remain searchable
             log.error("damaged signature skipped", extra={"frame_id": change.frame_id})
             self._damaged.add(change.number)
         elif self._tail.revision_of(change.number) < change.revision:
-            # else an error ended the last time half way
-            if self._tail.revision_of(change.number):  # signed anew, as it had been damaged
+            # otherwise, an interrupted call appended it already
+            if self._tail.revision_of(change.number):  # a damaged frame was signed again
                 self._tail = self._tail.copy(0, without={change.number})
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))
-            self._dead.pop(change.number, None)  # rejected by a model, and tried again by another
+            self._dead.pop(change.number, None)  # another model may have rejected the frame
 
     def _swap(self, connection: Connection, row: MapRow) -> None:
-        """Take another version, if a worker has published one, and keep the rest as tail."""
+        """Switch to another version if there is one, and keep newer frames as the tail."""
         self._looked = time.monotonic()
         view = self._view
         if not self.is_outdated():
             return
-        found = self._newest(connection, row, view.version)
+        version = self._newest(connection, row, view.version)
         since = 0 if view.version is None else view.version.revision
-        # one of the same revision stands for one that was found damaged
+        # a version of the same revision replaces a damaged one
         if (
-            found is None or found.number == view.number
-            or not since <= found.revision <= view.revision
+            version is None or version.number == view.number
+            or not since <= version.revision <= view.revision
         ):  # fmt: skip
-            if found is not None and found.revision < since:  # a fleet's, older than one made here
-                self._unsound = found.number, time.monotonic() + _AGAIN_S
+            if version is not None and version.revision < since:  # a shared version may be older
+                self._unsound = version.number, time.monotonic() + _AGAIN_S
             return
-        self._tail = self._tail.copy(found.revision)
-        self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > found.revision}
-        self._publish(found, view.revision)
+        self._tail = self._tail.copy(version.revision)
+        self._dead = {n: deleted for n, deleted in self._dead.items() if deleted > version.revision}
+        self._publish(version, view.revision)
 
     def _newest_number(self) -> int | None:
         return newest_number(self._folder) if self._model.metric == "l2" else None
@@ -393,10 +391,10 @@ class Reader:
         if number is None:
             return None
         length = self._model.signature_bytes
-        found = newest(self._folder, row.model_id, length, known=known)
-        if found is None or found.number < number:
+        version = newest(self._folder, row.model_id, length, known=known)
+        if version is None or version.number < number:
             self._unsound = number, time.monotonic() + _AGAIN_S
-        return trusted(connection, row, found)
+        return trusted(connection, row, version)
 
     def _publish(self, version: IndexVersion | None, revision: int) -> None:
         tail, both = self._tail.tail(), 0
@@ -404,7 +402,7 @@ class Reader:
         held = np.isin(deleted, tail.keys)
         if version is not None:
             held |= version.has(deleted)
-            both = int(version.has(tail.keys).sum())  # signed anew since
+            both = int(version.has(tail.keys).sum())  # frames that were signed again
         dead = frozenset(deleted[held].tolist())
         size = len(version or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)
