@@ -288,7 +288,9 @@ def test_a_list_of_what_is_gone_that_is_damaged_is_passed_over(worn: tuple[Path,
         assert (found.number, len(found)) == (1, 40)  # readers know of the deletion themselves
 
 
-@pytest.mark.parametrize(("gone", "why"), [([7, 40], "is not in the segment"), ([9, 7], "not in ascending order")])
+@pytest.mark.parametrize(
+    ("gone", "why"), [([7, 40], "not in the segment"), ([9, 7], "not in ascending order")]
+)
 def test_a_list_of_other_frames_is_refused(
     worn: tuple[Path, Path], gone: list[int], why: str
 ) -> None:
