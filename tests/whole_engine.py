@@ -125,7 +125,7 @@ class Engine:
         if_novel: float | None = None,
     ) -> tuple[Added, bool]:  # fmt: skip
         outcome, _ = self.uploads.add(map_name, Upload(data, meta, priority, if_novel))
-        return outcome.taken, outcome.new
+        return outcome.accepted, outcome.new
 
     def list_frames(
         self, map_name: str, cursor: str | None = None, limit: int = 100,

@@ -238,7 +238,7 @@ async def _add_frame(
             parts = ("frame", map_name, upload.data, form.meta, priority, if_novel)
             once = guarded(asking, key, *parts)
             outcome, replayed = here.uploads.add(map_name, upload, once)
-            return outcome.taken, outcome.new, replayed
+            return outcome.accepted, outcome.new, replayed
 
         added, is_new, replayed = await here.upload_gate.run(add)
     mark_replayed(response, replayed=replayed)

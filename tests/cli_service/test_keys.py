@@ -68,7 +68,7 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_pa
     assert [named(one) for one in (old, last)] == [None, "robot"]
     assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr
     assert (
-        "not within 0 s and 30 days"
+        "not between 0 s and 30 days"
         in keys("--rotate", "robot", "--overlap", "31d", expect=2).stderr
     )
     assert "Use it with --rotate" in keys("--list", "--overlap", "1h", expect=2).stderr

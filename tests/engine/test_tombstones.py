@@ -183,7 +183,7 @@ def test_what_has_come_again_is_not_restored(full: Engine, uploads: Any) -> None
     assert new
     other = uploads[8].meta.model_copy(update={"name": "other"})
     put = Upload(uploads[8].data, other, frame_id=second)  # another frame under the second's id
-    assert full.uploads.add("hall", put)[0].taken.frame_id == second
+    assert full.uploads.add("hall", put)[0].accepted.frame_id == second
     (left,) = full.tombstones.list_all("hall", None, 9).items
     assert left.frames == 2
     with pytest.raises(Conflict, match=f"uploaded again as frame {again.frame_id}"):

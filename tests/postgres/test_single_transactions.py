@@ -417,9 +417,9 @@ def test_a_frame_has_the_id_that_it_is_put_under(engine: Engine, small: Any) -> 
     mine, other, no = (
         Upload(*small[i], frame_id=frame_id) for i, frame_id in enumerate(("mine", "other", None))
     )
-    assert engine.uploads.add("hall", mine)[0].taken.frame_id == "mine"
+    assert engine.uploads.add("hall", mine)[0].accepted.frame_id == "mine"
     outcomes, _ = engine.uploads.add_all("hall", [other, no])
-    own, given = (one.taken.frame_id for one in outcomes)
+    own, given = (one.accepted.frame_id for one in outcomes)
     assert (own, len(given)) == ("other", 32)
     assert engine.get_map("hall").frames == {"received": 3}
 

@@ -134,7 +134,7 @@ class UploadResult:
     error: errors.SceneprintError | None = None
 
     @property
-    def taken(self) -> Added:
+    def accepted(self) -> Added:
         """The frame and its job; raise `error` if the upload was refused."""
         if self.added is None:
             raise self.error or ValueError("neither stored nor refused")
@@ -146,7 +146,7 @@ def item_of(outcome: UploadResult) -> BatchItem:
     if outcome.error is not None:
         problem = problem_of(outcome.error)
         return BatchItem(status=problem.status, frame=None, problem=problem)
-    return BatchItem(status=202 if outcome.new else 200, frame=outcome.taken, problem=None)
+    return BatchItem(status=202 if outcome.new else 200, frame=outcome.accepted, problem=None)
 
 
 def upload_response(connection: Connection, frame: FrameRow) -> Added:

@@ -240,7 +240,8 @@ class Products(ABC, Generic[Request, Record]):
             job_file = queue.files_of(connection, job.number).get(name)
         if job_file is None:
             raise DamagedBlob(
-                f"The {name} of {self.record.noun} {job_id} are lost. Delete it and start another."
+                f"File {name} of {self.record.noun} {job_id} is lost. Delete the "
+                f"{self.record.noun} and start another."
             )
         return job_file
 
