@@ -98,7 +98,7 @@ test-postgres: $(STAMP) kernels
 # Update the reference files of tests/test_golden.py after an intended change; read the diff.
 goldens: $(STAMP) kernels
 	SCENEPRINT_UPDATE_GOLDEN=1 $(BIN)/python -m pytest -q tests/test_golden.py
-	$(BIN)/python -m tools.settings_page
+	$(BIN)/python -m tools.pages
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -13,7 +13,7 @@ import socket
 import threading
 from collections import Counter as Tally
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
@@ -92,37 +92,101 @@ MOST_MAPS = 20
 MOST_TENANTS, OTHERS = 50, "(others)"
 
 
+class MetricFamily(NamedTuple):
+    """A family of time series.
+
+    Parameters
+    ----------
+    kind : `counter`, `gauge` or `histogram`
+    meaning : help text
+    labels : names of the labels
+    """
+
+    kind: str
+    meaning: str
+    labels: tuple[str, ...] = ()
+
+
+#: All metrics by their names without the prefix `sceneprint_`. docs/operations.md lists them.
+METRICS = {
+    "requests_total": MetricFamily(
+        "counter", "Number of answered requests.", ("method", "route", "status")
+    ),
+    "request_seconds": MetricFamily("histogram", "Time to answer a request.", ("route",)),
+    "received_bytes_total": MetricFamily("counter", "Size of the received bodies.", ("route",)),
+    "answers_total": MetricFamily("counter", "Number of queries by status.", ("status",)),
+    "stage_seconds": MetricFamily("histogram", "Time of each stage of a query.", ("stage",)),
+    "queries_lost_total": MetricFamily(
+        "counter", "Number of queries that could not be logged; the log says why (`queries lost`)."
+    ),
+    "event_streams": MetricFamily("gauge", "Number of open event streams."),
+    "frames": MetricFamily("gauge", "Number of frames in each state.", ("state",)),
+    "jobs": MetricFamily("gauge", "Number of jobs in each state.", ("state",)),
+    "maps": MetricFamily("gauge", "Number of maps."),
+    "oldest_waiting_seconds": MetricFamily(
+        "gauge", "Age of the oldest waiting job of each kind.", ("kind",)
+    ),
+    "oldest_unsigned_seconds": MetricFamily(
+        "gauge", "Age of the oldest frame without a signature; 0 without such a frame."
+    ),
+    "index_version": MetricFamily(
+        "gauge", "Newest index of each of the 20 maps with the longest tails.", ("map",)
+    ),
+    "index_tail_frames": MetricFamily(
+        "gauge", "Number of indexed frames that the newest index lacks, of the same maps.", ("map",)
+    ),
+    "workers": MetricFamily(
+        "gauge", "Number of `busy` and `idle` workers of this machine; with PostgreSQL, of all.",
+        ("state",),
+    ),
+    "workers_began": MetricFamily(
+        "gauge", "Number of workers that started in the last hour. A number above that of the "
+        "configured workers means restarts."
+    ),
+    "newest_event": MetricFamily("gauge", "Number of the newest event; it only grows."),
+    "disk_bytes": MetricFamily(
+        "gauge", "Disk space of each part of the store, estimated if it has many blobs.", ("part",)
+    ),
+    "disk_free_bytes": MetricFamily("gauge", "Free space on the disk of the data folder."),
+    "scrub_bytes": MetricFamily("gauge", "Size of the data that this scrub has read."),
+    "scrub_damaged": MetricFamily("gauge", "Number of lost and damaged objects in this scrub."),
+    "tenant_requests_total": MetricFamily(
+        "counter", "Number of answered requests of each tenant. The first 50 tenants of a process "
+        "have their own series; all others share `(others)`.", ("tenant", "status"),
+    ),
+    "tenant_request_seconds_total": MetricFamily(
+        "counter", "Time of the tenant's requests, without streams.", ("tenant",)
+    ),
+    "tenant_requests_in_progress": MetricFamily(
+        "gauge", "Number of the tenant's requests in progress.", ("tenant",)
+    ),
+    "tenant_spool_bytes": MetricFamily(
+        "gauge", "Size of the tenant's request bodies on disk.", ("tenant",)
+    ),
+    "tenant_waiting_jobs": MetricFamily(
+        "gauge", "Number of the tenant's jobs that wait for a worker.", ("tenant",)
+    ),
+    "build_info": MetricFamily("gauge", "Version of the service.", ("version", "python")),
+}  # fmt: skip
+
+
 class TenantMetrics:
     """Metrics of the tenants of keys: their requests in one process, and their waiting jobs."""
 
-    def __init__(self, registry: CollectorRegistry) -> None:
-        self._requests = Counter(
-            "sceneprint_tenant_requests", "Number of answered requests of each tenant.",
-            ("tenant", "status"), registry=registry,
-        )  # fmt: skip
-        self._seconds = Counter(
-            "sceneprint_tenant_request_seconds", "Time of the tenant's requests without streams.",
-            ("tenant",), registry=registry,
-        )  # fmt: skip
-        self._now = {
-            name: Gauge(f"sceneprint_tenant_{name}", text, ("tenant",), registry=registry)
-            for name, text in (
-                ("requests_in_progress", "Number of requests in progress."),
-                ("spool_bytes", "Size of request bodies on disk."),
-                ("waiting_jobs", "Number of jobs that wait for a worker."),
-            )
-        }
+    def __init__(self, metrics: Metrics) -> None:
+        self._metrics = metrics
         self._named: set[str] = set()
 
     def request(self, tenant: str, status: int, seconds: float) -> None:
         """Count a request."""
         name = self._name(tenant)
-        self._requests.labels(name, str(status)).inc()
-        self._seconds.labels(name).inc(seconds)
+        self._metrics.counters["tenant_requests_total"].labels(name, str(status)).inc()
+        self._metrics.counters["tenant_request_seconds_total"].labels(name).inc(seconds)
 
-    def update(self, *values: Mapping[str, int]) -> None:
-        """Set requests in progress, bytes on disk and waiting jobs by tenant, without NOBODY."""
-        for gauge, by_tenant in zip(self._now.values(), values, strict=True):
+    def update(self, **values: Mapping[str, int]) -> None:
+        """Set `requests_in_progress`, `spool_bytes` and `waiting_jobs` by tenant, except NOBODY."""
+        for name, by_tenant in values.items():
+            gauge = self._metrics.gauges[f"tenant_{name}"]
             gauge.clear()  # drop tenants that have none left
             for tenant, number in by_tenant.items():
                 if tenant != NOBODY:
@@ -140,86 +204,44 @@ class Metrics:
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.sampler = Sampler()
-        self._requests = Counter(
-            "sceneprint_requests", "Number of answered requests.", ("method", "route", "status"),
-            registry=self.registry,
-        )  # fmt: skip
-        self._seconds = Histogram(
-            "sceneprint_request_seconds", "Time to answer a request.", ("route",),
-            buckets=_SECONDS, registry=self.registry,
-        )  # fmt: skip
-        self._received = Counter(
-            "sceneprint_received_bytes", "Size of the received bodies.", ("route",),
-            registry=self.registry,
-        )  # fmt: skip
-        self._answers = Counter(
-            "sceneprint_answers", "Number of queries by status of the answer.", ("status",),
-            registry=self.registry,
-        )  # fmt: skip
-        self._stages = Histogram(
-            "sceneprint_stage_seconds", "Time of each stage of a query.", ("stage",),
-            buckets=_SECONDS, registry=self.registry,
-        )  # fmt: skip
-        self._lost = Counter(
-            "sceneprint_queries_lost", "Number of queries that could not be logged.",
-            registry=self.registry,
-        )  # fmt: skip
+        self.counters: dict[str, Counter] = {}
+        self.gauges: dict[str, Gauge] = {}
+        self.histograms: dict[str, Histogram] = {}
+        for name, (kind, meaning, labels) in METRICS.items():
+            full = f"sceneprint_{name}"
+            if kind == "counter":
+                self.counters[name] = Counter(full, meaning, labels, registry=self.registry)
+            elif kind == "gauge":
+                self.gauges[name] = Gauge(full, meaning, labels, registry=self.registry)
+            else:
+                self.histograms[name] = Histogram(
+                    full, meaning, labels, buckets=_SECONDS, registry=self.registry
+                )
+        self.gauges["build_info"].labels(__version__, platform.python_version()).set(1)
+        self.tenants = TenantMetrics(self)
         self._reported_lost = 0
-        self._by_tenant = TenantMetrics(self.registry)
-        self._streams = self._gauge("event_streams", "Number of open event streams.")
-        self._frames = self._gauge("frames", "Number of frames in each state.", "state")
-        self._jobs = self._gauge("jobs", "Number of jobs in each state.", "state")
-        self._maps = self._gauge("maps", "Number of maps.")
-        self._oldest = self._gauge(
-            "oldest_waiting_seconds", "Age of the oldest waiting job of each kind.", "kind"
-        )
-        self._oldest_frame = self._gauge(
-            "oldest_unsigned_seconds", "Age of the oldest frame without a signature; 0 for none."
-        )
-        self._version = self._gauge(
-            "index_version", "Newest index; of the maps with the longest tails.", "map"
-        )
-        self._tail = self._gauge(
-            "index_tail_frames", "Indexed frames that the newest index lacks; of these maps.", "map"
-        )
-        self._workers = self._gauge("workers", "Number of busy and idle workers.", "state")
-        self._began = self._gauge(
-            "workers_began", "Number of workers that started in the last hour. A number above that "
-            "of the configured workers means restarts."
-        )  # fmt: skip
-        self._events = self._gauge("newest_event", "Number of the newest event; it only grows.")
-        self._disk = self._gauge("disk_bytes", "Disk space of each part of the store.", "part")
-        self._scrubbed = self._gauge("scrub_bytes", "Size of the data that this scrub has read.")
-        self._damaged = self._gauge("scrub_damaged", "Lost and damaged objects in this scrub.")
-        self._free = self._gauge("disk_free_bytes", "Free space on the disk of the data folder.")
-        self._gauge("build_info", "Version of the service.", "version", "python").labels(
-            __version__, platform.python_version()
-        ).set(1)
-
-    def _gauge(self, name: str, text: str, *labels: str) -> Gauge:
-        return Gauge(f"sceneprint_{name}", text, labels, registry=self.registry)
 
     def request(
         self, method: str, route: str, status: int, seconds: float, received: int = 0,
         tenant: str = NOBODY,
     ) -> None:  # fmt: skip
         """Count a request. `route` is a pattern, which limits the number of series."""
-        self._requests.labels(method, route, str(status)).inc()
+        self.counters["requests_total"].labels(method, route, str(status)).inc()
         if tenant != NOBODY:
-            self._by_tenant.request(tenant, status, 0.0 if route == EVENTS else seconds)
+            self.tenants.request(tenant, status, 0.0 if route == EVENTS else seconds)
         if received:
-            self._received.labels(route).inc(received)
+            self.counters["received_bytes_total"].labels(route).inc(received)
         if route != EVENTS:  # a stream lasts as long as its client
-            self._seconds.labels(route).observe(seconds)
+            self.histograms["request_seconds"].labels(route).observe(seconds)
         if route.startswith("/v1/"):
             self.sampler.request(status)
 
     def answer(self, answer: Answer) -> None:
         """Count the answer to a query."""
-        self._answers.labels(answer.status).inc()
+        self.counters["answers_total"].labels(answer.status).inc()
         self.sampler.answer(answer)
         for stage, milliseconds in answer.milliseconds.items():
-            self._stages.labels(stage).observe(milliseconds / 1e3)
+            self.histograms["stage_seconds"].labels(stage).observe(milliseconds / 1e3)
 
     def text(
         self, figures: Figures, streams: int, lost: int, held: Mapping[str, int],
@@ -234,34 +256,35 @@ class Metrics:
         lost : number of queries lost since the start of the process
         held, spool : requests in progress, and bytes of bodies on disk, by tenant
         """
-        self._by_tenant.update(held, spool, figures.waiting)
-        self._lost.inc(lost - self._reported_lost)
+        self.tenants.update(
+            requests_in_progress=held, spool_bytes=spool, waiting_jobs=figures.waiting
+        )
+        self.counters["queries_lost_total"].inc(lost - self._reported_lost)
         self._reported_lost = lost
-        stats, workers = figures.stats, figures.stats.workers or []
+        stats, workers, gauges = figures.stats, figures.stats.workers or [], self.gauges
         for state in FrameState:
-            self._frames.labels(state).set(stats.frames.get(state, 0))
+            gauges["frames"].labels(state).set(stats.frames.get(state, 0))
         for kind in JobState:
-            self._jobs.labels(kind).set(stats.jobs.get(kind, 0))
-        self._streams.set(streams)
-        self._scrubbed.set(0 if stats.scrub is None else stats.scrub.bytes)
-        self._damaged.set(0 if stats.scrub is None else stats.scrub.damaged)
-        self._maps.set(stats.maps)
-        self._oldest.clear()
+            gauges["jobs"].labels(kind).set(stats.jobs.get(kind, 0))
+        gauges["event_streams"].set(streams)
+        gauges["scrub_bytes"].set(0 if stats.scrub is None else stats.scrub.bytes)
+        gauges["scrub_damaged"].set(0 if stats.scrub is None else stats.scrub.damaged)
+        gauges["maps"].set(stats.maps)
+        for name in ("oldest_waiting_seconds", "index_version", "index_tail_frames"):
+            gauges[name].clear()  # drop deleted maps and ended jobs
         for waiting, age in stats.oldest_waiting_s.items():
-            self._oldest.labels(waiting).set(age)
-        self._oldest_frame.set(stats.oldest_waiting_s.get("sign", 0.0))
-        for gauge in (self._version, self._tail):
-            gauge.clear()  # drop deleted maps
+            gauges["oldest_waiting_seconds"].labels(waiting).set(age)
+        gauges["oldest_unsigned_seconds"].set(stats.oldest_waiting_s.get("sign", 0.0))
         for index in stats.indexes[:MOST_MAPS]:
-            self._version.labels(index.map).set(index.version or 0)
-            self._tail.labels(index.map).set(index.tail)
+            gauges["index_version"].labels(index.map).set(index.version or 0)
+            gauges["index_tail_frames"].labels(index.map).set(index.tail)
         busy = sum(worker.job_id is not None for worker in workers)
-        self._workers.labels("busy").set(busy)
-        self._workers.labels("idle").set(len(workers) - busy)
-        self._began.set(figures.began)
-        self._events.set(figures.events)
-        self._disk.labels("database").set(stats.bytes.database or 0)
-        self._disk.labels("blobs").set(stats.bytes.blobs)
-        self._disk.labels("index").set(stats.bytes.index)
-        self._free.set(stats.bytes.free or 0)
+        gauges["workers"].labels("busy").set(busy)
+        gauges["workers"].labels("idle").set(len(workers) - busy)
+        gauges["workers_began"].set(figures.began)
+        gauges["newest_event"].set(figures.events)
+        gauges["disk_bytes"].labels("database").set(stats.bytes.database or 0)
+        gauges["disk_bytes"].labels("blobs").set(stats.bytes.blobs)
+        gauges["disk_bytes"].labels("index").set(stats.bytes.index)
+        gauges["disk_free_bytes"].set(stats.bytes.free or 0)
         return generate_latest(self.registry)

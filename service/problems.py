@@ -17,61 +17,16 @@ from sceneprint import errors
 from sceneprint_client.api import Problem
 from sceneprint_client.api.base import invalid_request
 from service.browser_security import security_headers
+from service.problem_types import PROBLEM_TYPES, problem_type
 
 log = logging.getLogger(__name__)
 
-#: Status code of each error class; other classes have that of their nearest base class.
-STATUSES: dict[type[errors.SceneprintError], int] = {
-    errors.FrameError: 422,
-    errors.NotFound: 404,
-    errors.Conflict: 409,
-    errors.InvalidRequest: 422,
-    errors.MalformedBody: 400,
-    errors.UnsupportedType: 415,
-    errors.TooLarge: 413,
-    errors.SlowBody: 408,
-    errors.AmbiguousKey: 400,
-    errors.PreconditionFailed: 412,
-    errors.KeyRequired: 401,
-    errors.Forbidden: 403,
-    errors.QuotaExceeded: 403,
-    errors.RateLimited: 429,
-    errors.Misdirected: 421,
-    errors.ForeignOrigin: 403,
-    errors.Busy: 503,
-    errors.StoreFull: 507,
-    errors.UnusableStore: 503,
-    errors.SceneprintError: 500,
-}
-#: Seconds for the header Retry-After. They are short if load is the cause, and longer if a person
-#: must act first.
-RETRY_AFTER_S = {429: "1", 503: "1", 507: "30"}
-LATER_S: dict[type[errors.SceneprintError], str] = {
-    errors.ReadOnlyStore: "60", errors.NewerSchema: "60",
-}  # fmt: skip
-#: Messages for clients if the store cannot be used. The messages of the errors name folders, which
-#: only the operator should see.
-_LOG = "Its log has the details under the id of the request."
-UNUSABLE: dict[type[errors.SceneprintError], str] = {
-    errors.StoreFull: "The service's disk is full, so nothing was stored. Queries still work. "
-    f"{_LOG} Free some space there, and send the request again.",
-    errors.ReadOnlyStore: "The service's store is read-only, so nothing was stored. Queries "
-    f"still work. {_LOG} Make the data folder writable there, and restart the service.",
-    errors.NewerSchema: "A later version of sceneprint has migrated the service's store, so this "
-    f"process stored nothing. {_LOG} Stop the process, and start the later version.",
-    errors.StoreLocked: "Another process has locked the service's store for too long, so "
-    f"nothing was stored. Queries still work. {_LOG} Retry later.",
-    errors.StoreAway: "The service's database or object store does not respond. The request may "
-    f"or may not have been stored; it is safe to send it again. {_LOG} Retry later.",
-    errors.UnusableStore: "The service cannot use its store at the moment, so nothing was "
-    f"stored. {_LOG} Retry later.",
-}
 MEDIA_TYPE = "application/problem+json"
 
 
 def status_of(error: errors.SceneprintError) -> int:
     """Return the HTTP status code of an error."""
-    return next(STATUSES[kind] for kind in type(error).__mro__ if kind in STATUSES)
+    return problem_type(type(error)).status
 
 
 def type_of(name: str) -> str:
@@ -92,7 +47,9 @@ def problem(
     }
     if fields:
         document["errors"] = [{"field": place, "reason": reason} for place, reason in fields]
-    headers = {"Retry-After": RETRY_AFTER_S[status]} if status in RETRY_AFTER_S else {}
+    known = PROBLEM_TYPES.get(name)
+    retry = known.retry_after_s if known else None
+    headers = {} if retry is None else {"Retry-After": str(retry)}
     if status == 401:
         headers["WWW-Authenticate"] = "Bearer"
     return JSONResponse(document, status, headers, MEDIA_TYPE)
@@ -125,15 +82,11 @@ def install(app: FastAPI) -> None:
         if status >= 500 and not isinstance(error, errors.Busy):
             log.error("request failed", extra={"request_id": _id(request), "error": str(error)})
         fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
-        detail = str(error)
-        if isinstance(error, errors.UnusableStore):
-            detail = next(UNUSABLE[kind] for kind in type(error).__mro__ if kind in UNUSABLE)
+        detail = problem_type(type(error)).detail or str(error)
         answer = problem(_id(request), type(error).__name__, status, detail, fields)
         rate = getattr(request.state, "rate", None)
         if rate is not None and isinstance(error, errors.RateLimited):
             answer.headers["Retry-After"] = str(rate.wait_s)
-        if type(error) in LATER_S:
-            answer.headers["Retry-After"] = LATER_S[type(error)]
         return answer
 
     @app.exception_handler(RequestValidationError)

@@ -1,20 +1,21 @@
-"""Tests that docs/operations.md, docs/settings.md and the dashboard match the code."""
+"""Tests that pages, alerts and the dashboards of Grafana match the tables of the code."""
 
 from __future__ import annotations
 
 import json
 import re
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 
+from sceneprint import errors
 from sceneprint.cli import parser
 from sceneprint.settings import Settings
-from sceneprint_client.api import AnswerStatus, FrameState, JobState
-from sceneprint_client.api.admin import KINDS, MISSED
-from service.metrics import Metrics
-from tools.settings_page import settings_page
+from sceneprint_client.api.admin import KINDS
+from service.metrics import METRICS
+from service.problem_types import problem_type
+from tools.pages import problem_rows, written_pages
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "operations.md").read_text()
@@ -35,15 +36,8 @@ def rows(text: str) -> dict[str, list[str]]:
 
 
 def families() -> dict[str, set[str]]:
-    """Names of all that is told to Prometheus, with their labels."""
-    found: dict[str, set[str]] = {}
-    metrics = Metrics()
-    for collector in metrics.registry._collector_to_names:  # also those without data
-        labels = set(getattr(collector, "_labelnames", ()))
-        for family in collector.describe():
-            name = family.name + ("_total" if family.type == "counter" else "")
-            found[name] = labels
-    return found
+    """Return the labels of each metric."""
+    return {f"sceneprint_{name}": set(family.labels) for name, family in METRICS.items()}
 
 
 def queried(expression: str) -> list[tuple[str, set[str]]]:
@@ -70,10 +64,13 @@ def check(expression: str) -> None:
     assert by <= labels, expression
 
 
-def test_the_page_of_settings_is_written_from_their_fields() -> None:
-    text = (DOCS / "settings.md").read_text()
-    assert text == settings_page(), "run: make goldens"
-    listed = rows(text)
+@pytest.mark.parametrize("path", written_pages(), ids=lambda path: path.name)
+def test_tables_of_pages_are_those_of_the_code(path: Path) -> None:
+    assert path.read_text() == written_pages()[path], "run: make goldens"
+
+
+def test_tables_have_the_units_statuses_and_labels_of_the_code() -> None:
+    listed = rows((DOCS / "settings.md").read_text())
     assert list(listed) == [name.upper() for name in Settings.model_fields]
     assert all(len(cells) == 4 and all(cells) for cells in listed.values())
     assert listed["PORT"][:2] == ["whole number, at least 0, at most 65,535", "`8008`"]
@@ -81,29 +78,26 @@ def test_the_page_of_settings_is_written_from_their_fields() -> None:
     assert listed["WORKERS"][1] == "number of processors"
     assert listed["DATABASE_URL"][:2] == ["text", "SQLite in the data folder"]
     assert listed["BUILD_SURFACES"][0] == "`auto` or `on_request`"
+    assert rows(PAGE)["sceneprint_requests_total"][:2] == ["counter", "`method`, `route`, `status`"]
+    assert set(KINDS) < rows(PAGE).keys()
 
 
-def test_every_state_is_told():
-    told = rows(section("States"))
-    wanted: dict[str, str] = {str(one): one.sentence for one in FrameState}
-    by_frames = rows(section("States").split("A job:")[0])
-    by_jobs = rows(section("States").split("A job:")[1].split("An answer:")[0])
-    answers = rows(section("States").split("An answer:")[1].split("Kinds of events")[0])
-    kinds = rows(section("States").split("Kinds of events")[1])
-    assert by_frames == {name: [sentence] for name, sentence in wanted.items()}
-    assert by_jobs == {str(one): [one.sentence] for one in JobState}
-    assert set(answers) == set(get_args(AnswerStatus))
-    assert {kind: [text] for kind, text in KINDS.items()} == {
-        kind: cells for kind, cells in kinds.items() if kind != MISSED
-    }
-    assert MISSED in told
+def test_every_public_error_is_in_one_row_with_its_status() -> None:
+    table = [row for row in problem_rows() if not row[0].startswith("5")]
+    listed = {one.strip("`"): row[0] for row in table for one in row[1].split(", ")}
+    assert sum(len(row[1].split(", ")) for row in table) == len(listed)
+    kinds = [getattr(errors, name) for name in errors.__all__ if name[:1].isupper()]
+    for kind in kinds:
+        status = problem_type(kind).status
+        name = errors.kebab_case(kind.__name__)
+        assert status >= 500 or listed[name] == str(status)
+    assert (listed["unknown-map"], listed["bad-request"]) == ("404", "400")
+    assert all(len(row) == 4 and all(row) for row in table)
 
 
-def test_every_metric_is_told_and_no_other():
-    text = section("What to watch")
-    table = text.split("| metric |")[1].split("\n\n")[0]
-    assert set(re.findall(r"`(sceneprint_\w+)`", table)) == set(families())
-    alerts = re.findall(r"^\| `([^`]*sceneprint_[^`]*)` \|", text.split("| condition |")[1], re.M)
+def test_alerts_query_existing_metrics() -> None:
+    alerts = re.findall(r"^\| `([^`]*sceneprint_[^`]*)` \|", section("What to watch"), re.M)
+    alerts = [alert for alert in alerts if " " in alert]
     assert len(alerts) >= 9
     for alert in alerts:
         check(alert)

@@ -15,7 +15,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 TOUR = (ROOT / "docs/api.md").read_text()
-REFERENCE = (ROOT / "docs/reference.md").read_text()
 #: Seconds in which the tour has to come to its end: it waits for jobs.
 PATIENCE_S = 600.0
 
@@ -227,23 +226,3 @@ def test_the_page_shows_the_fields_that_there_are(outputs: dict[str, list[str]])
     assert set(shown["matches"][0]) == set(Match.model_fields)
     assert set(shown["matches"][0]["validation"]) == set(Validation.model_fields)
     assert set(one(outputs, "Where was this taken?")[0]) == set(shown)
-
-
-def test_every_kind_of_problem_has_its_row() -> None:
-    from sceneprint import errors
-    from service.problems import STATUSES, status_of, type_of
-
-    over_http = [
-        kind
-        for base in STATUSES
-        if base is not errors.SceneprintError
-        for kind in (base, *base.__subclasses__())
-        if not kind.__subclasses__() or kind is errors.InvalidRequest
-    ]
-    for kind in over_http:
-        name = type_of(kind.__name__).removeprefix("/problems/")
-        rows = [
-            line for line in REFERENCE.splitlines() if f"`{name}`" in line and line.startswith("| ")
-        ]
-        assert len(rows) == 1, name
-        assert rows[0].startswith(f"| {status_of(kind('x'))} |"), name

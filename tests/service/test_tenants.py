@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import generate_latest
 from sqlalchemy import select
 from starlette.applications import Starlette
 
@@ -35,7 +35,7 @@ from service.limits import (
     Turns,
     share,
 )  # fmt: skip
-from service.metrics import MOST_TENANTS, Metrics, TenantMetrics
+from service.metrics import MOST_TENANTS, Metrics
 from service.middleware import RequestMiddleware
 from tests.whole_engine import Engine
 
@@ -350,19 +350,19 @@ def test_metrics_tell_tenants_apart(shared, until):
 
 
 def test_series_of_tenants_stay_few():
-    registry = CollectorRegistry()
-    told = TenantMetrics(registry)
+    metrics = Metrics()
+    told = metrics.tenants
     for number in range(MOST_TENANTS + 5):
         told.request(f"t{number}", 200, 0.5)
-    told.update({"t0": 2, "t51": 3, "t52": 4, NOBODY: 9}, {}, {})
-    text = generate_latest(registry).decode()
+    told.update(requests_in_progress={"t0": 2, "t51": 3, "t52": 4, NOBODY: 9})
+    text = generate_latest(metrics.registry).decode()
     assert text.count("sceneprint_tenant_requests_total{") == MOST_TENANTS + 1
     assert 'sceneprint_tenant_requests_total{status="200",tenant="(others)"} 5.0' in text
     assert 'sceneprint_tenant_requests_in_progress{tenant="t0"} 2.0' in text
     assert 'sceneprint_tenant_requests_in_progress{tenant="(others)"} 7.0' in text
-    told.update({}, {"t1": 5}, {"t2": 6})
-    text = generate_latest(registry).decode()
+    told.update(requests_in_progress={}, spool_bytes={"t1": 5}, waiting_jobs={"t2": 6})
+    text = generate_latest(metrics.registry).decode()
     assert 'sceneprint_tenant_spool_bytes{tenant="t1"} 5.0' in text
     assert 'sceneprint_tenant_waiting_jobs{tenant="t2"} 6.0' in text
-    told.update({}, {}, {})
-    assert "requests_in_progress{" not in generate_latest(registry).decode()
+    told.update(requests_in_progress={})
+    assert "requests_in_progress{" not in generate_latest(metrics.registry).decode()

@@ -10,12 +10,8 @@ from typing import Any
 import pytest
 
 import sceneprint_client
-from sceneprint import errors
 from sceneprint_client import Client
-from service.problems import type_of as problem_type
 from tools.site import http_pages
-from tools.site.error_page import kinds, remedy, status
-from tools.site.markup import cell
 from tools.site.reference import GeneratedPage, api_document, generated_pages
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,33 +64,6 @@ def test_every_operation_is_described_once_on_the_page_of_its_resource(
     )
     assert set(listed) == wanted
     assert pages["reference/http/index.md"].text.splitlines()[2].startswith(f"{len(wanted)} opera")
-
-
-def test_every_error_is_listed_with_its_status_and_what_to_do(
-    pages: dict[str, GeneratedPage],
-) -> None:
-    public = set(kinds())
-    assert {one.__name__ for one in public} == {
-        name for name in errors.__all__ if name[0].isupper()
-    } - {"SceneprintError"}
-    parts = sections(pages["reference/errors.md"].text)
-    problems = {row[1].strip("`"): row for row in rows(parts["Problems by status"])[1:]}
-    others = {row[0].strip("`"): row for row in rows(parts["Other errors"])[1:]}
-    for kind in public:
-        if status(kind) == 500:
-            assert others[kind.__name__][2]
-        else:
-            row = problems[problem_type(kind.__name__)]
-            assert row[0].startswith(f"{status(kind)} ")
-            assert row[3] == cell(remedy(kind))
-    assert problems["/problems/rate-limited"] == [
-        "429 Too Many Requests", "`/problems/rate-limited`",
-        "The caller exceeds its request rate.", "Wait for the seconds in `Retry-After`.",
-    ]  # fmt: skip
-    # whatever the reference by hand lists is there, too
-    table = (ROOT / "docs/reference.md").read_text().split("## Problems")[1]
-    by_hand = re.findall(r"`([a-z]+(?:-[a-z]+)+|forbidden|misdirected|conflict|busy)`", table)
-    assert {f"/problems/{name}" for name in by_hand} - set(problems) == {"/problems/damaged-blob"}
 
 
 def test_everything_that_the_client_offers_is_described(pages: dict[str, GeneratedPage]) -> None:

@@ -1,64 +1,14 @@
-"""Pages of metrics and commands, generated from the code."""
+"""Generator of the page of commands, from their parsers."""
 
 from __future__ import annotations
 
 import argparse
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
-
-from prometheus_client.metrics import MetricWrapperBase
 
 from sceneprint.cli import COMMANDS, parser
 from sceneprint.cli.completion import subcommands
-from service.metrics import Metrics
 from tools.site.markup import cell, code, fenced, page, plain, table
-
-
-@dataclass(frozen=True)
-class MetricFamily:
-    """A family of time series.
-
-    Parameters
-    ----------
-    name : name in Prometheus
-    kind : counter, gauge or histogram
-    labels : labels of its series
-    meaning : help text
-    """
-
-    name: str
-    kind: str
-    labels: tuple[str, ...]
-    meaning: str
-
-
-def metric_families() -> list[MetricFamily]:
-    """Return all families of a service by name, including those without data."""
-    metrics = Metrics()
-    found = set()
-    for collector in metrics.registry._collector_to_names:  # `collect` omits empty families
-        assert isinstance(collector, MetricWrapperBase)
-        for family in collector.describe():
-            name = family.name + ("_total" if family.type == "counter" else "")
-            labels = tuple(collector._labelnames)
-            found.add(MetricFamily(name, family.type, labels, family.documentation))
-    return sorted(found, key=lambda one: one.name)
-
-
-def metrics_page() -> str:
-    """Return Markdown that lists every metric."""
-    found = metric_families()
-    rows = (
-        (f"`{one.name}`", one.kind, ", ".join(map(code, one.labels)), cell(one.meaning))
-        for one in found
-    )
-    return page(
-        "# Metrics",
-        f"`GET /metrics` serves {len(found)} families of metrics to Prometheus. "
-        "[Operations](../operations.md#what-to-watch) says what to watch, and has a dashboard.",
-        table(("metric", "kind", "labels", "meaning"), rows),
-    )
 
 
 def commands_page() -> str:

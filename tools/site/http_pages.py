@@ -10,6 +10,7 @@ from tools.site.markup import cell, code, fenced, first_sentence, page, plain, t
 
 Json = Mapping[str, Any]
 RECORDS = "records.md"
+ERRORS = "../../reference.md#problems"
 JSON = "application/json"
 PROBLEM = "application/problem+json"
 #: Prefix of the descriptions of parameters that replace fields of a form.
@@ -79,7 +80,7 @@ def index_page(document: Json) -> str:
     return page(
         "# HTTP API",
         f"{len(found)} operations. Bodies and answers are described with the "
-        f"[records]({RECORDS}); errors are [problems](../errors.md). A service serves the same "
+        f"[records]({RECORDS}); errors are [problems]({ERRORS}). A service serves the same "
         "as an OpenAPI document at `/openapi.json`, and as pages to try it at `/docs`. "
         "[The tour](../../api.md) shows the API at work with curl.",
         *(
@@ -167,7 +168,11 @@ def _answers(responses: Json) -> str:
         rows.append((status, ", ".join(kinds) or "no body", cell(response["description"])))
     if problems:
         rows.append(
-            (", ".join(problems), "[Problem](records.md#problem)", "[errors](../errors.md)")
+            (
+                ", ".join(problems),
+                "[Problem](records.md#problem)",
+                f"[errors]({ERRORS})",
+            )
         )
     return table(("status", "body", "meaning"), rows)
 

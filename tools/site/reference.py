@@ -12,8 +12,7 @@ from sceneprint.settings import Settings
 from service.app import create_app
 from tools.site import http_pages
 from tools.site.client_page import client_page
-from tools.site.code_pages import commands_page, metrics_page
-from tools.site.error_page import error_page
+from tools.site.code_pages import commands_page
 
 
 @dataclass(frozen=True)
@@ -41,15 +40,11 @@ def generated_pages() -> list[GeneratedPage]:
     return [
         *http_reference(),
         GeneratedPage(
-            "reference/errors.md", "Errors", error_page(), "every problem: status, cause, remedy"
-        ),
-        GeneratedPage(
             "reference/client.md", "Python client", client_page(), "every class and method"
         ),
         GeneratedPage(
             "reference/commands.md", "Command line", commands_page(), "every command and option"
         ),
-        GeneratedPage("reference/metrics.md", "Metrics", metrics_page(), "what Prometheus is told"),
     ]
 
 

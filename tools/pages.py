@@ -1,10 +1,12 @@
-"""Generator of docs/settings.md, a table of all settings, from the fields of `Settings`.
+"""Generator of docs/settings.md and of tables in other pages, from tables in the code.
 
-python -m tools.settings_page        # writes the page
+python -m tools.pages        # writes the pages
 """
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -12,10 +14,16 @@ from annotated_types import Ge, Gt, Le
 from pydantic import SecretStr
 from pydantic.fields import FieldInfo
 
+from sceneprint import errors
 from sceneprint.settings import Settings
+from sceneprint_client.api import FrameState, JobState
+from sceneprint_client.api.admin import KINDS
+from service.metrics import METRICS
+from service.problem_types import PROBLEM_TYPES, problem_type
+from service.problems import type_of
 from tools.site.markup import cell, code, page, table
 
-PAGE = Path(__file__).resolve().parents[1] / "docs/settings.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 #: Titles of the sections, by the first setting in each.
 SECTIONS = {
     "data_dir": "Places",
@@ -90,5 +98,53 @@ def _shown(name: str, default: object) -> str:
     return code(str(default).lower() if isinstance(default, bool) else str(default))
 
 
+def problem_rows() -> Iterator[tuple[str, str, str, str]]:
+    """Yield a row for each type of problem, with the classes that share it."""
+    kinds = [getattr(errors, name) for name in errors.__all__ if name[:1].isupper()]
+    for name, row in sorted(PROBLEM_TYPES.items(), key=lambda one: one[1].status):
+        if name == "SceneprintError":  # the base of errors that a service does not send
+            continue
+        named = {name, *(kind.__name__ for kind in kinds if problem_type(kind) is row)}
+        types = sorted(type_of(one).removeprefix("/problems/") for one in named)
+        docstring = inspect.getdoc(getattr(errors, name, None)) or ""
+        meaning = row.meaning or docstring.partition("\n\n")[0]
+        yield str(row.status), ", ".join(map(code, types)), cell(meaning), cell(row.remedy)
+
+
+def sections() -> dict[str, dict[str, str]]:
+    """Return the tables between the marks of each page, by the names of the marks."""
+    metrics = (
+        (f"`sceneprint_{name}`", one.kind, ", ".join(map(code, one.labels)), cell(one.meaning))
+        for name, one in METRICS.items()
+    )
+    states = [
+        table((title, "meaning"), ((f"`{one}`", cell(one.sentence)) for one in kind))
+        for title, kind in (("frame", FrameState), ("job", JobState))
+    ]
+    kinds = ((f"`{kind}`", cell(text)) for kind, text in KINDS.items())
+    problems = ("status", "`type` ends in", "meaning", "what to do")
+    return {
+        "operations.md": {
+            "states": page(*states, table(("event", "meaning"), kinds)),
+            "metrics": table(("metric", "type", "labels", "meaning"), metrics),
+        },
+        "reference.md": {"problems": table(problems, problem_rows())},
+    }
+
+
+def written_pages() -> dict[Path, str]:
+    """Return the text of each page with its present tables."""
+    pages = {DOCS / "settings.md": settings_page()}
+    for name, tables in sections().items():
+        text = (DOCS / name).read_text()
+        for mark, content in tables.items():
+            begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
+            head, _, rest = text.partition(begin)
+            text = f"{head}{begin}\n\n{content}\n{end}{rest.partition(end)[2]}"
+        pages[DOCS / name] = text
+    return pages
+
+
 if __name__ == "__main__":
-    PAGE.write_text(settings_page())
+    for path, text in written_pages().items():
+        path.write_text(text)
