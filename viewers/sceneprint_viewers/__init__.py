@@ -1,1 +1,1 @@
-"""Answers and maps as scenes in MCAP files, which Foxglove and Rerun draw."""
+"""Scenes of answers and maps, as MCAP files for Foxglove and Rerun."""

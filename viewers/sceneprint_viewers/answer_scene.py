@@ -1,11 +1,11 @@
-"""Answers as moments of a scene: the query, its matches and its alternatives in their map.
+"""Answers as moments of a scene, with the query, its matches and its alternatives in the map.
 
 Answer  --AnswerScene.add-->  Moment
-Association  --association_scene-->  Moment: both sessions where it places them, and their edges
+Association  --association_scene-->  Moment with both sessions and their edges
 
-Only what an answer supports is placed in the map: accepted and ambiguous matches with the poses
-that they vote for, and the answer's own pose or its alternatives. Rejected matches are in the text
-alone. A query that is not found lies in a space of its own.
+The map contains only poses with evidence: accepted and ambiguous matches with the poses for which
+they vote, and the pose of the answer or its alternatives. Rejected matches appear only in the text.
+A query that is not found has a separate space.
 """
 
 from __future__ import annotations
@@ -66,42 +66,42 @@ from sceneprint_viewers.scene import (
     sensor_outline,
 )
 
-#: An id that the service made, and how many of its digits stand for it in a scene.
-_MADE_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
+#: Pattern of ids that the service generates, and number of digits by which a scene shows them.
+_GENERATED_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
 SHORT_ID = 8
-#: Path of what is said of an answer; no space is called so.
+#: Path of the text about an answer; no space has this name.
 SUMMARY: EntityPath = ("answer",)
-#: Where a label stands over the sensor that it is of, metres along its up.
+#: Height of a label over its sensor, metres.
 _LABEL_M = 0.12
 
 
 @dataclass(frozen=True)
 class PointLimits:
-    """How many points of each frame of an answer are drawn.
+    """Maximum numbers of points that are drawn per frame of an answer.
 
     Parameters
     ----------
-    query : of the frame that was asked
-    match : of each match, and of the query at each alternative
+    query : number for the query
+    match : number for each match, and for the query at each alternative
     """
 
     query: int
     match: int
 
 
-#: Of a single answer, and of each of many.
+#: Limits for a single answer, and for each of many answers.
 ONE, MANY = PointLimits(20_000, 6_000), PointLimits(5_000, 1_500)
 
 
 class AnswerScene:
-    """Draws answers, and the maps that they are of where these first occur.
+    """A scene to which answers are added; a map is added with its first answer.
 
     Parameters
     ----------
-    stream : where to
-    client : that has asked
-    limits : of points
-    map_frames : frames of each map whose points are drawn; 0 for none
+    stream : output of the scene
+    client : client of the service with the answers
+    limits : maximum numbers of points
+    map_frames : number of frames of each map whose points are drawn; 0 draws no map
     """
 
     def __init__(
@@ -121,15 +121,15 @@ class AnswerScene:
 
         Parameters
         ----------
-        answer : kept by the service, with the stage `validate`
-        name : of the frame that was asked
-        text : about the answer, for people
-        camera : of that frame; None of a cloud
-        index, stamp_ns : of the moment
+        answer : stored answer with the stage `validate`
+        name : name of the query
+        text : description of the answer
+        camera : camera of the query; None for a cloud
+        index, stamp_ns : see Moment
 
         Raises
         ------
-        UnknownQuery : the answer is not stored, or no longer.
+        UnknownQuery : If the service does not store the answer (any more).
         """
         named = dict.fromkeys(one.map for one in placed(answer.matches))
         for map_name in answer.maps if len(answer.maps) == 1 else named:
@@ -157,24 +157,24 @@ class AnswerScene:
 
 
 def space_name(map_name: str, parent_frame: str, *, several: bool) -> str:
-    """Return what the space of a parent frame is called; of several maps, with the map's name."""
+    """Return the name of a parent frame's space, with the map's name if there are several maps."""
     return f"{map_name}: {parent_frame}" if several else parent_frame
 
 
 def short_name(frame_id: str, name: str | None = None) -> str:
-    """Return what a stored frame is called in labels: its file, else the start of its id."""
+    """Return the name of a stored frame in labels: its file, else the first digits of its id."""
     if name:
         return name.rpartition("/")[2]
-    return frame_id[:SHORT_ID] if _MADE_ID.fullmatch(frame_id) else frame_id
+    return frame_id[:SHORT_ID] if _GENERATED_ID.fullmatch(frame_id) else frame_id
 
 
 def placed(matches: Sequence[Match]) -> list[Match]:
-    """Return matches whose transform the evidence supports."""
+    """Return the matches whose transforms are accepted or ambiguous."""
     return [one for one in matches if one.validation.status in ("accepted", "ambiguous")]
 
 
 class _Drawing:
-    """One answer as entities."""
+    """A drawing of one answer."""
 
     def __init__(
         self, client: Client, answer: Answer, name: str, camera: CameraIntrinsics | None,
@@ -184,18 +184,18 @@ class _Drawing:
         self._camera, self._limits = camera, limits
         self._several = len(answer.maps) > 1
         self._points = np.zeros((0, 3))
-        with suppress(NotIndexed):  # asked without validation, so there are none
+        with suppress(NotIndexed):  # a query without validation has no geometry
             self._points = client.query_points(answer.query_id, limits.query).points
 
     def entities(self) -> list[SceneEntity]:
-        """Query, alternatives and matches."""
+        """Return the entities of the query, its alternatives and its matches."""
         found = [*self._query(), *self._alternatives()]
         for number, match in enumerate(placed(self._answer.matches), start=1):
             found += self._match(match, f"{number}")
         return found
 
     def axes(self) -> list[SceneEntity]:
-        """Return which way is up in the query's space, where that is a sensor's own frame."""
+        """Return the up axis of the query's space if that is the sensor's frame."""
         if self._answer.location is not None:
             return []
         space, _ = self._query_space()
@@ -206,11 +206,11 @@ class _Drawing:
         return space_name(map_name or "", parent_frame, several=self._several)
 
     def _query_space(self) -> tuple[str, Transform | None]:
-        """The space that the query lies in, and where; no pose where that is the query's own."""
+        """Return the query's space and its pose there; None if it has a separate space."""
         location = self._answer.location
         if location is not None:
             return self._space(location.map, location.pose.parent_frame), location.pose
-        if self._answer.status == "found":  # in a map without poses: in the frame of the best
+        if self._answer.status == "found":  # without poses, use the frame of the best match
             for match in placed(self._answer.matches):
                 if match.transform is not None:
                     return match.transform.parent_frame, match.transform
@@ -225,29 +225,29 @@ class _Drawing:
         return [SceneEntity(path, Placement(np.array(pose.matrix), pose.child_frame)), *found]
 
     def _alternatives(self) -> list[SceneEntity]:
-        """Return the poses of an ambiguous answer, none of which is the answer."""
+        """Return the alternative poses of an ambiguous answer."""
         found: list[SceneEntity] = []
         some = self._points[:: max(len(self._points) // self._limits.match, 1)]
         for number, one in enumerate(self._answer.alternatives, start=1):
             path = (self._space(one.map, one.pose.parent_frame), "alternatives", f"{number}")
             child = f"{one.pose.child_frame} alternative {number}"
-            sure = "" if one.confidence is None else f", confidence {one.confidence:.2f}"
-            label = f"alternative {number}: support {one.support}{sure}"
+            confidence = "" if one.confidence is None else f", confidence {one.confidence:.2f}"
+            label = f"alternative {number}: support {one.support}{confidence}"
             found.append(SceneEntity(path, Placement(np.array(one.pose.matrix), child)))
             found += _sensor(path, some, self._camera, UNSURE, label)
         return found
 
     def _match(self, match: Match, name: str) -> list[SceneEntity]:
-        """Return a match where the map has it, with the pose of the query that it votes for.
+        """Return a match at its pose in the map, with the pose of the query for which it votes.
 
-        It is called after its place in the answer: so paths stay few over many answers.
+        Its path contains its rank, so that many answers share few paths.
         """
         try:
             frame = self._client.frame(match.map, match.frame_id)
             points = self._client.frame_points(
                 match.map, match.frame_id, limit=self._limits.match
             ).points
-        except (NotFound, NotIndexed):  # deleted since, or being signed anew
+        except (NotFound, NotIndexed):  # deleted meanwhile, or being signed again
             return []
         path, placement = self._place_of_match(match, frame, name)
         if path is None:
@@ -263,7 +263,7 @@ class _Drawing:
     def _place_of_match(
         self, match: Match, frame: Frame, name: str
     ) -> tuple[EntityPath | None, Placement | None]:
-        """The path of a match, and where it lies in its space; no path where it lies in none."""
+        """Return the path and the placement of a match; None if it cannot be placed."""
         if frame.pose is not None:
             space = self._space(match.map, frame.pose.parent_frame)
             child = space_name(match.map, frame.pose.child_frame, several=self._several)
@@ -276,7 +276,7 @@ class _Drawing:
 
 
 def _look_of_match(match: Match) -> tuple[Colour, str]:
-    """Return colour and label of a match: rank, name, strength or status, overlap."""
+    """Return the colour of a match and its label: rank, name, strength or status, overlap."""
     v = match.validation
     colour = STRONG if v.strength == "strong" else WEAK
     if v.status == "ambiguous":
@@ -291,7 +291,7 @@ def _look_of_match(match: Match) -> tuple[Colour, str]:
 def _sensor(
     path: EntityPath, points: Floats, camera: CameraIntrinsics | None, colour: Colour, label: str
 ) -> list[SceneEntity]:
-    """Return points, outline and label of a sensor, in its own frame."""
+    """Return points, outline and label of a sensor in its frame."""
     colours = plain_colours(len(points), colour)
     base_m = QUERY_POINT_M if colour == QUERY else MATCH_POINT_M
     size_m = point_size(base_m, cameras=camera is not None)
@@ -305,75 +305,75 @@ def _sensor(
 
 # An association as a scene.
 
-#: Edges that are drawn.
+#: Maximum number of edges that are drawn.
 MOST_EDGES = 20_000
 
 
-def association_scene(client: Client, told: Association, text: str, most: int) -> Moment:
-    """Return what an association that has succeeded came to, at all times.
+def association_scene(client: Client, association: Association, text: str, most: int) -> Moment:
+    """Return the result of a successful association, as entities that are always visible.
 
-    Frames lie where the pose graph has them: in one space where the sessions are joined, else each
-    session in its own, and then edges between the two cannot be drawn.
+    Frames have their poses of the pose graph. Joined sessions share one space. Otherwise each
+    session has a separate space, and edges between them are not drawn.
 
     Parameters
     ----------
-    client : to fetch with
-    text : about it, for people
-    most : frames whose points are drawn
+    client : client of the service with the association
+    text : description of the association
+    most : maximum number of frames whose points are drawn
     """
-    graph = Graph.model_validate_json(client.graph(told.map, told.job_id, "json"))
-    runs = _runs(client, told, graph.vertices)
+    graph = Graph.model_validate_json(client.graph(association.map, association.job_id, "json"))
+    runs = _runs(client, association, graph.vertices)
     spaces = sorted({run.parent_frame for run in runs})
-    up_of_poses = up_of_map(client, told.map)
+    up_of_poses = up_of_map(client, association.map)
     entities = [SceneEntity(SUMMARY, TextPage(text))]
     for space in spaces:
         there = [run for run in runs if run.parent_frame == space]
         up = up_of_runs(there) if up_of_poses is None else up_of_poses
         entities.append(SceneEntity((space,), UpAxis(up)))
-        alone = len(told.request.sessions) == 1
+        alone = len(association.request.sessions) == 1
         for run in there:
-            colour = TRACK if alone else SESSIONS[_names(told).index(run.name)]
+            colour = TRACK if alone else SESSIONS[_names(association).index(run.name)]
             entities += _run_entities(client, run, up, colour, most // len(runs), alone=alone)
-    edges = itertools.islice(client.edges(told.map, told.job_id), MOST_EDGES)
+    edges = itertools.islice(client.edges(association.map, association.job_id), MOST_EDGES)
     entities += _edge_entities(edges, graph.vertices)
     return Moment(entities)
 
 
-def _runs(client: Client, told: Association, vertices: list[Vertex]) -> list[PosedRun]:
-    """The posed vertices by session and the frame that they lie in; named after the session's
-    place among those that were asked.
-    """
+def _runs(client: Client, association: Association, vertices: list[Vertex]) -> list[PosedRun]:
+    """Return the posed vertices by session and parent frame."""
     found: defaultdict[tuple[str, str], list[Vertex]] = defaultdict(list)
     for one in vertices:
         if one.pose is not None:
-            found[_session_of(told, one), one.pose.parent_frame].append(one)
+            found[_session_of(association, one), one.pose.parent_frame].append(one)
     return [
         PosedRun(
-            name, told.map, space, [one.frame_id for one in run],
+            name, association.map, space, [one.frame_id for one in run],
             [np.array(one.pose.matrix) for one in run if one.pose is not None],
-            client.frame(told.map, run[0].frame_id).kind == "depth",
+            client.frame(association.map, run[0].frame_id).kind == "depth",
         )
         for (name, space), run in found.items()
     ]  # fmt: skip
 
 
-def _names(told: Association) -> list[str]:
-    """Return what the sessions are called, the first that was asked first."""
-    robots: Sequence[str | None] = told.request.robots or [None] * len(told.request.sessions)
-    pairs = zip(robots, told.request.sessions, strict=True)
+def _names(association: Association) -> list[str]:
+    """Return the names of the sessions, in the order of the request."""
+    robots: Sequence[str | None] = association.request.robots or [None] * len(
+        association.request.sessions
+    )
+    pairs = zip(robots, association.request.sessions, strict=True)
     return [session if robot is None else f"{robot}/{session}" for robot, session in pairs]
 
 
-def _session_of(told: Association, vertex: Vertex) -> str:
-    """Return what the session of a vertex is called."""
-    names, known = _names(told), (vertex.session, f"{vertex.robot}/{vertex.session}")
+def _session_of(association: Association, vertex: Vertex) -> str:
+    """Return the name of a vertex's session."""
+    names, known = _names(association), (vertex.session, f"{vertex.robot}/{vertex.session}")
     return next((name for name in names if name in known), names[0])
 
 
 def _run_entities(
     client: Client, run: PosedRun, up: Floats, colour: Colour, most: int, *, alone: bool
 ) -> list[SceneEntity]:
-    """Return points and line of a session: by height where there is no other to tell it from."""
+    """Return points and line of a session; a single session is coloured by height."""
     chosen = evenly_taken([run], most)
     path = (run.parent_frame, "sessions", run.name)
     entities = []
@@ -388,7 +388,7 @@ def _run_entities(
 
 
 def _edge_entities(edges: itertools.islice[Edge], vertices: list[Vertex]) -> list[SceneEntity]:
-    """Return lines between frames that edges join: confirmed, outvoted and unchecked ones apart."""
+    """Return lines for edges, in separate entities for confirmed, outvoted and unchecked ones."""
     poses = {one.frame_id: one.pose for one in vertices if one.pose is not None}
     kinds = {
         True: ("confirmed", CONFIRMED),

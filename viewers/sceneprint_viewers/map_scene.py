@@ -1,6 +1,6 @@
-"""What a map holds, as entities: points of posed frames by height, and the runs they were taken in.
+"""Entities of a map: points of posed frames, coloured by height, and the paths of runs.
 
-Client, map  --map_runs-->  runs of posed frames  --map_entities-->  entities that stay
+Client, map  --map_runs-->  runs of posed frames  --map_entities-->  permanent entities
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ from sceneprint_viewers.scene import (
     up_of_sensors,
 )
 
-#: Frames of a map whose points are drawn, unless another number is asked for.
+#: Default number of frames of a map whose points are drawn.
 MAP_FRAMES = 120
-#: Points of a map, over all of these frames.
+#: Maximum number of points of a map, over all of these frames.
 MAP_POINTS = 300_000
-#: Poses of one run that its line is drawn through.
+#: Maximum number of poses in the line of a run.
 TRACK_POSES = 1000
-#: A run is in the order in which it was taken, or where no frame says it, in that of arrival.
+#: Clocks by which a run is ordered: the time of capture or, if it is unknown, of arrival.
 CLOCKS: tuple[Literal["taken", "received"], ...] = ("taken", "received")
-#: Sessions, and frames without one, that are looked through for posed frames.
+#: Maximum number of sessions, and of frames without a session, that are searched for posed frames.
 MOST_LISTED = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class PosedRun:
-    """Frames of one run whose poses lead to one frame.
+    """The frames of a run with poses in one parent frame.
 
     Parameters
     ----------
-    name : for people
-    map_name, parent_frame : where they are
-    frame_ids : in the order of time
-    poses : of each, (4, 4) T_parent_sensor
-    cameras : whether they are depth images
+    name : display name
+    map_name, parent_frame : map and parent frame of the frames
+    frame_ids : ids in order of time
+    poses : (4, 4) T_parent_sensor of each frame
+    cameras : whether the frames are depth images
     """
 
     name: str
@@ -73,11 +73,11 @@ class PosedRun:
 
 
 def map_runs(client: Client, map_name: str) -> list[PosedRun]:
-    """Return the runs of a map with poses, each through at most TRACK_POSES of them.
+    """Return the runs of a map with at most TRACK_POSES poses each.
 
     Raises
     ------
-    UnknownMap : no such map.
+    UnknownMap : If the map does not exist.
     """
     runs, unnamed = [], False
     for session in itertools.islice(client.sessions(map_name), MOST_LISTED):
@@ -96,25 +96,24 @@ def _runs_of_session(client: Client, map_name: str, session: Session) -> list[Po
     runs = []
     for parent in session.parent_frames:
         for clock in CLOCKS:
-            told = client.trajectory(
+            trajectory = client.trajectory(
                 map_name, str(session.session), robot=session.robot, parent_frame=parent,
                 most=TRACK_POSES, clock=clock,
             )  # fmt: skip
-            if told.frame_ids:
+            if trajectory.frame_ids:
                 break
         else:
             continue
         with suppress(NotFound):  # deleted meanwhile
-            kind = client.frame(map_name, told.frame_ids[0]).kind
-            poses = [_pose_of_row(row) for row in told.poses]
+            kind = client.frame(map_name, trajectory.frame_ids[0]).kind
             name = _run_name(session.robot, session.session)
-            poses, cameras = [_pose_of_row(row) for row in told.poses], kind == "depth"
-            runs.append(PosedRun(name, map_name, parent, told.frame_ids, poses, cameras))
+            poses, cameras = [_pose_of_row(row) for row in trajectory.poses], kind == "depth"
+            runs.append(PosedRun(name, map_name, parent, trajectory.frame_ids, poses, cameras))
     return runs
 
 
 def listed_runs(frames: Iterable[Frame]) -> list[PosedRun]:
-    """Return runs of the posed frames of a list, in its order."""
+    """Return the runs of the posed frames of a list, in the same order."""
     found: defaultdict[tuple[str, str, str, bool], list[Frame]] = defaultdict(list)
     for one in frames:
         if one.pose is not None:
@@ -134,7 +133,7 @@ def _run_name(robot: str | None, session: str | None) -> str:
 
 
 def _pose_of_row(row: Sequence[float]) -> Floats:
-    """Return T (4, 4) of a line of a TUM file."""
+    """Return the pose (4, 4) in a line of a TUM file."""
     T = np.eye(4)
     T[:3, 3] = row[1:4]
     T[:3, :3] = rotation_of(np.array(row[4:8]))
@@ -144,15 +143,15 @@ def _pose_of_row(row: Sequence[float]) -> Floats:
 def map_entities(
     client: Client, runs: Sequence[PosedRun], space: str, up: Floats | None, most: int
 ) -> list[SceneEntity]:
-    """Return what a scene shows of runs in one space at all times.
+    """Return the permanent entities of runs in one space.
 
     Parameters
     ----------
-    client : to fetch points with
-    runs : of one parent frame
-    space : name of that
-    up : (3,) unit vector in it; None to judge by the sensors
-    most : frames whose points are fetched, evenly taken along the runs
+    client : client of the service with the points
+    runs : runs of one parent frame
+    space : name of the space
+    up : (3,) unit vector in the space; None estimates it from the sensors
+    most : maximum number of frames whose points are fetched, evenly spaced along the runs
     """
     if up is None:
         up = up_of_runs(runs)
@@ -173,24 +172,24 @@ def map_entities(
 
 
 def points_of_each(frames: int) -> int:
-    """Return how many points are drawn of each of so many frames."""
+    """Return the number of points per frame if `frames` frames are drawn."""
     return min(max(MAP_POINTS // frames, 1), MOST_DRAWN)
 
 
 def up_of_runs(runs: Sequence[PosedRun]) -> Floats:
-    """The axis of the parent frame of runs that is likely up; of all, the longest run decides."""
+    """Return the axis of the runs' parent frame that is probably up, by the longest run."""
     longest = max(runs, key=lambda run: len(run.poses))
     return up_of_sensors(longest.poses, cameras=longest.cameras)
 
 
 def up_of_map(client: Client, map_name: str) -> Floats | None:
-    """Return up (3,) in the parent frames of a map; None where the map does not say it."""
+    """Return up (3,) in the parent frames of a map; None if it is unknown."""
     up = client.map(map_name).up
     return None if up is None else np.array([up.x, up.y, up.z])
 
 
 def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Floats]]:
-    """Map, frame id and pose of at most so many frames, evenly taken over all runs in turn."""
+    """Return map, frame id and pose of at most `most` frames, evenly spaced over all runs."""
     every = [
         (run.map_name, frame_id, T)
         for run in runs
@@ -202,7 +201,7 @@ def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Fl
 
 
 def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit: int) -> Floats:
-    """Return at most so many points (N, 3) of an indexed frame, moved by its pose."""
+    """Return at most `limit` points (N, 3) of an indexed frame, transformed by its pose."""
     try:
         return transform_points(T, client.frame_points(map_name, frame_id, limit=limit).points)
     except (NotFound, NotIndexed):
@@ -210,13 +209,13 @@ def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit
 
 
 def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
-    """Return frames of a map at all times: points by height, runs, and the sensors of those drawn.
+    """Return permanent entities of a map's frames: points by height, runs, and sensors.
 
     Parameters
     ----------
-    client : to fetch points with
-    frames : of one map, at least one; those without a pose are left out
-    most : frames that are drawn, evenly taken
+    client : client of the service with the points
+    frames : frames of one map, at least one; frames without a pose are omitted
+    most : maximum number of frames that are drawn, evenly spaced
     """
     runs = listed_runs(frames)
     parents = sorted({run.parent_frame for run in runs})
@@ -237,11 +236,11 @@ def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
 
 
 def frame_scene(client: Client, frame: Frame) -> Moment:
-    """Return one frame of a map at all times, in its parent frame, or its own where it has no pose.
+    """Return permanent entities of one frame, in its parent frame or else in its sensor's frame.
 
     Raises
     ------
-    NotIndexed : nothing has been made of it, or not yet.
+    NotIndexed : If the frame is not indexed (yet).
     """
     optical = frame.kind == "depth"
     points = client.frame_points(frame.map, frame.frame_id).points

@@ -1,9 +1,9 @@
-"""Scenes for Foxglove: an MCAP file with messages of its schemas. The boundary to foxglove-sdk.
+"""Scenes as MCAP files with Foxglove's schemas; the only module that uses foxglove-sdk.
 
-PointSet: PointCloud on a topic of its own, which is the entity's path
-Placement: FrameTransforms on /tf, and PoseInFrame on a topic of its own
-UpAxis: a frame above the space, named "SPACE upright", whose z points up
-LineSet, TextLabel: SceneUpdate, on a topic for each group of a space
+PointSet: PointCloud on a separate topic, the entity's path
+Placement: FrameTransforms on /tf, and PoseInFrame on a separate topic
+UpAxis: parent frame of the space, named "SPACE upright", whose z points up
+LineSet, TextLabel: SceneUpdate on one topic per group of a space
 TextPage: Log on /log
 """
 
@@ -45,34 +45,34 @@ if TYPE_CHECKING:
     )
     from foxglove.messages import SceneEntity as FoxgloveEntity
 
-#: Time between moments whose frames have no time stamps.
+#: Time between moments without time stamps, nanoseconds.
 STEP_NS = 1_000_000_000
 #: Height of letters, metres.
 _FONT_M = 0.08
-#: A point: its position, and its colour.
+#: Record of a point: position and colour.
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])
 
 
 class _OutputFile:
-    """A file that keeps the first error of writing: foxglove-sdk does not tell it."""
+    """A file that stores the first write error, which foxglove-sdk does not report."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")
         self.error: OSError | None = None
 
     def write(self, data: bytes | bytearray) -> int:
-        return int(self._kept(lambda: self._file.write(data)))
+        return int(self._record_error(lambda: self._file.write(data)))
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        return int(self._kept(lambda: self._file.seek(offset, whence)))
+        return int(self._record_error(lambda: self._file.seek(offset, whence)))
 
     def flush(self) -> None:
-        self._kept(self._file.flush)
+        self._record_error(self._file.flush)
 
     def close(self) -> None:
-        self._kept(self._file.close)
+        self._record_error(self._file.close)
 
-    def _kept(self, work: Any) -> Any:
+    def _record_error(self, work: Any) -> Any:
         try:
             return work()
         except OSError as error:
@@ -82,11 +82,11 @@ class _OutputFile:
 
 @contextmanager
 def mcap_file(path: Path) -> Iterator[McapWriter]:
-    """A writer of an MCAP file, which is there when the block ends well and wrote something.
+    """Yield a writer of an MCAP file, which is created at the end if it is not empty.
 
     Raises
     ------
-    OSError : it cannot be written; nothing is left behind.
+    OSError : If the file cannot be written. No partial file remains.
     """
     import foxglove
 
@@ -97,7 +97,7 @@ def mcap_file(path: Path) -> Iterator[McapWriter]:
                 writer = McapWriter(context, file)
                 yield writer
                 writer.finish()
-        except (OSError, RuntimeError) as error:  # foxglove's own say nothing of the cause
+        except (OSError, RuntimeError) as error:  # errors of foxglove hide the cause
             why = file.error
             if why is None:
                 raise
@@ -107,7 +107,7 @@ def mcap_file(path: Path) -> Iterator[McapWriter]:
 
 
 class McapWriter:
-    """Entities to messages."""
+    """A writer of entities as messages."""
 
     def __init__(self, context: Any, file: _OutputFile) -> None:
         import foxglove.channels
@@ -116,15 +116,15 @@ class McapWriter:
         self._messages, self._kinds = foxglove.messages, foxglove.channels
         self._context, self._file = context, file
         self._channels: dict[tuple[str, str], Any] = {}
-        #: What is there at all times waits for the first moment, whose time it gets.
+        #: Permanent entities, which are written with the time of the first moment.
         self._waiting: list[Moment] = []
         self._log_time = 0
         self._started = False
-        #: Frames of coordinates by the path of their placement.
+        #: Coordinate frames by the path of their placement.
         self._frames: dict[EntityPath, str] = {}
 
     def write(self, moment: Moment, gone: Collection[SceneEntity]) -> None:
-        """Log a moment; see `SceneWriter`."""
+        """Write a moment; see `SceneWriter`."""
         if moment.index is not None:
             stamp = moment.stamp_ns
             self._log_time = moment.index * STEP_NS if stamp is None else stamp
@@ -141,7 +141,7 @@ class McapWriter:
         return not self._started and not self._waiting
 
     def finish(self) -> None:
-        """Write what waits for a moment that never came."""
+        """Write the permanent entities if no moment was added."""
         if self._waiting:
             self._start()
 
@@ -167,14 +167,14 @@ class McapWriter:
                 )
                 self._log("Log", ("log",), text)
         for one in gone:
-            if isinstance(one.content, PointSet):  # an empty cloud takes its place
+            if isinstance(one.content, PointSet):  # replace it by an empty cloud
                 nothing = PointSet(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), one.content.size_m)
                 self._log("PointCloud", one.path, self._cloud(one.path, nothing, now))
         if self._file.error is not None:
             raise self._file.error
 
     def _write_frames(self, entities: Sequence[SceneEntity], now: Timestamp) -> None:
-        """Transforms, and the poses that they are, which Foxglove draws as axes."""
+        """Write placements as transforms and as poses, which Foxglove draws as axes."""
         m = self._messages
         transforms: list[FrameTransform] = []
         for one in entities:
@@ -185,15 +185,15 @@ class McapWriter:
                 parent, T = self._frame_of(one.path[:-1]), one.content.T_parent_child
                 self._frames[one.path] = one.content.child
                 transforms.append(self._transform(parent, one.content.child, T, now))
-                told = m.PoseInFrame(timestamp=now, frame_id=parent, pose=self._pose(T))
-                self._log("PoseInFrame", (*one.path, "pose"), told)
+                pose = m.PoseInFrame(timestamp=now, frame_id=parent, pose=self._pose(T))
+                self._log("PoseInFrame", (*one.path, "pose"), pose)
         if transforms:
             self._log("FrameTransforms", ("tf",), m.FrameTransforms(transforms=transforms))
 
     def _write_groups(
         self, entities: Sequence[SceneEntity], gone: Collection[SceneEntity], now: Timestamp
     ) -> None:
-        """Lines and labels, by group; what is gone is deleted."""
+        """Write lines and labels by group, and delete the entities in `gone`."""
         m = self._messages
         groups: defaultdict[EntityPath, tuple[list[FoxgloveEntity], list[SceneEntityDeletion]]]
         groups = defaultdict(lambda: ([], []))
@@ -257,7 +257,7 @@ class McapWriter:
         return cloud
 
     def _frame_of(self, path: EntityPath) -> str:
-        """The frame of coordinates at a path: of the nearest placement above, or the space."""
+        """Return the coordinate frame of a path: that of its nearest placement, or the space."""
         for end in range(len(path), 0, -1):
             if path[:end] in self._frames:
                 return self._frames[path[:end]]
@@ -294,7 +294,7 @@ class McapWriter:
 
 
 def upright(up: Floats) -> Floats:
-    """Return T (4, 4) that turns a unit vector (3,) to z, which Foxglove draws upwards."""
+    """Return T (4, 4) that rotates a unit vector (3,) to z, which Foxglove draws upwards."""
     level = np.zeros(3)
     level[int(np.argmin(np.abs(up)))] = 1.0
     level -= (level @ up) * up
@@ -305,5 +305,5 @@ def upright(up: Floats) -> Floats:
 
 
 def _topic(path: EntityPath) -> str:
-    """Return a path as a topic: names may hold blanks and slashes, which topics have too."""
+    """Return the topic of a path."""
     return "/" + "/".join(part.strip("/").replace(" ", "_") for part in path)

@@ -1,11 +1,10 @@
-"""A scene as entities over time, in the terms of no viewer, and how things look in it.
+"""Entities of a scene over time, independent of the viewer, and their appearance.
 
 Moment  --SceneStream.write-->  SceneWriter (MCAP)
 
-Entities form a tree by their paths. The first part of a path is the space: the name of the frame
-of coordinates that all of it lies in, such as the parent frame of a map's poses. Below an entity
-with a `Placement` all coordinates are those of its child frame. Cameras are outlines; heights and
-answers have colours.
+Entities form a tree by their paths. The first part of a path is the space: the name of a coordinate
+frame, such as the parent frame of a map's poses. Below an entity with a `Placement`, coordinates
+are in its child frame. Cameras are drawn as outlines; colours show heights and answers.
 """
 
 from __future__ import annotations
@@ -20,21 +19,21 @@ from sceneprint.pictures import viridis
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.api.base import CameraIntrinsics
 
-#: Red, green, blue, 0 to 255.
+#: Red, green and blue, 0 to 255.
 Colour = tuple[int, int, int]
-#: From the space down.
+#: Path of an entity, starting with the space.
 EntityPath = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
-    """Points.
+    """A set of coloured points.
 
     Parameters
     ----------
     points : (N, 3) metres
-    colours : (N, 3)
-    size_m : diameter that a point is drawn with
+    colours : (N, 3) uint8
+    size_m : diameter of a drawn point, metres
     """
 
     points: Floats
@@ -44,12 +43,12 @@ class PointSet:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where a frame of coordinates lies.
+    """The pose of a coordinate frame.
 
     Parameters
     ----------
     T_parent_child : (4, 4)
-    child : name of the frame; no other placement of the scene has it
+    child : name of the frame, unique in the scene
     """
 
     T_parent_child: Floats
@@ -58,13 +57,13 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class LineSet:
-    """Strips of lines.
+    """A set of line strips.
 
     Parameters
     ----------
-    strips : each (M, 3) metres
-    colours : of each strip
-    width_px : on the screen
+    strips : (M, 3) points of each strip, metres
+    colours : colour of each strip
+    width_px : width on the screen, pixels
     """
 
     strips: Sequence[Floats]
@@ -74,13 +73,7 @@ class LineSet:
 
 @dataclass(frozen=True, eq=False)
 class TextLabel:
-    """A short text in space.
-
-    Parameters
-    ----------
-    position : (3,) metres
-    text, colour : of it
-    """
+    """A label at a position (3,), in metres."""
 
     position: Floats
     text: str
@@ -89,19 +82,14 @@ class TextLabel:
 
 @dataclass(frozen=True, eq=False)
 class UpAxis:
-    """Which way is up in a space.
-
-    Parameters
-    ----------
-    up : (3,) unit vector
-    """
+    """The up direction of a space, a unit vector (3,)."""
 
     up: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class TextPage:
-    """What is said of the scene, for people, in lines."""
+    """A text about the scene."""
 
     text: str
 
@@ -111,13 +99,7 @@ Content = PointSet | Placement | LineSet | TextLabel | UpAxis | TextPage
 
 @dataclass(frozen=True, eq=False)
 class SceneEntity:
-    """Something in a scene.
-
-    Parameters
-    ----------
-    path : from its space down; one content each
-    content : what is drawn there
-    """
+    """A drawn object of a scene, with a unique path."""
 
     path: EntityPath
     content: Content
@@ -125,13 +107,13 @@ class SceneEntity:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What a scene holds at one time.
+    """The content of a scene at one time.
 
     Parameters
     ----------
-    entities : those that are there until the next moment
-    index : of the frame that was asked, from 0; None for what is there at all times
-    stamp_ns : when it was taken, nanoseconds since 1970; None where not known
+    entities : entities that are visible until the next moment
+    index : index of the query, from 0; None for permanent entities
+    stamp_ns : time of capture, nanoseconds since 1970; None if unknown
     """
 
     entities: Sequence[SceneEntity]
@@ -140,19 +122,14 @@ class Moment:
 
 
 class SceneWriter(Protocol):
-    """A file that takes a scene."""
+    """A writer of a scene's file."""
 
     def write(self, moment: Moment, gone: Collection[SceneEntity]) -> None:
-        """Add a moment; `gone` are entities of the one before that it does not have."""
+        """Add a moment; `gone` are the entities of the previous moment that it does not contain."""
 
 
 class SceneStream:
-    """A scene while it is written, which knows what each moment replaces.
-
-    Parameters
-    ----------
-    writer : of the scene's file
-    """
+    """A scene that is being written; it determines the entities that each moment replaces."""
 
     def __init__(self, writer: SceneWriter) -> None:
         self._writer = writer
@@ -160,7 +137,7 @@ class SceneStream:
         self._there: dict[EntityPath, SceneEntity] = {}
 
     def write(self, moment: Moment) -> None:
-        """Add a moment in the place of the one before; what is there at all times stays."""
+        """Replace the previous moment; permanent entities remain."""
         self.is_empty = False
         gone: list[SceneEntity] = []
         if moment.index is not None:
@@ -171,41 +148,42 @@ class SceneStream:
 
 
 def space_of(path: EntityPath) -> str:
-    """Return the space that an entity lies in."""
+    """Return the space of an entity."""
     return path[0]
 
 
-# How cameras, heights and answers look.
+# The appearance of cameras, heights and answers.
 
 QUERY: Colour = (255, 140, 0)
 STRONG: Colour = (60, 120, 255)
 WEAK: Colour = (120, 180, 255)
-#: Of what is not confirmed: ambiguous matches, and poses that compete.
+#: Colour of unconfirmed entities: ambiguous matches and alternative poses.
 UNSURE: Colour = (235, 70, 200)
 TRACK: Colour = (150, 150, 150)
 CONFIRMED: Colour = (60, 190, 90)
 OUTVOTED: Colour = (220, 50, 50)
-#: Of the first and the second session of an association.
+#: Colours of the first and the second session of an association.
 SESSIONS: tuple[Colour, Colour] = (QUERY, STRONG)
 
-#: Depth at which the outline of a camera's picture is drawn, and length of axes, metres.
+#: Depth of the outline of a camera's image, and length of axes, metres.
 FRUSTUM_M, AXES_M = 0.25, 0.5
-#: The same of a sensor that is one of many, and the width of its lines and of edges, pixels.
+#: Depth of the outline of each of many sensors, metres, and width of their lines and of edges,
+#: pixels.
 SMALL_M, THIN_PX = 0.1, 1.0
-#: Diameters of points, metres: the query's stand out of the surfaces that its matches share with
-#: it, and these out of the map. A scanner sees farther than a camera, so its points are larger.
+#: Diameters of points, metres. Points of the query are larger than points of its matches on the
+#: same surfaces, and these are larger than points of the map.
 MAP_POINT_M, MATCH_POINT_M, QUERY_POINT_M = 0.012, 0.018, 0.024
 _SCANNERS_TIMES = 4.0
-#: Percentiles of height at the ends of the colours: stray points must not flatten all others.
+#: Percentiles of height at the ends of the colour scale, so that stray points do not compress it.
 _RANGE = (1.0, 99.0)
-#: What height leaves of a colour: the map is the background.
+#: Factor that dims the colours of heights, since the map is the background.
 _DIMMED = 0.6
 
 
 def frustum(camera: CameraIntrinsics, colour: Colour, depth_m: float = FRUSTUM_M) -> LineSet:
-    """The outline of what a camera sees, in its optical frame, with a tick at the upper edge.
+    """Return the outline of a camera's view in its optical frame, with a mark at the upper edge.
 
-    Lens distortion is left out.
+    Lens distortion is ignored.
     """
     columns = np.array([-0.5, camera.width - 0.5])
     rows = np.array([-0.5, camera.height - 0.5])
@@ -221,7 +199,7 @@ def frustum(camera: CameraIntrinsics, colour: Colour, depth_m: float = FRUSTUM_M
 
 
 def sensor_axes(length_m: float = AXES_M) -> LineSet:
-    """Return the axes of a sensor that is no camera: x red, y green, z blue."""
+    """Return the axes of a sensor without a camera: x red, y green, z blue."""
     strips = [np.array([np.zeros(3), length_m * axis]) for axis in np.eye(3)]
     return LineSet(strips, [(230, 60, 60), (70, 190, 70), (70, 110, 240)])
 
@@ -232,18 +210,18 @@ def sensor_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
 
 
 def small_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
-    """Return as `sensor_outline`, of one sensor of many."""
+    """Return a small `sensor_outline`, for one of many sensors."""
     drawn = sensor_axes(SMALL_M) if camera is None else frustum(camera, colour, SMALL_M)
     return replace(drawn, width_px=THIN_PX)
 
 
 def point_size(base_m: float, *, cameras: bool) -> float:
-    """Return the diameter of points of cameras, or of scanners, metres."""
+    """Return the diameter of points, metres; points of scanners, which see farther, are larger."""
     return base_m if cameras else _SCANNERS_TIMES * base_m
 
 
 def height_colours(points: Floats, up: Floats) -> Bytes:
-    """Colours (N, 3) of points (N, 3) by their height along `up`: low is violet, high yellow."""
+    """Return the colours (N, 3) of points by height along `up`: low is violet, high is yellow."""
     if not len(points):
         return np.zeros((0, 3), np.uint8)
     heights = points @ up
@@ -254,12 +232,12 @@ def height_colours(points: Floats, up: Floats) -> Bytes:
 
 
 def plain_colours(count: int, colour: Colour) -> Bytes:
-    """Return one colour (count, 3)."""
+    """Return `count` copies of one colour, (count, 3)."""
     return np.tile(np.array(colour, np.uint8), (count, 1))
 
 
 def nearest_axis(direction: Floats) -> Floats:
-    """Return the axis (3,), positive or negative, that is nearest to a direction."""
+    """Return the positive or negative axis (3,) that is nearest to a direction."""
     axis = np.zeros(3)
     largest = int(np.argmax(np.abs(direction)))
     axis[largest] = 1.0 if direction[largest] >= 0 else -1.0
@@ -267,12 +245,12 @@ def nearest_axis(direction: Floats) -> Floats:
 
 
 def up_of_sensors(poses: Sequence[Floats], *, cameras: bool) -> Floats:
-    """The axis (3,) of a parent frame that is likely up: sensors are carried upright on average.
+    """Return the axis (3,) of a parent frame that is probably up, since most sensors are upright.
 
     Parameters
     ----------
-    poses : each (4, 4) T_parent_sensor; of none z is taken
-    cameras : whether up is -y of the sensors, as in optical frames; else z
+    poses : (4, 4) T_parent_sensor of each sensor; without poses, the result is z
+    cameras : whether up is -y of the sensors, as in optical frames, instead of z
     """
     if not poses:
         return np.array([0.0, 0.0, 1.0])

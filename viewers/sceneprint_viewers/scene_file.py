@@ -1,4 +1,4 @@
-"""The file that a command of `sceneprint` fills: what it found, as moments of a scene."""
+"""The file in which a command of `sceneprint` draws its results, as moments of a scene."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sceneprint_viewers.scene import SceneStream
 
 
 class SceneFile:
-    """Draws what is found; the `Scene` that the commands of `sceneprint` fill.
+    """The `Scene` in which the commands of `sceneprint` draw their results.
 
     Parameters
     ----------
-    stream : of the file
-    client : to fetch with
-    map_frames : frames of each map whose points are drawn; 0 for none
+    stream : output of the scene
+    client : client of the service with the results
+    map_frames : number of frames of each map whose points are drawn; 0 draws no map
     """
 
     def __init__(self, stream: SceneStream, client: Client, map_frames: int) -> None:
@@ -39,7 +39,7 @@ class SceneFile:
         self, answer: Answer, name: str, text: str, camera: CameraIntrinsics | None,
         place: tuple[int, int], stamp_ns: int | None,
     ) -> None:  # fmt: skip
-        """Add an answer as the next moment; the map is drawn with the first."""
+        """Add an answer as the next moment; the first answer draws the map too."""
         index, of = place
         if self._answers is None:
             limits = ONE if of == 1 else MANY
@@ -47,26 +47,26 @@ class SceneFile:
         self._answers.add(answer, name, text, camera, index, stamp_ns)
 
     def add_frame(self, frame: Frame) -> None:
-        """Add one frame of a map."""
+        """Draw one frame of a map."""
         self._stream.write(frame_scene(self._client, frame))
 
     def add_frames(self, frames: Sequence[Frame]) -> None:
-        """Add posed frames of one map."""
+        """Draw posed frames of one map."""
         self._stream.write(frames_scene(self._client, frames, self._map_frames))
 
     def add_association(self, association: Association, text: str) -> None:
-        """Add what an association found."""
+        """Draw the result of an association."""
         moment = association_scene(self._client, association, text, self._map_frames)
         self._stream.write(moment)
 
 
 @contextmanager
 def open_scene_file(path: Path, client: Client, map_frames: int) -> Iterator[SceneFile]:
-    """Open an MCAP file to fill, which is there when the block ends well and wrote something.
+    """Open an MCAP file for drawing, which is created at the end if it is not empty.
 
     Raises
     ------
-    OSError : it cannot be written; nothing is left behind.
+    OSError : If the file cannot be written. No partial file remains.
     """
     with mcap_file(path) as writer:
         yield SceneFile(SceneStream(writer), client, map_frames)
