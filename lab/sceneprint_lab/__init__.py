@@ -1,1 +1,1 @@
-"""What makes and judges models: synthetic scenes, training, evaluation."""
+"""Training and evaluation of models: synthetic scenes, training, evaluation."""

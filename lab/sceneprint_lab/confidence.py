@@ -1,4 +1,4 @@
-"""The numbers that a confidence is computed with, learnt on synthetic sites.
+"""Parameters of the confidence, fitted to answers at synthetic sites.
 
 answers at sites  --judged_queries-->  JudgedQuery, ...  --fit-->  ConfidenceParameters
 """
@@ -28,9 +28,9 @@ class JudgedQuery:
 
     Parameters
     ----------
-    site, kind, query : where it was taken
-    evidence : for each pose
-    right : which poses are right
+    site, kind, query : site of the query, its kind, and the number of the query
+    evidence : evidence for each pose
+    right : whether each pose is right
     """
 
     site: str
@@ -41,12 +41,7 @@ class JudgedQuery:
 
 
 def judged_queries(answers: Iterable[SiteAnswer]) -> list[JudgedQuery]:
-    """Return the candidate poses of every answer that has any.
-
-    Parameters
-    ----------
-    answers : of `ask_site`
-    """
+    """Return the candidate poses of all answers that have any; `ask_site` returns the answers."""
     return [
         JudgedQuery(
             one.site, one.kind, one.query,
@@ -59,10 +54,10 @@ def judged_queries(answers: Iterable[SiteAnswer]) -> list[JudgedQuery]:
 
 
 def steps_of(evidence: Sequence[PlaceEvidence]) -> Floats:
-    """Return how far each evidence falls between its knots: (n, 3 kinds), from 0 to 1.
+    """Return the position of each evidence in the three intervals between its knots, (n, 3 kinds).
 
-    The penalty of a kind is the sum of its three steps, each times how far the evidence fell
-    within it; so a penalty rises wherever its steps are not negative.
+    Positions are from 0 to 1. The penalty of a kind is the sum of its steps multiplied by these
+    positions, so it does not decrease with worse evidence if no step is negative.
     """
     columns = []
     for name, (worst, poor, fair, best) in KNOTS.items():
@@ -72,7 +67,7 @@ def steps_of(evidence: Sequence[PlaceEvidence]) -> Floats:
     return np.stack(columns, axis=1)
 
 
-#: Step of a penalty that the samples leave open: evidence that no site happens to test counts too.
+#: Default step of a penalty, for evidence that the samples do not contain.
 USUAL_STEP = 0.3
 
 
@@ -80,19 +75,19 @@ def fit(
     samples: Sequence[JudgedQuery], shares: Mapping[str, float], ridge: float = 1e-5,
     lone: float = 0.0,
 ) -> ConfidenceParameters:  # fmt: skip
-    """Fit a conditional logistic model whose penalties never fall with worse evidence.
+    """Fit a conditional logistic model whose penalties do not decrease with worse evidence.
 
     Parameters
     ----------
     samples : queries with their candidate poses
-    shares : how often robots are at a place of each kind: a confidence is a probability among
-        queries that are mixed so, whatever the numbers of samples
-    ridge : weight of the squares by which steps differ from `USUAL_STEP`
-    lone : least step of the penalty of a pose that one view alone suggests
+    shares : share of queries at places of each kind: confidences are probabilities for this
+        mixture of queries, whatever the numbers of samples
+    ridge : weight of the squared differences of steps from `USUAL_STEP`
+    lone : minimum step of the penalty of a pose that only one view suggests
 
     Returns
     -------
-    parameters : of the least mean logarithmic loss
+    parameters : parameters with the minimum mean logarithmic loss
     """
     X = steps_of([e for one in samples for e in one.evidence])
     right = np.array([y for one in samples for y in one.right], bool)
@@ -109,7 +104,7 @@ def fit(
         whole = 1.0 + np.add.reduceat(odds, first)
         good = np.where(none, 1.0, np.add.reduceat(np.where(right, odds, 0.0), first))
         value = w @ np.log(whole / good) + ridge * (off @ off)
-        # by each logit: what the pose has of all odds, less what it has of the right ones
+        # derivative by each logit: share of all odds minus share of the odds of right poses
         residuals = odds / np.repeat(whole, counts)
         residuals -= np.where(right, odds / np.repeat(good, counts), 0.0)
         residuals *= np.repeat(w, counts)
@@ -117,7 +112,10 @@ def fit(
         return float(value), slope
 
     bounds = [(None, None), *[(0.0, None)] * X.shape[1]]
-    bounds[1 + 3 * list(KNOTS).index("suggested") + 1] = (lone, None)  # from two views to one
+    bounds[1 + 3 * list(KNOTS).index("suggested") + 1] = (
+        lone,
+        None,
+    )  # the step from two views to one
     result = minimize(
         loss, np.full(1 + X.shape[1], max(0.5, lone)), jac=True, bounds=bounds, method="L-BFGS-B",
         options={"maxiter": 2000},

@@ -1,9 +1,9 @@
-"""Learning a model: synthetic scenes and, if wished, frames of one's own, to a `Model`.
+"""Training of a model on synthetic scenes and, optionally, the user's frames.
 
     rooms or sites, frames  --train-->  Model
 
-What is learnt (projection, mixture, whitening) lives with its stage in `geometry`; here the
-stages are put in order, and the quantiser and d0 are fixed from the signatures that come out.
+The fits (projection, mixture, whitening) are in the modules of their stages in `geometry`. This
+module runs them in order, and derives the quantiser and d0 from the resulting signatures.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ from sceneprint.signing import (
 from sceneprint.types import AnyFrame, Bytes, Floats, Floats32, Patches
 from sceneprint_lab.synth import synthesise_room, synthesise_survey
 
-# What the presets are made of: sizes, lengths, and the scenes they learn from.
+# The presets: sizes, lengths, and training scenes.
 #
 # name  --preset_parameters-->  ModelParameters, MixtureParameters
 
-#: Synthetic scenes: rooms seen by a depth camera, or sites scanned by a laser.
+#: Kinds of synthetic scenes: rooms for a depth camera, or sites for a laser scanner.
 Scenes = Literal["rooms", "sites"]
 
 #: Sizes of the presets: G components, H levels.
 PRESET_SIZES = {"depth": (256, 2), "lidar": (256, 4), "paper": (1250, 4)}
-#: Levels of psi that stored signatures are made of, how, and the number of scenes that the
-#: whitening is fitted to; `paper` stores psi itself.
+#: Levels of psi in stored signatures, parameters of the whitening, and number of scenes to which it
+#: is fitted. `paper` stores psi.
 PRESET_WHITENINGS = {
     "depth": ((1,), WhiteningParameters(448, exponent=0.75), 500),
     "lidar": ((1, 2, 3), WhiteningParameters(448, exponent=0.75), 400),
@@ -73,18 +73,18 @@ PRESET_WHITENINGS = {
 
 
 def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
-    """Return parameters of a preset.
+    """Return the parameters of a preset.
 
-    `depth` suits depth cameras indoors, and is what to take by default. `lidar` has longer
-    lengths, for scanners that see tens of metres. `paper` has the sizes of Sec. III-F.
+    `depth`, the default, suits depth cameras indoors. `lidar` has longer lengths, for scanners with
+    a range of tens of metres. `paper` has the sizes of Sec. III-F.
 
     Raises
     ------
-    TrainingError : no such preset.
+    TrainingError : If the preset does not exist.
     """
     if preset not in PRESET_SIZES:
         raise TrainingError(
-            f"There is no preset {preset!r}. Choose one of {', '.join(PRESET_SIZES)}."
+            f"There is no preset {preset!r}. Select one of {', '.join(PRESET_SIZES)}."
         )
     g, h = PRESET_SIZES[preset]
     model = _lidar() if preset == "lidar" else ModelParameters()
@@ -92,9 +92,9 @@ def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
 
 
 def preset_whitening(preset: str) -> tuple[tuple[int, ...], WhiteningParameters, int]:
-    """Return levels of psi that stored signatures are made of, how, and the scenes that teach it.
+    """Return the levels of psi in signatures, the whitening's parameters, and its number of scenes.
 
-    No scenes where psi itself is stored.
+    The number of scenes is 0 if psi is stored without a whitening.
     """
     if preset not in PRESET_WHITENINGS:
         return (0,), WhiteningParameters(), 0
@@ -102,32 +102,32 @@ def preset_whitening(preset: str) -> tuple[tuple[int, ...], WhiteningParameters,
 
 
 def preset_scenes(preset: str) -> tuple[Scenes, int]:
-    """Return what a preset learns from, and how many frames are taken in each."""
+    """Return the kind of training scenes of a preset, and the number of frames per scene."""
     return ("sites", 3) if preset == "lidar" else ("rooms", 6)
 
 
-#: Most violations by planes of a scan's transform, and of a rival to it: what is not believed to
-#: be refuted refutes nothing.
+#: Maximum violations by planes of a scan's transform and of a rival: violations that do not refute
+#: the transform do not refute a rival.
 _MOST_VIOLATIONS = 0.08
-#: Of scans planes and free space decide, as what two of them share may be small. A corridor looks
-#: like others: six distinct planes have to agree, and hardly any lie in another's free space.
+#: Acceptance for scans. Planes and free space decide, because two scans may share little surface.
+#: Corridors look similar, so six distinct planes must agree, with few violations of free space.
 _SCAN_ACCEPTANCE = AcceptanceParameters(
     residual_m=0.2, residual_rad=math.radians(3.0), violation_weight=0.0, evidence=0.0,
     plane_overlap=0.0, strong=0.0, net_strong=0.15, planes=6.0, plane_violations=_MOST_VIOLATIONS,
 )  # fmt: skip
-#: The world of a scanner beside that of a depth camera.
+#: Ratio of the lengths for a scanner to those for a depth camera.
 _FACTOR = 5.0
-#: How the noise of a laser changes what its refinements weigh.
+#: Parameters of refinements for the noise of a laser.
 _SCAN_NOISE: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_depth": 1e6}
 
 
 def _lidar() -> ModelParameters:
-    """Return `paper` in a world five times as large, but with a scanner's reach and noise.
+    """Return the parameters of `paper` with five-fold lengths, and a scanner's range and noise.
 
-    How far patches reach, and that large ones count no more than small ones, was found best on
-    synthetic halls that training does not know (docs/evaluation.md). The noise of a laser does
-    not grow with range, so nothing is weighted down for being far; what grows, linearly, is the
-    distance from sample to sample.
+    The radius of patches' neighbourhoods and the equal weights of large and small patches were
+    tuned on synthetic halls that are not in the training data (docs/evaluation.md). The noise of a
+    laser does not grow with range, so distant points have full weights; only the distance between
+    samples grows, linearly.
     """
     p = scale_lengths(ModelParameters(), _FACTOR)
     noise = _SCAN_NOISE
@@ -135,12 +135,12 @@ def _lidar() -> ModelParameters:
         p.cloud,
         minimum_range=0.6,
         maximum_range=60.0,
-        voxel_angle=1 / 40,  # so that rings 1.4 degrees apart touch
+        voxel_angle=1 / 40,  # rings 1.4 degrees apart must touch
         seed_px=4.4,
         maximum_patches=1000,
         validation_seed_px=6.9,
         maximum_validation_patches=500,
-        image_angle=1 / 64,  # so that a window holds three rings two degrees apart
+        image_angle=1 / 64,  # a window must contain three rings two degrees apart
         noise_gate=0.0015,
     )
     depth = replace(p.depth, minimum_depth=0.6, maximum_depth=60.0)
@@ -169,14 +169,10 @@ def _lidar() -> ModelParameters:
 
 
 def preset_answer(preset: str) -> AnswerParameters:
-    """Return the numbers of a preset by which poses are judged.
+    """Return the parameters of a preset, one of PRESETS, by which poses are evaluated.
 
-    Penalties of the confidence are those that the preset was shipped with: they are learnt from
-    answers, which need a model.
-
-    Parameters
-    ----------
-    preset : one of PRESETS
+    The penalties of the confidence are those of the shipped preset, because they are fitted to
+    answers, which require a model.
     """
     confidence = read_model(preset).answer.confidence
     if preset != "lidar":
@@ -186,43 +182,43 @@ def preset_answer(preset: str) -> AnswerParameters:
     return AnswerParameters(replace(lengths, refinement=refinement), confidence)
 
 
-#: Called with the stage's name, steps done and their total.
+#: Callback with the name of the stage, the number of finished steps and the total number.
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class TrainingParameters:
-    """What a model is trained on and how; all of it decides the outcome."""
+    """Parameters of the training, all of which affect the model."""
 
-    rooms: int = 100  #: synthetic rooms, or sites
-    views: int = 6  #: frames taken in each
-    seed: int = 0  #: of rooms, of the pairs drawn and of the fits
-    pairs: int = 240_000  #: properties that projection and mixture are fitted to
+    rooms: int = 100  #: number of synthetic rooms or sites
+    views: int = 6  #: number of frames per room or site
+    seed: int = 0  #: seed of rooms, sampled pairs and fits
+    pairs: int = 240_000  #: number of pairs to which projection and mixture are fitted
     projection: Literal["pca", "ica"] = "pca"
-    descriptors: int = 128  #: bytes of a descriptor
-    histograms: int = 40_000  #: of surroundings, that their compression is fitted to
-    clipped_share: float = 0.0005  #: of signature components, beyond the quantiser's range
-    scenes: Scenes = "rooms"  #: seen by a depth camera, or by a laser
-    whitening_rooms: int = 0  #: that the whitening is fitted to; 0: signatures are psi itself
-    levels: tuple[int, ...] = (0,)  #: that whitened signatures are made of
+    descriptors: int = 128  #: number of bytes of a descriptor
+    histograms: int = 40_000  #: number of histograms to which the compression is fitted
+    clipped_share: float = 0.0005  #: share of signature components beyond the quantiser's range
+    scenes: Scenes = "rooms"  #: kind of synthetic scenes
+    whitening_rooms: int = 0  #: number of rooms for the whitening; 0 stores psi
+    levels: tuple[int, ...] = (0,)  #: levels in whitened signatures
     whitening: WhiteningParameters = field(default_factory=WhiteningParameters)
 
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """What training keeps of one frame."""
+    """The training data of one frame."""
 
-    place: str  #: frames of different places are unrelated
-    properties: Floats  #: (n, 13) of pairs drawn from all levels
-    histograms: Floats32  #: (m, D) of the surroundings of patches drawn
+    place: str  #: place of the frame; frames of different places are unrelated
+    properties: Floats  #: (n, 13) properties of sampled pairs of all levels
+    histograms: Floats32  #: (m, D) histograms of the surroundings of sampled patches
     levels: tuple[Patches, ...]
 
 
 @dataclass(frozen=True)
 class Draw:
-    """How much is taken from each frame."""
+    """The number of samples per frame."""
 
-    pairs: int  #: of each level
+    pairs: int  #: number of pairs per level
     histograms: int
 
 
@@ -231,19 +227,20 @@ def train(
     references: Sequence[tuple[str, FrameReference]] = (), jobs: int = 1,
     report: Report | None = None,
 ) -> Model:  # fmt: skip
-    """Learn a model; the same arguments give the same model, however many processes help.
+    """Train a model; the result depends on the arguments, but not on the number of processes.
 
     Parameters
     ----------
-    name : what to call the model
-    model_p, mixture_p : its parameters, such as those of a preset: see `preset_parameters`
-    references : frames of one's own beside the rooms, each with the name of its place
-    jobs : processes that make and segment frames; with one, this process does
-    report : called as the stages advance
+    name : name of the model
+    model_p, mixture_p : parameters of the model, such as the results of `preset_parameters`
+    references : the user's frames, each with the name of its place, in addition to the rooms
+    jobs : number of processes that create and segment frames; 1 uses this process
+    report : callback for progress
 
     Raises
     ------
-    TrainingError : too little data, frames of fewer than two places, or no such level.
+    TrainingError : If there is too little data, the frames show fewer than two places, or a level
+        does not exist.
     """
     from threadpoolctl import threadpool_limits
 
@@ -258,23 +255,23 @@ def train(
     lessons = list(_lessons(model_p, p, drawn, references, jobs, tell))
     if len({lesson.place for lesson in lessons}) < 2:
         raise TrainingError(
-            f"{len(lessons)} usable frames of fewer than two places: d0, the distance of "
-            "unrelated frames, needs two. Add --rooms, or frames of another place."
+            f"The {len(lessons)} usable frames show fewer than two places, but d0, the distance of "
+            "unrelated frames, requires two. Add --rooms or frames of another place."
         )
     properties = np.concatenate([lesson.properties for lesson in lessons])
     histograms = np.concatenate([lesson.histograms for lesson in lessons])
     if len(histograms) <= model_p.surroundings.dimension:
         raise TrainingError(
-            f"{len(histograms)} patches are too few to learn what {model_p.surroundings.dimension} "
-            "bins of their surroundings have in common. Add --rooms, or frames of your own."
+            f"{len(histograms)} patches are too few to fit the compression of "
+            f"{model_p.surroundings.dimension} bins. Add --rooms or your own frames."
         )
-    with threadpool_limits(1):  # sums in one order, whatever the number of processors
+    with threadpool_limits(1):  # the order of sums must not depend on the processors
         compression = fit_compression(histograms, p.descriptors)
         projection = fit_projection(properties, p.projection, p.seed)
         features = project(properties, projection)
         fit = fit_mixture(features, mixture_p, p.seed)
         mixture = next(fit)
-        for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last one is kept
+        for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last mixture is the result
             tell("mixture", step, mixture_p.iterations)
     seen = {
         "training": _written(p),
@@ -289,7 +286,7 @@ def train(
 
 
 def _written(p: TrainingParameters) -> dict[str, Any]:
-    """Return the parameters for provenance, without defaults that came later."""
+    """Return the parameters for provenance, without defaults of newer parameters."""
     written = asdict(p)
     if p.scenes == "rooms":
         del written["scenes"]
@@ -304,12 +301,12 @@ def _silent(stage: str, done: int, total: int) -> None:
 
 
 def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -> Model:
-    """Return the model with its quantiser step and d0 fixed, from one frame of each place.
+    """Return the model with quantiser step and d0 computed from one frame per place.
 
     Parameters
     ----------
-    model : with projection and mixture
-    lessons : of at least two places
+    model : model with projection and mixture
+    lessons : training data of at least two places
     """
     signer = open_signer(model, cached=False)
     first = {lesson.place: lesson for lesson in reversed(lessons)}
@@ -327,16 +324,16 @@ def whitened(
     model: Model, p: TrainingParameters, references: Sequence[tuple[str, FrameReference]],
     jobs: int, report: Report,
 ) -> Model:  # fmt: skip
-    """Return the model with a whitening, fitted to more rooms, and to frames of one's own.
+    """Return the model with a whitening that is fitted to further rooms and the user's frames.
 
     Parameters
     ----------
-    model : calibrated
-    p, references, jobs, report : see `train`
+    model : result of `calibrated`
+    p, references, jobs, report : arguments of `train`
 
     Raises
     ------
-    TrainingError : too few frames for the dimension of the whitening.
+    TrainingError : If there are too few frames for the dimension of the whitening.
     """
     from threadpoolctl import threadpool_limits
 
@@ -353,19 +350,19 @@ def whitened(
     if len(psi) <= p.whitening.dimension:
         raise TrainingError(
             f"{len(psi)} usable frames are too few for signatures of {p.whitening.dimension} "
-            "bytes. Add --rooms, or frames of your own."
+            "bytes. Add --rooms or your own frames."
         )
     with threadpool_limits(1):
         fit = fit_whitening(np.stack(psi), p.levels, p.whitening)
     first = {place: i for i, place in reversed(list(enumerate(places)))}
     stored = np.stack([whiten(psi[i] / UNITS, fit) for _, i in sorted(first.items())])
     own = replace(fit, unrelated_distance=_median_distance(stored, "l2"))
-    # coarser levels taught the mixture; no frame needs them any more
+    # coarser levels were used for the mixture only
     h = replace(model.parameters.hierarchy, n_levels=max(p.levels) + 1)
     return replace(model, parameters=replace(model.parameters, hierarchy=h), whitening=own)
 
 
-#: What a process signs with while the whitening is fitted: its model, and the levels of psi.
+#: Signer of a process while the whitening is fitted, and the levels of psi.
 _signing: list[tuple[Signer, tuple[int, ...]]] = []
 
 
@@ -382,12 +379,12 @@ def _own_psi(reference: tuple[str, FrameReference]) -> tuple[str, list[Ints16]]:
     place, frame = reference
     try:
         return place, _psi(frame.read())
-    except FrameError:  # one bad frame of a recording teaches nothing; that is all
+    except FrameError:  # unusable frames of a recording are skipped
         return place, []
 
 
 def _psi(frame: AnyFrame) -> list[Ints16]:
-    """Return psi of some levels of a frame; of a frame that cannot be signed, none."""
+    """Return psi of a frame's levels in a list, which is empty if the frame cannot be signed."""
     (signer, levels), p = _signing[0], _signing[0][0].model.parameters
     try:
         patches = hierarchy_of(see(frame, p), p).levels
@@ -403,7 +400,7 @@ def _median_distance(stored: Bytes, metric: Metric) -> float:
 
 
 def _helpers(jobs: int, begin: Callable[..., None] | None = None, *arguments: Any) -> Executor:
-    """Return a pool of processes that begin with a call; for one job, a thread of this process."""
+    """Return a pool of processes that start with a call; for one job, a thread of this process."""
     if jobs == 1:
         return ThreadPoolExecutor(1, "training", begin, arguments)
     return ProcessPoolExecutor(jobs, get_context("spawn"), begin, arguments)
@@ -437,7 +434,7 @@ def _room_lessons(
 
 
 def _scene(p: TrainingParameters, index: int) -> tuple[str, Sequence[AnyFrame]]:
-    """Return the frames of one synthetic scene, and what it is called."""
+    """Return the name and the frames of a synthetic scene."""
     if p.scenes == "sites":
         survey = synthesise_survey(p.seed, index, p.views)
         return survey.name, survey.clouds
@@ -452,7 +449,7 @@ def _own_lesson(
     place, frame = reference
     try:
         return _lesson(frame.read(), place, (p.seed, 1, index), model_p, draw)
-    except FrameError:  # one bad frame of a recording teaches nothing; that is all
+    except FrameError:  # unusable frames of a recording are skipped
         return []
 
 
@@ -469,7 +466,7 @@ def _lesson(
     for level in patches.levels:
         pairs = neighbour_pairs(level, model_p.properties)
         if len(pairs):
-            # as often as they count in the statistics; one that comes twice does no harm
+            # sample in proportion to the weights in the statistics; duplicates are harmless
             share = patch_weights(level, model_p.weights)[pairs].prod(axis=1).cumsum()
             some = np.searchsorted(share, np.sort(rng.random(draw.pairs)) * share[-1], "right")
             drawn.append(pair_properties(level, pairs[some], model_p.properties))

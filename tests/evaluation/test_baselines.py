@@ -107,7 +107,7 @@ def test_baselines_are_rows_of_the_same_table(
     )
     out = capsys.readouterr().out
     assert "3 queries with a frame that is their place (overlap by half), recall" in out
-    assert "not asked: it is not made for frames" in out
+    assert "not used: it does not support frames" in out
     again = evaluated(tmp_path, *asked, "--baselines", "thumbnail_l1")
     for key in ("milliseconds", "ratio"):
         again["baselines"]["thumbnail_l1"].pop(key)

@@ -95,5 +95,5 @@ def test_a_calibration_by_hand() -> None:
     squares = 2 * 0.05**2 + 0.91**2 + 0.15**2 + 0.95**2 + 0.05**2
     assert found.brier == pytest.approx(squares / 6)
     assert math.isclose(calibration([1.0], [True]).error, 0.0)
-    with pytest.raises(ValueError, match="2 confidences of 1"):
+    with pytest.raises(ValueError, match="2 confidences for 1"):
         calibration([0.5, 0.5], [True])

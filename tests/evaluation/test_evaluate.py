@@ -184,7 +184,7 @@ def test_frames_that_cannot_be_used_are_named(
     )
     assert found["counts"] == {"queries": 2, "database": 3, "left_out": 2}
     reasons = {one["name"]: one["reason"] for one in found["left_out"]}
-    assert "no pose" in reasons["room/seq-01/frame-000001"]
+    assert "its pose is unknown" in reasons["room/seq-01/frame-000001"]
     assert "frame-000002" in reasons["room/seq-01/frame-000002"]
     assert "left out" in capsys.readouterr().out
 
@@ -292,11 +292,11 @@ def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["{room}"], "Give --db and --queries"),
+        (["{room}"], "Add --db and --queries"),
         (["{room}", "--db", "0:4"], "--db needs --queries"),
-        (["{room}", "--db", "0-4", "--queries", "5:6"], "is no range of frames"),
-        (["{room}", "--db", "0:4", "--queries", "5:99"], "outside its 12 frames"),
-        (["{room}", "--db", "0:4", "--queries", "3:6"], "chosen twice"),
+        (["{room}", "--db", "0-4", "--queries", "5:6"], "is not a range of frames"),
+        (["{room}", "--db", "0:4", "--queries", "5:99"], "outside the 12 frames"),
+        (["{room}", "--db", "0:4", "--queries", "3:6"], "selected twice"),
         (["{room}@db=0:4,queries=5:6", "--db", "0:4", "--queries", "5:6"], "Omit them"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--levels", "9"], "Choose from 1 to"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--max-overlap", "2"], "--max-overlap"),

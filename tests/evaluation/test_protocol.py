@@ -61,7 +61,7 @@ def test_ranges(text: str, ranges: list[Range]) -> None:
 
 @pytest.mark.parametrize("text", ["", "7", "a:b", "5:5", "9:3", "0:9:0", "0:9:1:1", "-5:9", "0:9,"])
 def test_what_is_no_range(text: str) -> None:
-    with pytest.raises(DatasetError, match=r"START:STOP|STOP must exceed"):
+    with pytest.raises(DatasetError, match=r"START:STOP|STOP above START"):
         parse_ranges(text)
 
 
@@ -115,15 +115,15 @@ def test_what_cannot_be_measured(tmp_path: Path) -> None:
     path = scene(tmp_path / "kitchen", {1: 4})
     twin = scene(tmp_path / "other" / "kitchen", {1: 4})
     some, rest = parse_ranges("0:2"), parse_ranges("2:4")
-    with pytest.raises(DatasetError, match=r"Give --db and --queries"):
+    with pytest.raises(DatasetError, match=r"Add --db and --queries"):
         choose([PathRanges(path)])
-    with pytest.raises(DatasetError, match=r"chosen twice, as database and as query"):
+    with pytest.raises(DatasetError, match=r"selected twice, as database and as query"):
         choose([PathRanges(path)], database=some, queries=parse_ranges("1:4"))
-    with pytest.raises(DatasetError, match=r"outside its 4 frames"):
+    with pytest.raises(DatasetError, match=r"outside the 4 frames"):
         choose([PathRanges(path)], database=some, queries=parse_ranges("2:5"))
-    with pytest.raises(DatasetError, match=r"Another scene is called kitchen"):
+    with pytest.raises(DatasetError, match=r"has the name kitchen too"):
         choose([PathRanges(path)], [twin], database=some, queries=rest)
-    with pytest.raises(DatasetError, match=r"No frame is chosen as query"):
+    with pytest.raises(DatasetError, match=r"No frame is selected as query"):
         choose([PathRanges(path, database=some)])
-    with pytest.raises(DatasetError, match=r"No frame is chosen as database"):
+    with pytest.raises(DatasetError, match=r"No frame is selected as database"):
         choose([PathRanges(path, queries=some)])

@@ -1,6 +1,6 @@
-"""The measure: a data set with known poses to figures anyone can repeat.
+"""Evaluation on data sets with reference poses, with reproducible figures.
 
     PATH...  --choose-->  Protocol  --evaluate-->  Evaluation  --figures-->  JSON, table, pictures
 
-Ground-truth poses are read here and nowhere else: they judge, they never help.
+Reference poses are used for the evaluation only.
 """

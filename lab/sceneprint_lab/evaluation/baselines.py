@@ -1,14 +1,15 @@
-"""Rank by other methods, and measure them in the run that measures the signature.
+"""Baselines of retrieval, which are measured in the same run as the signature.
 
 Thumbnails are small inverse depth images, compared by L1 or ZNCC.
 
 FPFH are local features of Open3D (Rusu et al., ICRA 2009), aggregated by VLAD (Jegou et al., CVPR
-2010). The vocabulary is learnt on the database that is searched, which favours this baseline: no
-model has seen a frame of it.
+2010). The vocabulary is fitted to the searched database, which favours this baseline: models were
+not trained on its frames.
 
-Rings are heights about a scanner, as in Scan Context (Kim and Kim, IROS 2018). The ground about the
-sensor is divided into rings and sectors; each cell has the height of its highest point. A turn of
-the sensor by a sector shifts the columns by one, so that two scans are compared at every shift.
+Rings are heights around a scanner, as in Scan Context (Kim and Kim, IROS 2018). The ground around
+the sensor is divided into rings and sectors; each cell has the height of its highest point. A
+rotation of the sensor by a sector shifts the columns by one, so two scans are compared at all
+shifts.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from sceneprint_lab.evaluation.protocol import (
 
 
 class Baseline:
-    """A way to compare frames without signatures."""
+    """A method that compares frames without signatures."""
 
     name: str
 
@@ -49,22 +50,22 @@ class Baseline:
         """Raise MissingDependency if a library is absent."""
 
     def takes(self, frame: AnyFrame) -> bool:  # noqa: ARG002
-        """Return whether the baseline supports such a frame."""
+        """Return whether the baseline supports a frame."""
         return True
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """Return what the descriptor is computed from; raise UselessFrame if there is nothing."""
+        """Return the features for the descriptor; raise UselessFrame if there are none."""
         raise NotImplementedError
 
     def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """Learn from what `read` returned for the `count` frames of the database."""
+        """Fit the baseline to the results of `read` for the `count` frames of the database."""
 
     def finish(self, features: Floats32) -> Floats32:
-        """Return the descriptor of what `read` returned; of one shape for all frames."""
+        """Return the descriptor of a result of `read`; it has the same shape for all frames."""
         return features
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """Return (N,) from one descriptor to each of a stack of N; infinite is farthest."""
+        """Return the distances (N,) from a descriptor to N descriptors; they may be infinite."""
         raise NotImplementedError
 
 
@@ -76,16 +77,16 @@ Comparison = Literal["l1", "zncc"]
 
 
 def thumbnail(depth: Floats32, rows: int = ROWS, columns: int = COLUMNS) -> Floats32:
-    """Return mean inverse depth of the samples in each cell of a grid over the image.
+    """Return the mean inverse depth in each cell of a grid over the image.
 
     Parameters
     ----------
-    depth : (H, W) metres; 0 where missing
-    rows, columns : of the grid
+    depth : (H, W) metres; 0 if missing
+    rows, columns : size of the grid
 
     Returns
     -------
-    (rows, columns) float32, 1/metres; 0 where a cell has no sample
+    (rows, columns) float32, 1/metres; 0 for cells without a sample
     """
     height, width = depth.shape
     y, x = np.nonzero(depth > 0)
@@ -102,8 +103,8 @@ class Thumbnails(Baseline):
 
     Parameters
     ----------
-    comparison : "l1": mean absolute difference over cells that both have filled, or "zncc":
-        1 - zero-mean normalised cross-correlation, empty cells at the mean
+    comparison : "l1", the mean absolute difference over cells that are filled in both, or "zncc",
+        1 - zero-mean normalised cross-correlation, with the mean in empty cells
     """
 
     def __init__(self, comparison: Comparison) -> None:
@@ -120,7 +121,7 @@ class Thumbnails(Baseline):
         return thumbnail(frame.depth)
 
     def finish(self, features: Floats32) -> Floats32:
-        """Return the thumbnail; for correlation at mean 0 and length 1."""
+        """Return the thumbnail, normalised to mean 0 and length 1 for correlation."""
         if self.comparison == "l1":
             return features
         filled = features > 0
@@ -130,7 +131,7 @@ class Thumbnails(Baseline):
         return (centred / length if length > 0 else centred).astype(np.float32)
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """Return distance of one finished thumbnail to each of (N, rows, columns): (N,)."""
+        """Return the distances (N,) from a finished thumbnail to N thumbnails."""
         own = query.reshape(-1).astype(np.float64)
         others = database.reshape(len(database), -1).astype(np.float64)
         if self.comparison == "zncc":
@@ -139,32 +140,32 @@ class Thumbnails(Baseline):
         both = (own > 0) & (others > 0)
         total = np.where(both, np.abs(others - own), 0.0).sum(axis=1)
         count = both.sum(axis=1)
-        # nothing in common is as far as can be
+        # thumbnails without common cells have the maximum distance
         return np.where(count > 0, total / np.maximum(count, 1), np.inf)
 
 
 # FPFH and VLAD.
 
-#: Voxel of the points, reach of normals and of features, metres, for a sensor of RANGE metres;
-#: for others in proportion.
+#: Voxel of the points, radius of normals and of features, metres, for a sensor with a range of
+#: RANGE metres; they are proportional to the range.
 VOXEL, NORMALS, FEATURES, RANGE = 0.05, 0.10, 0.25, 9.0
-_WHAT = "The baseline fpfh_vlad"  #: needs Open3D
-#: Words of the vocabulary, and features that it is learnt from.
+_WHAT = "The baseline fpfh_vlad"
+#: Number of words in the vocabulary, and of features to which it is fitted.
 WORDS, LEARNT_FROM = 64, 20_000
 
 
 def features(points: Floats, scale: float = 1.0) -> Floats32:
-    """Return FPFH of a cloud's voxels.
+    """Return the FPFH of a cloud's voxels.
 
     Parameters
     ----------
-    points : (N, 3) metres, the sensor at the origin
-    scale : of VOXEL, NORMALS and FEATURES
+    points : (N, 3) metres, with the sensor at the origin
+    scale : factor of VOXEL, NORMALS and FEATURES
 
     Returns
     -------
-    (n, 33) float32, of each of the three histograms the root of its shares, so that L2 between
-    two is Hellinger's distance
+    (n, 33) float32, roots of the shares in each of the three histograms, so that L2 is the
+    Hellinger distance
     """
     o3d = open3d(_WHAT)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
@@ -176,26 +177,26 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
         cloud, search(radius=FEATURES * scale, max_nn=100)
     )
     found = np.maximum(np.asarray(fpfh.data).T, 0.0).reshape(-1, 3, 11)
-    total = found.sum(axis=2, keepdims=True)  # 0 without neighbours
+    total = found.sum(axis=2, keepdims=True)  # the sum is 0 without neighbours
     shares = np.divide(found, total, out=np.zeros_like(found), where=total > 0)
     rooted: Floats32 = np.sqrt(shares).reshape(-1, 33).astype(np.float32)
     return rooted
 
 
 def vlad(local: Floats32, words: Floats) -> Floats32:
-    """Return sums of what is left of features less their nearest word: VLAD, intra-normalised.
+    """Return the VLAD descriptor: intra-normalised sums of features minus their nearest words.
 
     Parameters
     ----------
-    local : (n, d)
-    words : (k, d)
+    local : (n, d) features
+    words : (k, d) vocabulary
 
     Returns
     -------
-    (k * d,) float32 of length 1, or 0 where every feature is a word
+    (k * d,) float32 unit vector; 0 if all features are words
     """
     own = local.astype(np.float64)
-    squares = (words**2).sum(axis=1) - 2 * own @ words.T  # and |own|^2, the same for every word
+    squares = (words**2).sum(axis=1) - 2 * own @ words.T  # |own|^2 is the same for every word
     nearest = squares.argmin(axis=1)
     sums = np.zeros_like(words)
     np.add.at(sums, nearest, own - words[nearest])
@@ -207,11 +208,11 @@ def vlad(local: Floats32, words: Floats) -> Floats32:
 
 
 class FpfhVlad(Baseline):
-    """FPFH-VLAD as a baseline, for depth images and clouds.
+    """The baseline FPFH-VLAD, for depth images and clouds.
 
     Parameters
     ----------
-    maximum : the sensor's range, metres; farther points are left out
+    maximum : range of the sensor, metres; farther points are omitted
     """
 
     name = "fpfh_vlad"
@@ -229,8 +230,8 @@ class FpfhVlad(Baseline):
 
         Raises
         ------
-        MissingDependency : see `open3d`.
-        UselessFrame : no point is in range.
+        MissingDependency : If Open3D cannot be imported.
+        UselessFrame : If no point is in range.
         """
         points = (
             np.asarray(frame.points, np.float64)
@@ -239,11 +240,13 @@ class FpfhVlad(Baseline):
         )
         points = points[np.linalg.norm(points, axis=1) <= self.maximum]
         if not len(points):
-            raise UselessFrame(f"{frame.name}: No point lies within {self.maximum:g} m.")
+            raise UselessFrame(
+                f"{frame.name}: no point lies within {self.maximum:g} m. Omit this frame."
+            )
         return features(points, self.maximum / RANGE)
 
     def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """The vocabulary: k-means of as many features of every frame of the database."""
+        """Fit the vocabulary by k-means to an equal number of features of each frame."""
         from sklearn.cluster import KMeans
 
         rng, share = np.random.default_rng(seed), -(-LEARNT_FROM // max(count, 1))
@@ -252,46 +255,46 @@ class FpfhVlad(Baseline):
             for one in database
         ]
         sample = np.concatenate(drawn).astype(np.float64)
-        distinct = len(np.unique(sample, axis=0))  # k-means warns where words would be alike
+        distinct = len(np.unique(sample, axis=0))  # k-means would warn about equal words
         means = KMeans(min(WORDS, distinct), n_init=1, random_state=seed).fit(sample)
         self._words = np.asarray(means.cluster_centers_, np.float64)
 
     def finish(self, features: Floats32) -> Floats32:
-        """Return the VLAD of a frame's features; after `learn`."""
+        """Return the VLAD descriptor of a frame's features; `learn` must run first."""
         if self._words is None:
-            raise ValueError("the vocabulary has not been learnt")
+            raise ValueError("There is no vocabulary. Call `learn` first.")
         return vlad(features, self._words)
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """Return Euclidean distance of one to each of (N, k * d): (N,)."""
+        """Return the Euclidean distances (N,) from a descriptor to N descriptors."""
         found: Floats = np.linalg.norm(database.astype(np.float64) - query, axis=1)
         return found
 
 
 # Rings.
 
-#: The paper's numbers: rings, sectors, reach of the rings, and the lift of all heights, so that
-#: what lies about the wheels is above 0, metres.
+#: Parameters of the paper: number of rings and of sectors, radius of the rings, and offset that
+#: makes heights of the ground positive, metres.
 RINGS, SECTORS, RADIUS, LIFT = 20, 60, 80.0, 2.0
 
 
 def ring_descriptor(points: Floats32 | Floats) -> Floats32:
-    """Return the greatest height in each ring and sector about the sensor.
+    """Return the maximum height in each ring and sector around the sensor.
 
     Parameters
     ----------
-    points : (N, 3) metres, the sensor at the origin, z up; azimuth counts from x towards y
+    points : (N, 3) metres, with the sensor at the origin and z up; azimuth is from x towards y
 
     Returns
     -------
-    (RINGS, SECTORS) float32, the height and `LIFT`; 0 where a cell holds no point
+    (RINGS, SECTORS) float32, height plus `LIFT`; 0 for cells without a point
     """
     x, y, z = np.asarray(points, np.float64).T
     flat = np.hypot(x, y)
     inside = flat < RADIUS
     ring = (flat[inside] / RADIUS * RINGS).astype(np.intp)
     azimuth = np.mod(np.arctan2(y[inside], x[inside]), 2 * np.pi)
-    # an azimuth a rounding below 2 pi is of the last sector, not of one more
+    # an azimuth just below 2 pi can be rounded up beyond the last sector
     sector = np.minimum((azimuth / (2 * np.pi) * SECTORS).astype(np.intp), SECTORS - 1)
     highest = np.full((RINGS, SECTORS), -np.inf)
     np.maximum.at(highest, (ring, sector), z[inside] + LIFT)
@@ -314,7 +317,7 @@ def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -
 def _best_shift(
     a: Floats, a_filled: NDArray[np.bool_], b: Floats, b_filled: NDArray[np.bool_]
 ) -> tuple[float, int]:
-    """Return the least distance over shifts, and that shift of the columns of `b`."""
+    """Return the minimum distance over all shifts of the columns of `b`, and its shift."""
     sectors, rings = a.shape
     best, at = 2.0, 0
     for shift in range(sectors):
@@ -340,29 +343,29 @@ def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def ring_distance(a: Floats32, b: Floats32) -> tuple[float, int]:
-    """Return how unlike two scans are, whichever way they are turned about the upright axis.
+    """Return the distance between two scans, which does not depend on their yaw.
 
     Parameters
     ----------
-    a, b : (rings, sectors) each
+    a, b : (rings, sectors) descriptors
 
     Returns
     -------
-    distance : mean of 1 - cosine over columns that both have filled, at the best shift; 0 to 2
-    shift : sectors by which the columns of `a` lie further on in `b`
+    distance : mean of 1 - cosine over columns that are filled in both, at the best shift; 0 to 2
+    shift : number of sectors by which the columns of `a` are shifted in `b`
     """
     distance, shift = _best_shift(*_columns(a), *_columns(b))
     return float(distance), int(shift)
 
 
 def ring_distances(query: Floats32, database: Floats32) -> Floats:
-    """Return distance of one descriptor (rings, sectors) to each of (N, rings, sectors): (N,)."""
+    """Return the distances (N,) from a descriptor to N descriptors (N, rings, sectors)."""
     own = _columns(query)
     return np.array([_best_shift(*own, *_columns(other))[0] for other in database], float)
 
 
 class Rings(Baseline):
-    """The ring descriptor as a baseline: for clouds with a viewpoint."""
+    """The baseline of ring descriptors, for clouds with a viewpoint."""
 
     name = "rings"
 
@@ -371,7 +374,7 @@ class Rings(Baseline):
         return isinstance(frame, Cloud) and frame.has_viewpoint
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """Return the descriptor of a cloud whose z axis is upright."""
+        """Return the descriptor of a cloud whose z axis points up."""
         assert isinstance(frame, Cloud)
         return ring_descriptor(frame.points)
 
@@ -380,7 +383,7 @@ class Rings(Baseline):
         return ring_distances(query, database)
 
 
-#: Constructors of the baselines by the range of the sensor, metres.
+#: Constructors of the baselines, which take the range of the sensor in metres.
 BASELINES: dict[str, Callable[[float], Baseline]] = {
     "thumbnail_l1": lambda _: Thumbnails("l1"),
     "thumbnail_zncc": lambda _: Thumbnails("zncc"),
@@ -390,7 +393,7 @@ BASELINES: dict[str, Callable[[float], Baseline]] = {
 
 
 def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
-    """Return baselines by their names, ready for use.
+    """Return baselines by their names, after a check of their libraries.
 
     Parameters
     ----------
@@ -399,7 +402,7 @@ def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
 
     Raises
     ------
-    MissingDependency : a library is absent.
+    MissingDependency : If a library is absent.
     """
     opened = [BASELINES[name](maximum) for name in names]
     for one in opened:
@@ -407,7 +410,7 @@ def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
     return opened
 
 
-#: Queries that are described and signed once more, to time a baseline beside the signature.
+#: Number of queries with which the times of a baseline and of the signature are measured.
 TIMED = 10
 
 
@@ -417,12 +420,12 @@ class Compared:
 
     Parameters
     ----------
-    name : of the baseline
-    reason : why it cannot be used; empty if it can
-    rankings : of each query the nearest database indices, nearest first
-    first : of each query the pair with the nearest, validated as ours; None without a ranking
-    milliseconds : processor time, medians of a query: to `describe` it, to `sign` it for the
-        signature, and to `rank` the database
+    name : name of the baseline
+    reason : reason why the baseline cannot be used; empty if it can
+    rankings : indices of the database for each query, nearest first
+    first : validated pair of each query with its nearest frame; None without a ranking
+    milliseconds : median processor times to `describe` a query, to `sign` it, and to `rank` the
+        database
     """
 
     name: str
@@ -438,16 +441,16 @@ def compare(
 ) -> Compared:  # fmt: skip
     """Rank the database for every query by a baseline.
 
-    One process and one thread, in which the signature is timed as well.
+    The computation uses one thread of this process, in which the signature is timed too.
 
     Parameters
     ----------
-    baseline : see there
-    prepared, store : frames
-    allowed : (Q, N), which frames a query may find
-    signer : of the signatures, to be timed
-    seed : of what is learnt
-    watch : told of every frame
+    baseline : baseline that is measured
+    prepared, store : frames of the evaluation
+    allowed : (Q, N) mask of the frames that a query may find
+    signer : signer for the time of the signature
+    seed : seed of the baseline's fit
+    watch : callback for progress
     """
     from threadpoolctl import threadpool_limits
 
@@ -456,7 +459,7 @@ def compare(
 
     for member in (*prepared.queries, *prepared.database):
         if not baseline.takes(store.frame(member)):
-            return refused(f"it is not made for frames such as {member.name}")
+            return refused(f"it does not support frames such as {member.name}")
     with threadpool_limits(1):
         try:
             found = _compared(baseline, prepared, store, allowed, seed, watch)
@@ -497,7 +500,7 @@ def registered(
     judge: Judge, rankings: Sequence[Sequence[int]], prepared: Prepared,
     overlap_mean: NDArray[np.float64], overlap_least: NDArray[np.float64],
 ) -> list[ValidatedPair | None]:  # fmt: skip
-    """Return the validated pair of each query with its nearest frame, as R has it by a ranking."""
+    """Return the validated pair of each query with the nearest frame of its ranking."""
     found: list[ValidatedPair | None] = []
     for i, (query, ranking) in enumerate(zip(prepared.queries, rankings, strict=True)):
         if not ranking:
@@ -515,16 +518,15 @@ def registered(
 def timed(
     baseline: Baseline, prepared: Prepared, store: FrameStore, signer: Signer
 ) -> dict[str, float]:
-    """Processor time to describe a query by a baseline, and to sign it: medians, milliseconds.
+    """Return the median processor times to describe and to sign a query, milliseconds.
 
-    Some evenly chosen queries, each described and signed in turn, so that both meet the same
-    machine; after `compare`.
+    Evenly spaced queries are described and signed alternately, so that conditions are equal.
     """
     n = len(prepared.queries)
     chosen = sorted({round(i) for i in np.linspace(0, n - 1, min(TIMED, n))})
     spent: dict[str, list[float]] = {"describe": [], "sign": []}
     frames = [store.frame(prepared.queries[i]) for i in chosen]
-    for frame in (frames[0], *frames):  # the first once more: libraries loaded, loops compiled
+    for frame in (frames[0], *frames):  # the first pass loads libraries and compiles loops
         start = time.process_time()
         baseline.finish(baseline.read(frame))
         between = time.process_time()

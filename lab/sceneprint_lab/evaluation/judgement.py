@@ -1,4 +1,4 @@
-"""Validate a query against its candidates, and judge the results by the true poses."""
+"""Validation of queries against candidates, and errors of the results by the reference poses."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ from sceneprint_lab.evaluation.protocol import (
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A database frame that a query is to be validated against.
+    """A database frame against which a query is validated.
 
     Parameters
     ----------
-    match : its index in the database
-    number : of its files in the store
-    scene, pose : as in Member
-    overlap_mean, overlap_least : with the query
+    match : index of the frame in the database
+    number : number of the frame in the store
+    scene, pose : see SignedFrame
+    overlap_mean, overlap_least : overlaps with the query; see Overlaps
     """
 
     match: int
@@ -75,23 +75,23 @@ class Candidate:
 
     @classmethod
     def of(cls, frame: SignedFrame, match: int, mean: float = 0.0, least: float = 0.0) -> Candidate:
-        """Return the candidate that a frame of the database is, with its overlaps."""
+        """Return a frame of the database as a candidate."""
         return cls(match, frame.number, frame.scene, frame.pose, mean, least)
 
 
 @dataclass(frozen=True, eq=False)
 class QueryTask:
-    """One query with its candidates.
+    """A query with its candidates.
 
     Parameters
     ----------
-    number : of the query's files in the store
-    scene, pose : of the query
-    ranking : database indices of the first of R, in order
-    selection : those of C, in order
-    candidates : all of both, each once
-    allowed : rising indices of all database frames that it may find
-    retrieved : R; without it no frames elsewhere are compared before a pose is found
+    number : number of the query in the store
+    scene, pose : scene and pose of the query
+    ranking : database indices of the first members of R, in order
+    selection : database indices of C, in order
+    candidates : candidates of `ranking` and `selection`, without duplicates
+    allowed : ascending indices of all database frames that the query may find
+    retrieved : R; None prevents the comparison with frames of other places
     """
 
     number: int
@@ -106,7 +106,7 @@ class QueryTask:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """The result of a task; fields as in QueryOutcome."""
+    """The result of a task; for its fields see QueryOutcome."""
 
     pairs: dict[int, ValidatedPair]
     average: Error
@@ -118,19 +118,16 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """What a process needs to validate.
+    """The data and parameters with which a process validates.
 
     Parameters
     ----------
-    geometry : gives that of a frame by its number in the store
-    mode : see `validate`
-    seed : of every pair, as a service has one for all that it validates
-    p : of the model
-    matching : see `validate`
-    database : the frames of the map; empty where only pairs are validated
-    answer : of the model
-    confidence : least of a pose that is found
-    unrelated_distance : of the model, by which distances are similarities
+    geometry : function that returns the geometry of a frame by its number in the store
+    mode, seed, p, matching : arguments of `validate` for all pairs
+    database : frames of the map; empty if only pairs are validated
+    answer : parameters of the model's answers
+    confidence : minimum confidence of a pose that is found
+    unrelated_distance : d0 of the model
     rendered : whether the frames of the map are views rendered from a surface
     """
 
@@ -152,7 +149,7 @@ def open_judge(
     answer: AnswerParameters | None = None, unrelated_distance: float = math.inf,
 ) -> Judge:  # fmt: skip
     """Return a judge of the frames of a store."""
-    geometry = lru_cache(128)(store.geometry)  # neighbouring queries have common candidates
+    geometry = lru_cache(128)(store.geometry)  # successive queries share candidates
     return Judge(
         geometry, mode, seed, p, matching, database, answer or AnswerParameters(),
         unrelated_distance=unrelated_distance,
@@ -160,14 +157,14 @@ def open_judge(
 
 
 def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
-    """Return the first accepted views of one scene, strong ones first.
+    """Return the first accepted views of one scene, strong views first.
 
-    Poses are comparable within one scene only. The scene with most strong matches counts, of equals
-    the one with most matches, and of these the one whose match comes first.
+    Poses are comparable within one scene only. The selected scene has the most strong matches; ties
+    are resolved by the number of matches, then by the rank of the first match.
 
     Parameters
     ----------
-    pairs : of a query, in the order of R
+    pairs : pairs of a query, in the order of R
     """
     accepted = in_preferred_order(pairs)
     scenes = [pair.scene for pair in accepted]
@@ -179,10 +176,10 @@ def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
 
 
 def judge(judging: Judge, task: QueryTask) -> Judged:
-    """Validate a query against each candidate, average its pose, and judge all by the true pose.
+    """Validate a query against each candidate, average its pose, and compute all errors.
 
-    The bound that registration can reach, which is refinement from the true pose, is computed for
-    the first answer and for the averaged views of C.
+    The bound of registration, which is the refinement from the reference pose, is computed for the
+    first answer and for the averaged views of C.
     """
     of = {c.match: c for c in task.candidates}
     pairs = {c.match: validated(judging, task, c) for c in task.candidates}
@@ -208,14 +205,14 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
 
 
 def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -> JudgedAnswer:
-    """Return the answer that a robot gets from the candidates of C, judged by the true pose.
+    """Return the answer from the candidates of C, with its error.
 
-    It is the one that a service gives: the same functions validate the candidates and decide.
+    A service returns the same answer, because it uses the same functions.
 
     Parameters
     ----------
-    judging, task : see there
-    prior : what the robot believes of its pose, its parent a scene of the database
+    judging, task : arguments of `judge`
+    prior : pose that the robot expects, in a scene of the database
     """
     start = time.perf_counter()
     database = _Recording(judging, task, prior)
@@ -234,7 +231,7 @@ class _Recording:
         self._judging, self._task, self._prior = judging, task, prior
         self._allowed = set(task.allowed.tolist())
         self._poses = [frame.pose for frame in judging.database]
-        # what a query may not find must not tell poses apart either: a scene of its own
+        # frames that the query may not find get a separate scene, so that they do not vote either
         self._scenes = [
             frame.scene if row in self._allowed else ""
             for row, frame in enumerate(judging.database)
@@ -246,14 +243,16 @@ class _Recording:
         self.selected = _ranking_of(judging, task, sorted(task.selection, key=self._is_far))
 
     def first_matches(self) -> list[PairMatch]:
-        """Return the matches of C, some of them guided."""
+        """Return the matches of C, some of which may be guided."""
         return self._validated(
             self.selected, pose_of=lambda row: (self._scenes[row], self._poses[row])
         )
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         p, agreement = self.p, self._judging.p.agreement
-        ahead = [looks_ahead(self.query)] * len(self._poses)  # a recording has one sensor
+        ahead = [looks_ahead(self.query)] * len(
+            self._poses
+        )  # all frames of a recording have one sensor
         views_of = views_of_rows(
             frames[-1].matches, self._poses, self._geometry, self._scenes, p.map, agreement, ahead,
             [self._judging.rendered] * len(self._poses),
@@ -287,7 +286,7 @@ class _Recording:
         return self._judging.geometry(self._judging.database[row].number)
 
     def _is_far(self, row: int) -> bool:
-        """Return whether a frame was taken too far from the prior to show the same."""
+        """Return whether a frame is too far from the prior to show the same surfaces."""
         prior = self._prior
         return prior is not None and not (
             self._scenes[row] == prior.parent and prior.reaches(self._poses[row], self.p.map)
@@ -297,7 +296,7 @@ class _Recording:
 def _judged_answer(
     estimate: PoseEstimate, task: QueryTask, p: LocalizationParameters, spent: float
 ) -> JudgedAnswer:
-    """Return an answer with the places that it was chosen from, judged by the true pose."""
+    """Return an answer with its candidate places and their errors."""
 
     def error_of(T: Floats) -> Error:
         return pose_error(T, task.pose) if estimate.parent == task.scene else Error()
@@ -310,14 +309,14 @@ def _judged_answer(
         error = error_of(place.T)
         right = error.within(p.map.place_m, PLACE_DEG)
         places.append(JudgedPlace(evidence, confidences[i], error, right))
-    # as far off as places are apart, so that a scan may be off by more than a depth image
+    # the limit is proportional to the distance of places, so it is larger for scans
     limits = RIGHT[0] * p.map.place_m / MapParameters.place_m, RIGHT[1]
     error = Error() if estimate.average is None else error_of(estimate.average.T)
     return JudgedAnswer(estimate.status, estimate.strength, error, spent, tuple(places), limits)
 
 
 def _ranking_of(judging: Judge, task: QueryTask, rows: Sequence[int]) -> Ranking:
-    """Return some rows of R in another order; without R every distance is that of strangers."""
+    """Return rows as a ranking with the distances of R; without R, distances are d0."""
     index = np.array(rows, np.intp)
     distances = np.full(len(index), judging.unrelated_distance)
     if task.retrieved is not None:
@@ -331,7 +330,7 @@ def _ranking_of(judging: Judge, task: QueryTask, rows: Sequence[int]) -> Ranking
 
 
 def true_transform(task: QueryTask, candidate: Candidate) -> Floats:
-    """Return T_match_query by the true poses."""
+    """Return T_match_query by the reference poses."""
     T: Floats = inverse(candidate.pose) @ task.pose
     return T
 
@@ -352,7 +351,7 @@ def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> Validate
 
 
 def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) -> Floats | None:
-    """Return the transform that refinement reaches from the true pose; see `refined_at`."""
+    """Return the transform that refinement reaches from the reference pose."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
     return refine_transform(query, match, true_transform(task, candidate), judging.p.alignment.fine)
 
@@ -367,11 +366,11 @@ def _average(
     return pose_error(average_poses(np.stack(poses)).T, task.pose)
 
 
-# R and C of every query, by stored signatures alone.
+# R and C of all queries, by stored signatures.
 
-#: Queries scanned at once.
+#: Number of queries per scan of the database.
 BLOCK = 64
-#: Queries whose distances within R are computed again, to time what a service does.
+#: Number of queries whose distances within R are computed again to measure the time.
 TIMED = 3
 
 
@@ -382,9 +381,10 @@ class Ranked:
     Parameters
     ----------
     ranking : R, database indices, nearest first
-    distances : (|R|,) of R, as of `cross_distances`
+    distances : (|R|,) distances of R; see `cross_distances`
     selection : C, in the order of R
-    milliseconds : of `rank` (scan and sort), `diversify`, and sometimes `compare_ranking`
+    milliseconds : times of `rank` (scan and sort), `diversify` and, for some queries,
+        `compare_ranking`
     """
 
     ranking: list[int]
@@ -402,23 +402,23 @@ def rank(
     queries: Bytes, database: Bytes, allowed: NDArray[np.bool_], *, metric: Metric,
     candidates: int = 10, watch: Watch = unwatched,
 ) -> list[Ranked]:  # fmt: skip
-    """Rank the database for each query and select from the ranking.
+    """Return the ranking and the selection of each query.
 
     Parameters
     ----------
     queries : (Q, n) uint8
     database : (N, n) uint8
-    allowed : (Q, N), which frames a query may find
+    allowed : (Q, N) mask of the frames that a query may find
     metric : l1 or l2
     candidates : size of C
-    watch : follows the queries
+    watch : callback for progress
 
     Returns
     -------
-    ranked : Q; empty lists where nothing is allowed
+    ranked : results of the Q queries; their lists are empty if no frame is allowed
     """
     size = max((ranking_size(int(n)) for n in allowed.sum(axis=1)), default=0)
-    # every pair of the database once, or the pairs within each ranking anew: whichever is less
+    # compute all pairs of the database once if they are fewer than the pairs of all rankings
     whole = len(database) ** 2 <= len(queries) * size**2
     among = pairwise_distances(database, metric) if whole and len(queries) else None
     rows = _rows(queries, database, metric)
@@ -444,7 +444,7 @@ def rank(
 
 
 def _rows(queries: Bytes, database: Bytes, metric: Metric) -> Iterable[tuple[Ints64, float]]:
-    """Yield the distances of each query to the database, and the milliseconds they took."""
+    """Yield the distances of each query to the database, and the time for them, milliseconds."""
     for begin in range(0, len(queries), BLOCK):
         start = time.perf_counter()
         block = cross_distances(queries[begin : begin + BLOCK], database, metric)

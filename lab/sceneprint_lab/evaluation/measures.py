@@ -1,4 +1,4 @@
-"""Measure rankings, accuracy, acceptance, and what diversification brings."""
+"""Measures of rankings, accuracy, acceptance, and the effect of diversification."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from sceneprint_lab.evaluation.protocol import (
     points_at,
 )
 
-#: The k of recall@k.
+#: Values of k for recall@k.
 FIRST = (1, 5, 10)
-#: Overlap, by the definition of retrieval, from which a frame shows the query's place.
+#: Minimum overlap, by the definition of retrieval, of a frame that shows the query's place.
 OVERLAP = 0.5
 
 
 def metres_apart(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -> Floats:
-    """Return (Q, N) distance of the sensors by the true poses; infinite between scenes."""
+    """Return the distances (Q, N) between the sensors, metres; infinite between scenes."""
     there = np.array([m.pose[:3, 3] for m in queries])
     here = np.array([m.pose[:3, 3] for m in database])
     same = np.array([m.scene for m in queries])[:, None] == np.array([m.scene for m in database])
@@ -42,18 +42,18 @@ def metres_apart(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]
 def recall(
     relevant: NDArray[np.bool_], allowed: NDArray[np.bool_], rankings: Sequence[Sequence[int]]
 ) -> dict[str, float | int | None]:
-    """Return share of queries that have a relevant frame among the first k, of those that have one.
+    """Return recall@k: the share of queries with a relevant frame among the first k.
 
     Parameters
     ----------
-    relevant : (Q, N), whether a database frame shows the query's place
-    allowed : (Q, N), whether the query may find it
-    rankings : of each query database indices, nearest first, all of them allowed
+    relevant : (Q, N) mask of the database frames that show the query's place
+    allowed : (Q, N) mask of the database frames that the query may find
+    rankings : database indices for each query, nearest first, all of which are allowed
 
     Returns
     -------
-    figures : `queries` that may find a relevant frame, and the share of each k of FIRST; null
-        where there is no such query
+    figures : number of `queries` that may find a relevant frame, and the recall for each k of
+        FIRST among them; null without such queries
     """
     able = np.flatnonzero((relevant & allowed).any(axis=1)).tolist()
     found: dict[str, float | int | None] = {"queries": len(able)}
@@ -63,44 +63,49 @@ def recall(
     return found
 
 
-# How sure a counted rate is, and how well one number tells right from wrong.
+# Confidence bounds of rates, and receiver operating characteristics.
 #
 # counts  --upper_bound-->  rate        scores, labels  --roc-->  Roc
 
-#: Of the bound on a rate.
+#: Confidence of the bound of a rate.
 CONFIDENCE = 0.95
-#: Points of a curve that are kept.
+#: Maximum number of points in a curve.
 CURVE = 200
 
 
 def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | None:
-    """Return the rate above which so few would be seen with less than 1 - `confidence`.
+    """Return the one-sided Clopper-Pearson upper bound of a rate.
 
-    One-sided Clopper-Pearson. Of none seen it is 1 - (1 - confidence)^(1 / of), which for 95 % is
-    about 3 / of: the rule of three. It holds for independent tries; pairs that share frames are
-    not, and say less.
+    For 0 events, it is 1 - (1 - confidence)^(1 / of), which for 95 % is about 3 / of (the rule of
+    three). It applies to independent trials; for pairs that share frames, the true bound is higher.
 
     Parameters
     ----------
-    seen, of : 0 <= seen <= of
-    confidence : between 0 and 1
+    seen, of : number of events and of trials, 0 <= seen <= of
+    confidence : confidence of the bound, between 0 and 1
 
     Returns
     -------
-    rate : None where nothing was tried
+    rate : upper bound; None without trials
     """
     if not 0 <= seen <= of or not 0 < confidence < 1:
-        raise ValueError(f"{seen} of {of} at {confidence} is no rate")
+        raise ValueError(
+            f"{seen} events in {of} trials at confidence {confidence} have no bound. Pass "
+            "0 <= seen <= of and 0 < confidence < 1."
+        )
     if of == 0:
         return None
     low, high = seen / of, 1.0
-    while (middle := (low + high) / 2) not in (low, high):  # until no number lies between
+    while (middle := (low + high) / 2) not in (
+        low,
+        high,
+    ):  # until the interval contains no other number
         low, high = (middle, high) if _at_most(seen, of, middle) > 1 - confidence else (low, middle)
     return high
 
 
 def _at_most(seen: int, of: int, rate: float) -> float:
-    """Return chance of at most `seen` hits in `of` independent tries."""
+    """Return the probability of at most `seen` events in `of` independent trials."""
     if rate in (0.0, 1.0):
         return float(rate == 0 or seen == of)
     hit, miss = math.log(rate), math.log1p(-rate)
@@ -113,13 +118,14 @@ def _at_most(seen: int, of: int, rate: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Roc:
-    """Right and wrong ones that pass, as the least score that is asked for falls.
+    """The receiver operating characteristic of a score.
 
     Parameters
     ----------
-    area : under the curve: the chance that a right one scores higher than a wrong one, ties half
-    false, true : (n,) share of the wrong and of the right ones that pass, from 0 to 1
-    thresholds : (n,) least score; infinite at first
+    area : area under the curve: probability that a right item has a higher score than a wrong item;
+        ties count half
+    false, true : (n,) share of the wrong and of the right items that reach the threshold, 0 to 1
+    thresholds : (n,) descending thresholds of the score, starting with infinity
     """
 
     area: float
@@ -128,11 +134,11 @@ class Roc:
     thresholds: Floats
 
     def true_at(self, false: float) -> float:
-        """Return the most right ones that pass while at most this share of the wrong ones does."""
+        """Return the maximum true rate at a false rate of at most `false`."""
         return float(self.true[self.false <= false].max())
 
     def thinned(self, most: int = CURVE) -> list[list[float]]:
-        """Return at most so many points (false, true, threshold), the ends among them."""
+        """Return at most `most` points (false, true, threshold), including both ends."""
         n = len(self.true)
         kept = np.arange(n)
         if n > most:
@@ -142,27 +148,27 @@ class Roc:
 
     def _kept(self, most: int) -> NDArray[np.intp]:
         n = len(self.true)
-        # evenly along both shares, so that neither end of the curve is lost
+        # even steps along both rates represent both ends of the curve
         at = np.linspace(0, 2, most - 1)
         return np.unique(np.append(np.searchsorted(self.false + self.true, at).clip(0, n - 1), 0))
 
 
 def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
-    """Return the curve of one number that should be high for right ones.
+    """Return the curve of a score that is high for right items.
 
     Parameters
     ----------
-    scores : (n,), -infinity where there is nothing to be said for it
-    right : (n,)
+    scores : (n,) scores; -infinity if there is no evidence
+    right : (n,) mask of the right items
 
     Returns
     -------
-    curve : None where all are right, or none
+    curve : None if all items are right or all are wrong
     """
     n_right, n_wrong = int(right.sum()), int((~right).sum())
     if not n_right or not n_wrong:
         return None
-    values, place = np.unique(-scores, return_inverse=True)  # highest first, equal ones together
+    values, place = np.unique(-scores, return_inverse=True)  # descending, without duplicates
     good = np.bincount(place[right], minlength=len(values)).cumsum()
     bad = np.bincount(place[~right], minlength=len(values)).cumsum()
     true = np.concatenate([[0], good]) / n_right
@@ -171,24 +177,24 @@ def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
     return Roc(area, false, true, np.concatenate([[np.inf], -values]))
 
 
-# The rows of the table: how far off the answers are, and whether they are rightly believed.
+# The rows of the table: errors of the answers, and correctness of their acceptance.
 #
 # Outcome, ...  --rows, validation, oracle_and_random-->  figures
 
 Figures = dict[str, float | int | None]
 
-#: Overlap from which a frame counts as showing the same place.
+#: Minimum overlap of a frame that shows the same place.
 OVERLAPS = 0.3
 
 
 def rows(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """Return each way to answer, over the queries whose scene is in the database.
+    """Return the figures of each method, over the queries whose scene is in the database.
 
-    R: the first of the ranking, registered and refined, accepted or not. VR: the first that is
-    accepted among the first of R, strong before weak. DR, VDR: the same of C. `pose_average`:
-    of up to five accepted views of C; `pose_average_vr`: of R. `bound`: refinement started at the
-    true pose, of the pair that VDR answers with (`first`) and of the views that are averaged.
-    Without an accepted match a query is a failure, and of another scene a match is always one.
+    R: the first member of the ranking after registration, accepted or not. VR: the first accepted
+    match among the first members of R, strong before weak. DR, VDR: the same for C.
+    `pose_average`: average of up to five accepted views of C; `pose_average_vr`: the same for R.
+    `bound`: refinement from the reference pose, for the pair of VDR (`first`) and for the averaged
+    views. A query without an accepted match, or with a match of another scene, is a failure.
     """
     here = [o for o in outcomes if o.present]
     return {
@@ -202,10 +208,10 @@ def rows(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def bound(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """Return what registration of the same pairs could reach: refinement started at the true pose.
+    """Return the bounds of registration, by refinement from the reference poses.
 
-    `VDR` for the first pair of VDR, `pose_average` for the views that are averaged. A query
-    without such a pair is a failure here as it is there.
+    `VDR` is the bound of the first pair of VDR, `pose_average` that of the averaged views. A query
+    without such a pair is a failure.
     """
     here = [o for o in outcomes if o.present]
     return {
@@ -215,15 +221,15 @@ def bound(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def bound_of(outcome: QueryOutcome) -> Error:
-    """Return where refinement from the true pose ends for the pair VDR answers with."""
+    """Return the error of refinement from the reference pose, for the first pair of VDR."""
     first = outcome.views("VDR")[:1]
     return first[0].bound or Error() if first else Error()
 
 
 def accuracy(errors: Sequence[Error]) -> Figures:
-    """Return shares of errors within the two thresholds, and medians; null where there is none.
+    """Return the shares of errors within the two thresholds, and medians; null without errors.
 
-    A failure is infinitely far off; a median that falls on one is null.
+    The error of a failure is infinite; an infinite median is null.
     """
     if not errors:
         names = ("within_5cm_5deg", "within_10cm_10deg")
@@ -237,11 +243,11 @@ def accuracy(errors: Sequence[Error]) -> Figures:
 
 
 def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
-    """Return how much the first match and the first five see of what the query sees.
+    """Return figures of the overlap of the first match, and of the first five, with the query.
 
     Parameters
     ----------
-    five : of each query, the overlap of retrieval of its first five matches
+    five : overlaps, by the definition of retrieval, of the first five matches of each query
     """
     first = [overlaps[0] for overlaps in five]
     return {
@@ -259,7 +265,7 @@ def retrieval(outcomes: Sequence[QueryOutcome], of: str) -> Figures:
 
 
 def oracle_and_random(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """Return the figures of the best frame of the database, and the expected ones of a random."""
+    """Return the figures of the best database frame, and the expected figures of a random frame."""
     here = [o for o in outcomes if o.present]
     of_any: Figures = {
         "top1_overlap_50": _mean([float((o.overlap_mean >= 0.5).mean()) for o in here]),
@@ -272,18 +278,18 @@ def oracle_and_random(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def _any_of_five(outcome: QueryOutcome) -> float:
-    """Return chance that five different frames hold one that overlaps by half."""
+    """Return the probability that one of five random frames has an overlap of at least a half."""
     n, good = len(outcome.overlap_mean), int((outcome.overlap_mean >= 0.5).sum())
     return 1.0 - math.comb(n - good, 5) / math.comb(n, 5) if n >= 5 else float(good > 0)
 
 
 def validation(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
-    """Return whether acceptance can be trusted, over all pairs that were validated.
+    """Return precision and recall of acceptance, over all validated pairs.
 
-    `precision`: accepted pairs whose transform is right to 10 cm and 10 degrees, over accepted.
-    `recall`: the same over all pairs whose transform is right. `recall_overlap_30`: over those
-    whose overlap (smaller direction) is 30 % or more. Counts: `pairs`, `accepted`,
-    `accepted_strong`; of right transforms `right_but_rejected` and `right_but_ambiguous`; of
+    `precision`: share of the accepted pairs whose transform is right within 10 cm and 10 degrees.
+    `recall`: share of the right transforms that are accepted. `recall_overlap_30`: the same for
+    pairs whose overlap (smaller direction) is 30 % or more. Counts: `pairs`, `accepted`,
+    `accepted_strong`; for right transforms `right_but_rejected` and `right_but_ambiguous`; for
     other scenes `pairs_of_other_scenes`, `accepted_of_other_scenes`,
     `accepted_strong_of_other_scenes`.
     """
@@ -291,7 +297,7 @@ def validation(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None
 
 
 def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | None]:
-    """Return the same of some pairs; precision is null where none of them was accepted."""
+    """Return the figures of `validation` for pairs; precision is null if none is accepted."""
     accepted = [p for p in pairs if p.accepted]
     right = [p for p in pairs if p.right]
     clear = [p for p in right if p.overlap_least >= OVERLAPS]
@@ -315,10 +321,10 @@ def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | Non
 
 
 def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
-    """Return how often a query is believed to be found where its scene is not in the database.
+    """Return the shares of queries that are accepted although their scene is not in the database.
 
-    `accepted_strong` and `accepted_weak` are shares of these queries by the strength of VDR's
-    answer; null where there is no such query.
+    `accepted_strong` and `accepted_weak` are the shares by the strength of VDR's answer; null
+    without such queries.
     """
     away = [o for o in outcomes if not o.present]
     answers = [o.views("VDR")[0].validation.strength if o.views("VDR") else None for o in away]
@@ -332,15 +338,15 @@ def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
 
 
 def answers(told: Sequence[JudgedAnswer]) -> dict[str, Any]:
-    """Return what robots are told, as shares of all queries; the first four add up to 1.
+    """Return the answers of robots as shares of all queries; the first four have the sum 1.
 
-    `found_right`: within 10 cm and 10 degrees, or the limits of the answers. `found_wrong`: found
-    and not right, of absent scenes always; `grossly_wrong` of them are beyond 50 cm or 15 degrees,
-    and the rate of those is below `grossly_wrong_at_most` (95 %, one-sided). `found_strong_wrong`:
-    wrong ones that were called strong. `wrong_of_found`: wrong ones as a share of those that are
-    found. `calibration_error`: how far the confidence of the likeliest pose is from the share of
-    these that are right; `reliability`: in each tenth of confidences the number of these poses,
-    their mean confidence, and the share that is right. Null where nothing was asked.
+    `found_right`: found within 10 cm and 10 degrees, or within the limits of the answers.
+    `found_wrong`: found, but not right; always the case for absent scenes. `grossly_wrong`: wrong
+    by more than 50 cm or 15 degrees; the upper bound of this rate is `grossly_wrong_at_most` (95 %,
+    one-sided). `found_strong_wrong`: strong, but wrong. `wrong_of_found`: share of the found
+    answers that are wrong. `calibration_error`: mean difference between the confidence of the most
+    likely pose and the share of such poses that are right. `reliability`: number, mean confidence
+    and share of right poses for each tenth of confidences. Figures are null without queries.
     """
     found = _calibration(told)
     wrong = [one.status == "found" and not one.right for one in told]
@@ -365,7 +371,7 @@ def answers(told: Sequence[JudgedAnswer]) -> dict[str, Any]:
 
 
 def _calibration(told: Sequence[JudgedAnswer]) -> Calibration | None:
-    """Return how well confidences predict which likeliest poses are right; None without any."""
+    """Return the calibration of the most likely poses; None without poses."""
     best = [one.places[0] for one in told if one.places]
     if not best:
         return None
@@ -374,13 +380,13 @@ def _calibration(told: Sequence[JudgedAnswer]) -> Calibration | None:
 
 @dataclass(frozen=True)
 class Calibration:
-    """How confidences compare with what was right.
+    """The calibration of confidences.
 
     Parameters
     ----------
     error : expected calibration error over ten bins of equal width
-    brier : mean square of confidence less outcome
-    bins : of each bin that has poses: their number, mean confidence, and share that is right
+    brier : mean square of confidence minus outcome
+    bins : number of poses, mean confidence, and share of right poses of each non-empty bin
     """
 
     error: float
@@ -389,18 +395,21 @@ class Calibration:
 
 
 def calibration(confidences: Sequence[float], right: Sequence[bool]) -> Calibration:
-    """Return how well confidences predict what is right.
+    """Return the calibration of confidences.
 
     Parameters
     ----------
-    confidences, right : one for one; at least one
+    confidences, right : confidence and correctness of each pose; at least one pose
 
     Raises
     ------
-    ValueError : not one for one, or none.
+    ValueError : If the lengths differ or are 0.
     """
     if len(confidences) != len(right) or not len(right):
-        raise ValueError(f"{len(confidences)} confidences of {len(right)} poses")
+        raise ValueError(
+            f"There are {len(confidences)} confidences for {len(right)} poses. Pass one confidence "
+            "per pose, and at least one pose."
+        )
     c, y = np.array(confidences, float), np.array(right, float)
     which = np.minimum((c * 10).astype(int), 9)
     bins = tuple(
@@ -413,7 +422,7 @@ def calibration(confidences: Sequence[float], right: Sequence[bool]) -> Calibrat
 
 
 def first_error(outcome: QueryOutcome, of: str) -> Error:
-    """Return how far off a row's first answer is; infinite where it has none."""
+    """Return the error of a row's first answer; infinite without an answer."""
     views = outcome.views(of)
     return views[0].error if views else Error()
 
@@ -435,11 +444,11 @@ def _median(values: Sequence[float]) -> float | None:
     return middle if math.isfinite(middle) else None
 
 
-# Where queries are lost on their way from the database to an accepted match.
+# The stage at which queries are lost between the database and an accepted match.
 #
 # Outcome, ...  --lost-->  counts
 
-#: Every query ends in exactly one of these.
+#: Outcomes of queries, exactly one of which applies to each query.
 PLACES = (
     "found", "near", "wrongly_accepted", "nothing_overlaps", "not_in_r", "not_in_c", "ambiguous",
     "rejected",
@@ -447,22 +456,19 @@ PLACES = (
 
 
 def lost(outcomes: Sequence[QueryOutcome]) -> dict[str, int]:
-    """Count the queries by where VDR lost them; the counts add up to the queries.
-
-    See `place_of` for what each word means.
-    """
+    """Return the number of queries for each outcome; see `place_of`."""
     counts = Counter(place_of(outcome) for outcome in outcomes)
     return {place: counts[place] for place in PLACES}
 
 
 def place_of(outcome: QueryOutcome) -> str:
-    """Return the first of these that is true of a query.
+    """Return the outcome of a query, the first of the following that applies.
 
-    With an accepted match: `found`, VDR's answer is right to 10 cm and 10 degrees; `near`, to
-    20 cm and 20 degrees; else `wrongly_accepted`. Without one: `nothing_overlaps`, no database
-    frame overlaps the query by 30 % (smaller direction, within 10 cm), which holds for every
-    query of an absent scene; `not_in_r`, such frames are not in R; `not_in_c`, those in R are
-    not in C; `ambiguous`, one of those in C was ambiguous; else `rejected`.
+    With an accepted match: `found`, VDR's answer is right within 10 cm and 10 degrees; `near`,
+    within 20 cm and 20 degrees; else `wrongly_accepted`. Without an accepted match:
+    `nothing_overlaps`, no database frame overlaps the query by 30 % (smaller direction, within
+    10 cm), which is always the case for absent scenes; `not_in_r`, no such frame is in R;
+    `not_in_c`, no such frame is in C; `ambiguous`, such a frame in C is ambiguous; else `rejected`.
     """
     answers = outcome.views("VDR")
     if answers:
@@ -482,9 +488,9 @@ def place_of(outcome: QueryOutcome) -> str:
     return "ambiguous" if "ambiguous" in states else "rejected"
 
 
-# What diversification brings: the paper's two figures.
+# The effect of diversification: the paper's two figures.
 
-#: Edge of a voxel, metres; depth from which surface is not counted; every so manieth pixel.
+#: Edge of a voxel, metres; maximum depth of counted surface, metres; stride of the pixels.
 VOXEL, FARTHEST, PIXELS = 0.02, 4.0, 2
 
 Voxels = NDArray[np.int64]
@@ -493,19 +499,20 @@ Voxels = NDArray[np.int64]
 def diversity(
     outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
-    """Return how far the first five lie from the query and from each other, and what they cover.
+    """Return the distances of the first five matches, and the volume that they cover.
 
-    `translation` has, for each of R, DR, VR and VDR, the mean and the standard deviation (within
-    the five) of the distance between the query and the match, metres, by true poses, averaged
-    over queries. `coverage` has the 2 cm voxels that the first validated views see (true
-    poses, depth below 4 m), for VR and VDR, in the mean over queries. VR and VDR are compared
-    at equal numbers of views, on queries for which both have two or more; without any, null.
+    `translation` contains, for R, DR, VR and VDR, the mean and the standard deviation (within the
+    five) of the distance between query and match, metres, by reference poses, averaged over
+    queries. `coverage` contains the number of 2 cm voxels that the first validated views observe
+    (reference poses, depth below 4 m), for VR and VDR, averaged over queries. VR and VDR are
+    compared with equal numbers of views, on queries for which both have two or more views; null
+    without such queries.
 
     Parameters
     ----------
-    outcomes : see Outcome
-    poses : (4, 4) of each database frame
-    database : gives the frame of a database index, with its pose
+    outcomes : outcomes of the queries
+    poses : (4, 4) pose of each database frame
+    database : function that returns the frame of a database index, with its pose
     """
     compared = [(o, *equal_views(o)) for o in outcomes]
     compared = [row for row in compared if len(row[1]) >= 2]
@@ -518,7 +525,7 @@ def diversity(
         "VDR": _translation([(o, d) for o, _, d in compared], poses),
     }
     covered = coverage(outcomes, database)
-    # where all that a query's views see lies beyond FARTHEST there is nothing to compare
+    # queries whose views show no surface within FARTHEST cannot be compared
     both = [pair for pair in covered if pair is not None and pair[0] > 0]
     ranked_mean, diverse_mean = np.mean(both, axis=0).tolist() if both else (0.0, 0.0)
     return {
@@ -535,7 +542,7 @@ def diversity(
 
 
 def equal_views(outcome: QueryOutcome) -> tuple[list[ValidatedPair], list[ValidatedPair]]:
-    """Return the first validated views of VR and VDR in the query's scene, as many of either."""
+    """Return equal numbers of the first validated views of VR and VDR in the query's scene."""
     ranked, diverse = (_of_scene(outcome, of) for of in ("VR", "VDR"))
     n = min(len(ranked), len(diverse))
     return ranked[:n], diverse[:n]
@@ -544,7 +551,10 @@ def equal_views(outcome: QueryOutcome) -> tuple[list[ValidatedPair], list[Valida
 def coverage(
     outcomes: Sequence[QueryOutcome], database: Callable[[int], AnyFrame]
 ) -> list[tuple[int, int] | None]:
-    """Return the voxels that VR's and VDR's views of each query cover; None with fewer than two."""
+    """Return the numbers of voxels that the views of VR and VDR cover, for each query.
+
+    The result is None for queries with fewer than two views.
+    """
 
     @lru_cache(256)
     def seen(match: int) -> Voxels:
@@ -561,21 +571,21 @@ def coverage(
 
 
 def voxels(frame: AnyFrame) -> Voxels:
-    """Return the voxels that a frame sees, as numbers that are the same for all frames."""
+    """Return the keys of the voxels that a frame observes, which are equal for all frames."""
     points = points_of(frame, PIXELS, FARTHEST)
     if frame.pose is None:
-        raise ValueError(f"{frame.name} has no pose")
+        raise ValueError(f"{frame.name} has no pose. Pass frames with poses.")
     cells = np.floor(transform_points(frame.pose, points) / VOXEL).astype(np.int64)
-    # 21 bits for each axis: 20 km either way
+    # 21 bits per axis suffice for 20 km in each direction
     half = 1 << 20
     x, y, z = (cells + half).T
     return np.unique((x << 42) | (y << 21) | z)
 
 
 def points_of(frame: AnyFrame, step: int, farthest: float) -> Floats:
-    """Return the points (N, 3) of every `step`-th pixel both ways, or of a cloud all.
+    """Return the points (N, 3) of every `step`-th row and column, or all points of a cloud.
 
-    Points that are as far as `farthest` metres are left out.
+    Points at `farthest` metres or more are omitted.
     """
     if isinstance(frame, Cloud):
         every: Floats = frame.points.astype(float)
@@ -587,7 +597,7 @@ def points_of(frame: AnyFrame, step: int, farthest: float) -> Floats:
 
 
 def _of_scene(outcome: QueryOutcome, of: str) -> list[ValidatedPair]:
-    """Return the first five, less those of other scenes: they lie nowhere in this one."""
+    """Return those of the first five pairs that are in the query's scene."""
     return [pair for pair in outcome.views(of)[:VIEWS] if pair.same_scene]
 
 

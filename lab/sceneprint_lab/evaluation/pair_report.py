@@ -1,4 +1,4 @@
-"""Report an evaluation of pairs: its figures for JSON, and as lines to read.
+"""Reports of pair evaluations, as JSON and as text.
 
 PairEvaluation  --pair_figures-->  dict  --pair_table-->  lines
 """
@@ -34,7 +34,7 @@ _HEAD = f"{'':24}" + "".join(f"{name + ' %':>16}" for name in BINS)
 
 
 def pair_table(found: dict[str, Any]) -> list[str]:
-    """Return the figures of `pair_figures` as lines to read."""
+    """Return the figures of `pair_figures` as lines of text."""
     lines: list[str] = []
     for scene, own in found.get("scenes", {}).items():
         lines += [f"{scene}, alone", *_bins(own), ""]
@@ -148,12 +148,12 @@ def _two(shares: dict[str, float | None]) -> str:
     return " / ".join(decimal(shares[name]) for name in _COLUMNS)
 
 
-#: Shares of wrong pairs at which a curve is read off.
+#: False rates at which a curve is evaluated.
 FALSE_RATES = (0.0, 0.01, 0.05)
 
 
 def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
-    """Return the evidence as acceptance weighs it, without the stiffness."""
+    """Return the evidence by which acceptance decides, without the stiffness."""
     told = Evidence(
         v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf
     )
@@ -161,11 +161,11 @@ def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
 
 
 def residual(v: PairValidation, p: AcceptanceParameters) -> float:
-    """Return of the two directions: the greater of metres and radians, each over its own limit."""
+    """Return the residual of the two directions, as a multiple of its limit."""
     return max(v.residual_m / p.residual_m, v.residual_rad / p.residual_rad)
 
 
-#: Statistics of a transform, each so that more speaks for it; None if it is unknown.
+#: Statistics of a transform, whose higher values are evidence for it; None if unknown.
 STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | None]] = {
     "residual": lambda v, p: -residual(v, p),
     "overlap": lambda v, _: v.overlap,
@@ -178,12 +178,12 @@ STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | N
 
 
 def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str, Any]:
-    """Return the receiver operating characteristic of each statistic, were it to decide alone.
+    """Return the receiver operating characteristic of each statistic as the only criterion.
 
-    A pair is right where its transform is, whatever was decided. One without a transform, or of
-    which a statistic is not known, has nothing to say for it. Of `ambiguity` only pairs are
-    counted for which rivals were looked for. `curve` has (share of wrong ones, share of right
-    ones, threshold); thresholds of statistics that should be small are negative.
+    A pair is right if its transform is right, whatever the decision. A pair without a transform or
+    the statistic has no evidence. For `ambiguity`, only pairs with a search for rivals count.
+    `curve` contains (false rate, true rate, threshold); thresholds of statistics whose small values
+    are evidence are negative.
     """
     found = {}
     for name, told in STATISTICS.items():
@@ -211,17 +211,17 @@ def _ambiguity_was_tested(pair: ValidatedPair) -> bool:
     return pair.accepted or pair.validation.ambiguity > 0
 
 
-#: Of JSON: raised when a key changes its meaning.
+#: Version of the JSON, which increases if the meaning of a key changes.
 SCHEMA_VERSION = 1
 
 
 def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[str, Any]:
-    """Return every figure of an evaluation of pairs.
+    """Return all figures of an evaluation of pairs.
 
     Parameters
     ----------
     evaluation : see PairEvaluation
-    settings : all that is needed to repeat it
+    settings : all settings with which the evaluation can be repeated
     """
     members, tried = evaluation.members, evaluation.tried
     scenes = list(dict.fromkeys(member.scene for member in members))
@@ -274,7 +274,7 @@ def _of_scene(
     own: Sequence[int], tried: Sequence[Tried], seconds: Sequence[Second | None],
     limits: tuple[float, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return figures of the pairs of one scene, its negatives among them."""
+    """Return the figures of the pairs of one scene, including its negatives."""
     pairs, theirs = [tried[i] for i in own], [seconds[i] for i in own]
     return {
         "bins": bins(pairs, theirs, limits),
@@ -284,17 +284,17 @@ def _of_scene(
     }
 
 
-#: What other accepted pairs of the same query say of an accepted pair.
+#: Relation of an accepted pair to other accepted pairs of the same query.
 Second = Literal["supported", "contradicted", "alone"]
 
 
 def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
-    """Return whether a second pair agrees with each accepted one, None for others.
+    """Return the relation of each accepted pair to other pairs; None for other pairs.
 
-    Each accepted pair places its query by the true pose of its match, as the pose of a frame of
-    a map would. A pair is supported if another accepted pair of the same query, whose match was
-    taken from a different viewpoint, places it there too, to what a map takes for one place;
-    contradicted if all others place it elsewhere.
+    An accepted pair implies a pose of its query by the reference pose of its match. A pair is
+    supported if another accepted pair of the same query, whose match has a different viewpoint,
+    implies a pose at the same place. It is contradicted if all other pairs imply poses at other
+    places.
     """
     members, p = evaluation.members, evaluation.map
     of_query: dict[int, list[int]] = {}
@@ -321,7 +321,7 @@ def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
 
 
 def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[str, Any]:
-    """Return how many accepted pairs a second one supports, and how many of each kind are right."""
+    """Return the number of accepted pairs by relation to a second pair, and their precision."""
     found: dict[str, Any] = {}
     kinds: tuple[Second, ...] = get_args(Second)
     for kind in kinds:
@@ -335,10 +335,10 @@ def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[st
 def bins(
     tried: Sequence[Tried], seconds: Sequence[Second | None], limits: tuple[float, float]
 ) -> dict[str, dict[str, Any]]:
-    """Return by true overlap how often the transform is right, and how often it is accepted.
+    """Return the rates of right and of accepted transforms, by true overlap.
 
-    `success`: of the transform that validation found; `right`: to the limits of the evaluation.
-    `bound`: of refinement started at the true pose. Without a transform a pair is a failure.
+    `success`: shares of right transforms; `right` refers to the limits of the evaluation. `bound`:
+    the same for refinement from the reference pose. A pair without a transform is a failure.
     `validation`: see `measures.validation`. `support`: see `support`.
     """
     found = {}
@@ -366,9 +366,9 @@ def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
 
 
 def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
-    """Return how many pairs that see nothing of each other were accepted, and how many may be.
+    """Return the rates of accepted pairs without overlap, and their upper bounds.
 
-    `planar`: the pairs of two scenes of which a frame is planar. `by_scenes`: of every two.
+    `planar`: pairs of two scenes with a planar frame. `by_scenes`: rates for each pair of scenes.
     """
     tried, members = evaluation.tried, evaluation.members
     same = [one for one in tried if one.drawn.kind == "same_scene"]
@@ -387,7 +387,7 @@ def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
 
 
 def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
-    """Return of pairs that ought not to be accepted: how many are; `upper`: see `upper_bound`."""
+    """Return the rate of accepted pairs among wrong pairs; `upper` is the `upper_bound`."""
     accepted = [one.pair for one in tried if one.pair.accepted]
     return {
         "pairs": len(tried),
@@ -399,10 +399,10 @@ def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
 
 
 def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
-    """Return success of others by bin on the same pairs, and what ours costs beside them.
+    """Return the success of the baselines by bin on the same pairs, and the ratio of times.
 
-    `start`: before refinement; `icp`: after their own; `ours`: after our refinement in its place.
-    `time_ratio`: median over pairs of our time over theirs, features of both frames counted.
+    `start`: before refinement; `icp`: after their ICP; `ours`: after our refinement instead.
+    `time_ratio`: median over pairs of our time divided by theirs, including features.
     """
     beside = [one for one in tried if one.others is not None]
     found: dict[str, Any] = {"pairs": len(beside), "methods": {}}
@@ -430,11 +430,11 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
 
 
 def why(one: Tried) -> str | None:
-    """Return what went wrong with a pair, None where nothing did.
+    """Return the kind of failure of a pair; None without a failure.
 
-    `wrongly_accepted`; `not_believed`: a right transform that was not accepted; `near`: off by
-    up to twice the limits, and not accepted; `not_found`: farther off or without a transform,
-    though the two overlap.
+    `wrongly_accepted`; `not_believed`: a right transform that is not accepted; `near`: an error of
+    up to twice the limits, not accepted; `not_found`: a larger error or no transform, although the
+    frames overlap.
     """
     pair = one.pair
     if pair.accepted:
@@ -448,7 +448,7 @@ def why(one: Tried) -> str | None:
 
 
 def failures(evaluation: PairEvaluation) -> list[dict[str, Any]]:
-    """Return every pair that went wrong, the worst kind first, and all that was told of it."""
+    """Return all failed pairs with their validations, the worst kind first."""
     order = ("wrongly_accepted", "not_believed", "near", "not_found")
     listed = [(why(one), number, one) for number, one in enumerate(evaluation.tried)]
     wrong = [(kind, number, one) for kind, number, one in listed if kind is not None]

@@ -1,4 +1,4 @@
-"""Draw pairs of frames, register them, by Open3D too, and judge them by the true poses.
+"""Evaluation of pairs of frames: samples, registration, by Open3D too, and errors.
 
 PATH...  --evaluate_pairs-->  PairEvaluation
 """
@@ -59,12 +59,12 @@ from sceneprint_lab.evaluation.protocol import (
 )
 from sceneprint_lab.evaluation.run import OFF_PLANE, PLANAR, overlaps_of, plane_share
 
-#: Edges of the bins of true overlap: the smaller direction, agreement within 10 cm.
+#: Edges of the bins of true overlap (smaller direction, within 10 cm).
 EDGES = (0.1, 0.3, 0.5, 0.7, 1.0)
 BINS = tuple(f"{round(100 * low)}-{round(100 * high)}" for low, high in pairwise(EDGES))
-#: Two frames of a scene see nothing of each other below this, mean of both directions.
+#: Maximum overlap (mean of both directions) of two frames of a scene that count as negatives.
 NOTHING = 0.01
-#: Share of cross-scene pairs that are drawn among those with a planar frame.
+#: Share of planar pairs in the sample of pairs of two scenes.
 PLANAR_SHARE = 0.25
 
 Kind = Literal["overlapping", "same_scene", "cross_scene"]
@@ -72,14 +72,14 @@ Kind = Literal["overlapping", "same_scene", "cross_scene"]
 
 @dataclass(frozen=True)
 class Drawing:
-    """How many pairs are drawn, and how.
+    """Parameters of the sample of pairs.
 
     Parameters
     ----------
-    pairs : of each bin of each scene, and as many of each scene that see nothing of each other
-    negatives : of two scenes, over all of these
-    apart : places in the recording between two frames of one sequence, at least
-    seed : of the draw
+    pairs : number of pairs per bin and scene, and of negatives per scene
+    negatives : total number of pairs of two scenes
+    apart : minimum number of frames between two frames of one sequence
+    seed : seed of the sample
     """
 
     pairs: int = 120
@@ -90,13 +90,13 @@ class Drawing:
 
 @dataclass(frozen=True)
 class FrameOrigin:
-    """Where a frame comes from.
+    """The origin of a frame.
 
     Parameters
     ----------
-    scene : its parent frame
-    run : its sequence
-    number : its place in the sequence
+    scene : parent frame
+    run : sequence
+    number : position in the sequence
     """
 
     scene: str
@@ -106,15 +106,15 @@ class FrameOrigin:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A pair of frames that is tried.
+    """A sampled pair of frames.
 
     Parameters
     ----------
-    query, match : indices of members
-    kind : overlapping, or a negative of one scene or of two
-    bin : of BINS where they overlap, else None
-    overlap_mean, overlap_least : as in Overlaps; 0 for two scenes
-    planar : whether a frame of the two is planar
+    query, match : indices of the frames
+    kind : overlapping pair, or negative of one scene or of two scenes
+    bin : bin of an overlapping pair, else None
+    overlap_mean, overlap_least : see Overlaps; 0 for two scenes
+    planar : whether one of the frames is planar
     """
 
     query: int
@@ -129,17 +129,17 @@ class Drawn:
 def draw(
     places: Sequence[FrameOrigin], truth: Overlaps, planar: NDArray[np.bool_], p: Drawing
 ) -> list[Drawn]:
-    """Return pairs of every bin and of both kinds of negatives, or fewer if fewer exist.
+    """Return a sample of pairs of all bins and of both kinds of negatives.
 
-    Each pair is drawn once, and its later frame is the query. Every two scenes have as many pairs,
-    and a quarter is drawn among those with a planar frame, so long as there are any.
+    Each pair occurs once, and its later frame is the query. All pairs of scenes have equal numbers
+    of pairs, a quarter of which have a planar frame. Samples are smaller if fewer pairs exist.
 
     Parameters
     ----------
-    places : (N,) of the frames
-    truth : (N, N) overlap, 0 between scenes
-    planar : (N,) whether a frame shows little but one plane
-    p : see Drawing
+    places : origins of the N frames
+    truth : (N, N) overlaps, 0 between scenes
+    planar : (N,) mask of the frames that show mostly one plane
+    p : parameters of the sample
     """
     scenes = list(dict.fromkeys(place.scene for place in places))
     of = {s: np.flatnonzero([place.scene == s for place in places]) for s in scenes}
@@ -180,7 +180,7 @@ def _of_one_scene(
 
 
 def inside(least: Floats, name: str) -> NDArray[np.bool_]:
-    """Return whether overlaps lie in a bin; the last one has its upper edge."""
+    """Return a mask of the overlaps in a bin; the last bin includes its upper edge."""
     low, high = list(pairwise(EDGES))[BINS.index(name)]
     return (least >= low) & ((least < high) | (high == EDGES[-1]))
 
@@ -200,40 +200,42 @@ def _of_two_scenes(
 
 
 def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return at most n of some numbers, each once, rising."""
+    """Return a random sample of at most n numbers without duplicates, in ascending order."""
     return np.sort(rng.choice(of, min(n, len(of)), replace=False))
 
 
-# Registration by Open3D: FPFH with RANSAC or FGR, then ICP. Each has one standard configuration,
-# which is not tuned, and works in one direction. It always answers, and does not say whether to
-# believe it. The features of both frames count.
+# Registration by Open3D: FPFH with RANSAC or FGR, then ICP. Each method has one standard
+# configuration, which is not tuned, and works in one direction. It always returns a transform,
+# without a decision on acceptance. Times include the features of both frames.
 
 T = TypeVar("T")
 
-#: Of FPFH: voxel, then radius and neighbours of normals, and of features.
+#: Parameters of FPFH: voxel, radius and number of neighbours of normals, and of features.
 VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
-#: Of RANSAC: farthest correspondence (metres), points a hypothesis, least ratio of edge lengths,
+#: Parameters of RANSAC: maximum distance of a correspondence (metres), number of points of a
+#: hypothesis, minimum ratio of edge lengths, maximum number of hypotheses, and confidence.
 CORRESPONDENCE, POINTS, BASELINE_EDGES = 0.075, 3, 0.9
-#: most hypotheses, and confidence at which it stops.
 HYPOTHESES, CONFIDENCE = 100_000, 0.999
-#: Of FGR: farthest correspondence, metres: half a voxel, as in its authors' example.
+#: Parameter of FGR: maximum distance of a correspondence, half a voxel as in its authors' example,
+#: metres.
 FGR_CORRESPONDENCE = 0.025
-#: Of ICP, point to plane: voxel of both clouds, and farthest correspondence, metres.
+#: Parameters of point-to-plane ICP: voxel of both clouds, and maximum distance of a correspondence,
+#: metres.
 ICP_VOXEL, ICP_CORRESPONDENCE = 0.02, 0.05
 #: The methods in the order of the tables.
 METHODS = ("FPFH + RANSAC", "FPFH + FGR")
-#: Fewer points than this in the thinned cloud are not registered.
+#: Minimum number of points of a thinned cloud that is registered.
 _FEWEST = 10
 
 
 class Clock:
-    """Milliseconds by stage."""
+    """A clock of milliseconds by stage."""
 
     def __init__(self) -> None:
         self.stages: dict[str, float] = {}
 
     def run(self, stage: str, call: Callable[[], T]) -> T:
-        """Time one call and add it to its stage."""
+        """Return the result of a call, and add its time to a stage."""
         start = time.perf_counter()
         result = call()
         self.stages[stage] = self.stages.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
@@ -247,8 +249,8 @@ class Attempt:
     Parameters
     ----------
     start : (4, 4) T_match_query before ICP
-    refined : (4, 4) after ICP
-    stages : milliseconds; those of features on both frames
+    refined : (4, 4) T_match_query after ICP
+    stages : milliseconds by stage, with the features of both frames
     """
 
     start: Floats
@@ -257,7 +259,7 @@ class Attempt:
 
     @property
     def milliseconds(self) -> float:
-        """Return the sum of all stages."""
+        """Return the total of all stages."""
         return sum(self.stages.values())
 
 
@@ -270,17 +272,17 @@ def register(
     query: Floats, match: Floats, o3d: Any, methods: Sequence[str] = METHODS, *, seed: int = 0,
     scale: float = 1.0,
 ) -> dict[str, Attempt]:  # fmt: skip
-    """Register a pair of clouds by each method; return nothing if one of them is next to empty.
+    """Register a pair of clouds by each method; return {} if one of them is almost empty.
 
-    Features are computed once, and counted for each method.
+    Features are computed once, but count for each method.
 
     Parameters
     ----------
     query, match : (N, 3) metres
-    o3d : of `open3d`
-    methods : of METHODS
-    seed : of the random choices
-    scale : that all lengths are multiplied by: 1 for rooms
+    o3d : result of `open3d`
+    methods : members of METHODS
+    seed : seed of the random choices
+    scale : factor of all lengths; 1 for rooms
     """
     o3r, shared = o3d.pipelines.registration, Clock()
 
@@ -316,7 +318,7 @@ def register(
         return o3r.registration_fgr_based_on_feature_matching(*thin, *features, option)
 
     def icp(start: Floats) -> Any:
-        # the finer clouds, and normals, are its own
+        # ICP uses finer clouds and other normals than the features
         fine = [c.voxel_down_sample(scale * ICP_VOXEL) for c in clouds]
         fine[1].estimate_normals(search(*NORMALS))
         return o3r.registration_icp(
@@ -341,8 +343,8 @@ class Other:
 
     Parameters
     ----------
-    start, icp, ours : errors: as found; after its own ICP; after our refinement in its place
-    milliseconds : features of both frames, search and its own ICP
+    start, icp, ours : errors before refinement, after the baseline's ICP, and after our refinement
+    milliseconds : time for the features of both frames, the search and the baseline's ICP
     """
 
     start: Error
@@ -353,15 +355,15 @@ class Other:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A pair that was validated.
+    """A sampled pair with its validation.
 
     Parameters
     ----------
-    drawn : see Drawn
-    pair : see ValidatedPair; with `bound` where the two overlap
-    others : by method; None without baselines, or if the two do not overlap; empty if there are
-        too few points for any
-    milliseconds : beside others: of ours, with the features of both frames; else None
+    drawn : sampled pair
+    pair : validated pair, with `bound` if the frames overlap
+    others : results of the baselines by method; empty if there are too few points; None without
+        baselines or overlap
+    milliseconds : time of our method, with the features of both frames; None without `others`
     """
 
     drawn: Drawn
@@ -372,15 +374,15 @@ class Tried:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What a process needs to try pairs.
+    """The data and parameters with which a process evaluates pairs.
 
     Parameters
     ----------
     judging : see Judge
-    store : of the frames
-    model : for baselines: with the parameters of ours
-    limits : metres and degrees to which a transform is to be right
-    o3d : Open3D, or None without baselines
+    store : store of the frames
+    model : model, whose parameters the baselines use
+    limits : maximum error of a right transform, metres and degrees
+    o3d : Open3D; None without baselines
     """
 
     judging: Judge
@@ -394,14 +396,14 @@ def open_bench(
     store: FrameStore, model: Model, mode: Mode, seed: int, limits: tuple[float, float], *,
     baselines: bool, matching: Matching = "histograms",
 ) -> Bench:  # fmt: skip
-    """Return what is needed to try pairs of the frames of a store."""
+    """Return a bench for pairs of the frames of a store."""
     o3d = open3d("A baseline of registration") if baselines else None
     judging = open_judge(store, mode, seed, model.parameters.validation, matching)
     return Bench(judging, store, model, limits, o3d)
 
 
 def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried:
-    """Validate a pair; if the two overlap, compute the bound and run the baselines too."""
+    """Validate a pair; if the frames overlap, compute the bound and run the baselines too."""
     drawn, query, match = task
     candidate = Candidate.of(match, drawn.match, drawn.overlap_mean, drawn.overlap_least)
     asked = QueryTask(query.number, query.scene, query.pose, [], [], (candidate,))
@@ -420,7 +422,7 @@ def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried
 def _others(
     bench: Bench, query: AnyFrame, match: AnyFrame, true: Floats
 ) -> tuple[dict[str, Other], float]:
-    """Return the results of the baselines, and the milliseconds of our geometry of both frames."""
+    """Return the results of the baselines, and the time for our geometry of both frames."""
     p = bench.model.parameters
     start = time.perf_counter()
     ours, its = (geometry_of(see(frame, p), bench.model) for frame in (query, match))
@@ -440,12 +442,12 @@ def _others(
 
 
 def scale_of(p: ModelParameters) -> float:
-    """Return how much longer the lengths of a model are than those for rooms, by its radius."""
+    """Return the ratio of a model's radius to the radius for rooms."""
     return p.properties.radius / PropertyParameters().radius
 
 
 def peer_points(frame: AnyFrame, model: Model) -> Floats:
-    """Return the points for baselines: all, of a depth image those within the model's range."""
+    """Return the points for baselines: all points, or those of a depth image within the range."""
     if isinstance(frame, Cloud):
         return frame.points.astype(np.float64)
     p = model.parameters.depth
@@ -455,7 +457,7 @@ def peer_points(frame: AnyFrame, model: Model) -> Floats:
 def refined_by_us(
     query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
 ) -> Floats | None:
-    """Return our refinement of another's transform, with wide gates first as for our hypotheses."""
+    """Return our refinement of a baseline's transform, which starts with wide gates."""
     coarse = refine_all(query.surface, match.surface, T[None], p.coarse)
     return refine_transform(query, match, coarse[0] if len(coarse) else T, p.fine)
 
@@ -470,14 +472,13 @@ class PairSettings:
 
     Parameters
     ----------
-    drawing : see Drawing
-    frames : of each scene, evenly spread over its recordings, at most
-    mode, matching : of validation
-    seed : of every pair that is validated
-    limits : metres and degrees to which a transform is to be right
-    baselines : whether overlapping pairs are registered by Open3D as well
-    jobs : processes; no figure but times depends on it
-    cache_dir : of derived files of the model; None for the user's
+    drawing : parameters of the sample
+    frames : maximum number of frames per scene, evenly spaced over its recordings
+    mode, matching, seed : arguments of `validate`
+    limits : maximum error of a right transform, metres and degrees
+    baselines : whether Open3D registers overlapping pairs too
+    jobs : number of processes, on which only times depend
+    cache_dir : folder of derived files of the model; None selects the user's cache folder
     """
 
     drawing: Drawing = field(default_factory=Drawing)
@@ -497,13 +498,13 @@ class PairEvaluation:
 
     Parameters
     ----------
-    members : N frames that can be used, without their signatures
-    limits : metres and degrees to which a transform was to be right
-    acceptance, map : the numbers of the model's
-    planes : (N,) share of each one's samples in its largest plane
-    tried : in the order drawn
-    left_out : (name, reason) of other frames
-    prepare_ms : median time to sign a frame and work out its geometry
+    members : N usable frames, without their signatures
+    limits : maximum error of a right transform, metres and degrees
+    acceptance, map : parameters of the model
+    planes : (N,) share of each frame's samples in its largest plane
+    tried : results in the order of the sample
+    left_out : (name, reason) of unusable frames
+    prepare_ms : median time to sign a frame and compute its geometry, milliseconds
     """
 
     members: list[SignedFrame]
@@ -520,23 +521,23 @@ def evaluate_pairs(
     paths: Sequence[Path], signer: Signer, store: FrameStore, settings: PairSettings,
     watch: Watch = unwatched,
 ) -> PairEvaluation:  # fmt: skip
-    """Draw pairs by true overlap, validate each, and judge it by the true poses.
+    """Sample pairs by true overlap, validate them, and compute their errors.
 
     Parameters
     ----------
-    paths : of sequences with poses; frames of two scenes are negatives of each other
-    signer : see `open_signer`
-    store : empty
-    settings : see PairSettings
-    watch : follows the steps of every stage
+    paths : paths of sequences with poses; frames of different scenes are negatives
+    signer : result of `open_signer`
+    store : empty store
+    settings : settings of the evaluation
+    watch : callback for progress
 
     Raises
     ------
-    DatasetError : no two frames can be used, or none make a pair.
-    MissingDependency : baselines need Open3D, which cannot be imported.
+    DatasetError : If no two frames can be used, or none make a pair.
+    MissingDependency : If baselines need Open3D, which cannot be imported.
     """
     if settings.baselines:
-        # before the frames are read: a missing library must not cost that
+        # detect a missing library before frames are read
         open3d("A baseline of registration")
     placed = spread(every_frame(paths), settings.frames)
     chosen = tuple(one for one, _ in placed)
@@ -555,8 +556,8 @@ def evaluate_pairs(
     drawn = draw(places, truth, planes >= PLANAR, settings.drawing)
     if not drawn:
         raise DatasetError(
-            f"Of {len(members)} frames no two overlap by a tenth or see nothing of each other, "
-            f"{settings.drawing.apart} places apart. Give more recordings, or a smaller --apart."
+            f"None of the pairs of {len(members)} frames at least {settings.drawing.apart} frames "
+            "apart overlaps by a tenth or not at all. Specify more recordings or a smaller --apart."
         )
     tasks = [(one, members[one.query], members[one.match]) for one in drawn]
     opening = partial(
@@ -572,7 +573,7 @@ def evaluate_pairs(
 
 
 def spread(chosen: Sequence[ProtocolFrame], most: int) -> list[tuple[ProtocolFrame, FrameOrigin]]:
-    """Return at most so many frames of each scene, evenly spread, and their origins."""
+    """Return at most `most` evenly spaced frames of each scene, and their origins."""
     counts: Counter[tuple[str, str]] = Counter()
     of: dict[str, list[tuple[ProtocolFrame, FrameOrigin]]] = {}
     for one in chosen:
@@ -590,11 +591,11 @@ def spread(chosen: Sequence[ProtocolFrame], most: int) -> list[tuple[ProtocolFra
 def _too_few(prepared: Prepared) -> str:
     usable = len(prepared.queries)
     if not prepared.left_out:
-        return f"There is {usable} frame, and a pair has two. Give more recordings."
+        return f"There is {usable} frame, but a pair requires two. Specify more recordings."
     name, reason = prepared.left_out[0]
     return (
-        f"{usable or 'No'} frame can be used, and a pair has two. The first that was left out is "
-        f"{name}: {reason.rstrip('.')}. Choose other recordings."
+        f"{usable or 'No'} frame is usable, but a pair requires two. The first omitted frame is "
+        f"{name}: {reason.rstrip('.')}. Specify other recordings."
     )
 
 
@@ -608,7 +609,7 @@ def _same(*opened: Any) -> tuple[Any, ...]:
 
 
 def _overlaps(members: Sequence[SignedFrame], store: FrameStore, watch: Watch) -> Overlaps:
-    """Return overlap of all with all; 0 between scenes."""
+    """Return the overlaps of all pairs of frames; 0 between scenes."""
     shape = len(members), len(members)
     mean, least = np.zeros(shape), np.zeros(shape)
     for scene in dict.fromkeys(member.scene for member in members):

@@ -1,6 +1,6 @@
-"""Read, sign and store the frames of an evaluation, for every later stage to take what it needs.
+"""The frames of an evaluation: selection, signatures, stored data, and overlaps.
 
-Protocol  --prepare_all-->  Member, ... and what could not be used; depth and geometry in a Store
+Protocol  --prepare_all-->  Prepared; depth and geometry in a FrameStore
 """
 
 from __future__ import annotations
@@ -52,28 +52,28 @@ from sceneprint.types import (
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-# What an evaluation remembers of a query: plain data, from which every figure is worked out.
+# The results of queries, from which all figures are computed.
 
-#: Views of a query that are averaged, counted and drawn.
+#: Number of views of a query that are averaged, counted and drawn.
 VIEWS = 5
-#: A transform between rooms' frames is right within these metres and degrees.
+#: Maximum error of a right transform between frames of rooms, metres and degrees.
 RIGHT = (0.10, 10.0)
-#: A candidate pose is of the right place within the model's distance between places, and these
-#: degrees.
+#: Maximum rotational error of a pose at the right place, degrees. The maximum translational error
+#: is the model's distance between places.
 PLACE_DEG = 10.0
-#: An answer beyond these is another place, not an inaccurate one.
+#: Errors above which an answer is another place, metres and degrees.
 GROSS = (0.50, 15.0)
 
 
 @dataclass(frozen=True, eq=False)
 class SignedFrame:
-    """A frame that takes part and could be signed.
+    """A signed frame of an evaluation.
 
     Parameters
     ----------
-    number : of its files in the store
-    name : unique in the evaluation
-    scene : its parent frame
+    number : number of the frame in the store
+    name : name, unique in the evaluation
+    scene : parent frame
     pose : (4, 4) T_parent_sensor
     signature : (n,) uint8
     """
@@ -87,31 +87,31 @@ class SignedFrame:
 
 @dataclass(frozen=True)
 class Error:
-    """How far an estimated pose lies from the true one; infinite where there is none."""
+    """The error of an estimated pose; infinite without an estimate."""
 
     metres: float = math.inf
     radians: float = math.inf
 
     def within(self, metres: float, degrees: float) -> bool:
-        """Return whether both parts are at most these."""
+        """Return whether both parts are within limits."""
         return self.metres <= metres and self.radians <= math.radians(degrees)
 
 
 @dataclass(frozen=True, eq=False)
 class ValidatedPair:
-    """A query validated against a database frame.
+    """The validation of a query against a database frame.
 
     Parameters
     ----------
     match : index of the database frame
-    scene : of the database frame
-    validation : what came of it
-    same_scene : whether the match has the query's parent frame
-    error : of T_match_query; infinite for another scene
-    bound : error of refinement started at the true pose; None where it was not asked for
-    overlap_mean, overlap_least : as in `Overlaps`; 0 for another scene
-    milliseconds : that validation took
-    limits : metres and degrees to which its transform is to be right
+    scene : scene of the database frame
+    validation : result of the validation
+    same_scene : whether the match is in the query's scene
+    error : error of T_match_query; infinite for another scene
+    bound : error of refinement from the reference pose; None unless computed
+    overlap_mean, overlap_least : see Overlaps; 0 for another scene
+    milliseconds : time of the validation
+    limits : maximum error of a right transform, metres and degrees
     """
 
     match: int
@@ -132,20 +132,20 @@ class ValidatedPair:
 
     @property
     def right(self) -> bool:
-        """Return whether the transform is right to its limits, accepted or not."""
+        """Return whether the transform is right within `limits`, accepted or not."""
         return self.error.within(*self.limits)
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedPlace:
-    """A candidate pose of a query, and how far off it is.
+    """A candidate pose of a query, and its error.
 
     Parameters
     ----------
-    evidence : for the pose
-    confidence : computed from it
-    error : of the pose; infinite in another parent frame
-    right : whether it is near enough to the true one to be of its place
+    evidence : evidence for the pose
+    confidence : confidence of the pose
+    error : error of the pose; infinite in another parent frame
+    right : whether the pose is at the right place
     """
 
     evidence: PlaceEvidence
@@ -162,10 +162,10 @@ class JudgedAnswer:
     ----------
     status : "found", "ambiguous" or "not_found"
     strength : "strong" or "weak"; None unless found
-    error : of the pose in the map; infinite without one, and in another parent frame
-    milliseconds : that the answer took, from R on
-    places : that the answer was chosen from, the likeliest first
-    limits : metres and degrees to which a pose is to be right; those of a depth camera by default
+    error : error of the pose in the map; infinite without a pose or in another parent frame
+    milliseconds : time of the answer, after R
+    places : candidate places, the most likely first
+    limits : maximum error of a right pose, metres and degrees; by default that of a depth camera
     """
 
     status: LocalizationStatus = "not_found"
@@ -177,35 +177,35 @@ class JudgedAnswer:
 
     @property
     def right(self) -> bool:
-        """Return whether it is found within its limits, 10 cm and 10 degrees by default."""
+        """Return whether the pose is found within `limits`."""
         return self.status == "found" and self.error.within(*self.limits)
 
     @property
     def grossly_wrong(self) -> bool:
-        """Return whether it is found beyond 50 cm or 15 degrees, or other limits in proportion."""
+        """Return whether the pose is found, but the error exceeds GROSS, scaled as `limits`."""
         gross = [g * limit / r for g, limit, r in zip(GROSS, self.limits, RIGHT, strict=True)]
         return self.status == "found" and not self.error.within(*gross)
 
 
 @dataclass(frozen=True, eq=False)
 class QueryOutcome:
-    """All that is known of a query when the evaluation is done.
+    """The results of a query.
 
     Parameters
     ----------
-    name, scene, pose : of the query
-    allowed : (A,) rising indices of the database frames that it may find
-    present : whether one of them is of the query's scene
-    overlap_mean, overlap_least : (A,) with those, as in `Overlaps`
+    name, scene, pose : name, scene and pose of the query
+    allowed : (A,) ascending indices of the database frames that the query may find
+    present : whether one of them is in the query's scene
+    overlap_mean, overlap_least : (A,) overlaps with these frames; see Overlaps
     ranking : R, indices of database frames, nearest first
-    distances : (|R|,) of the ranking, as of `cross_distances`
+    distances : (|R|,) distances of R; see `cross_distances`
     selection : C, in the order of R
-    pairs : by index of the database frame: the first of R and all of C
-    candidates : how many of R were validated
-    average, average_of_ranking : errors of the pose averaged over accepted views of C and of R
-    average_bound : error of the average of the same views of C, each refined from the true pose
-    milliseconds : of ranking, of the selection, of averaging
-    answer : the whole answer; see `answer_of`
+    pairs : validated pairs of the first members of R and all of C, by index of the database frame
+    candidates : number of members of R that were validated
+    average, average_of_ranking : errors of the average pose over accepted views of C and of R
+    average_bound : error of the average over the same views of C, refined from the reference pose
+    milliseconds : times of ranking, selection and averaging
+    answer : complete answer; see `answer_of`
     """
 
     name: str
@@ -231,11 +231,11 @@ class QueryOutcome:
         return float(self.overlap_mean[np.searchsorted(self.allowed, match)])
 
     def views(self, of: str) -> list[ValidatedPair]:
-        """Return the pairs of a row in the order in which it answers with them.
+        """Return the pairs of a row of the table in its order.
 
         Parameters
         ----------
-        of : "R" and "DR": as ranked, accepted or not; "VR" and "VDR": accepted ones, strong
+        of : "R" and "DR" for all pairs in the order of R; "VR" and "VDR" for accepted pairs, strong
             before weak
         """
         first = self.ranking[: self.candidates] if of in ("R", "VR") else self.selection
@@ -243,44 +243,44 @@ class QueryOutcome:
         return pairs if of in ("R", "DR") else in_preferred_order(pairs)
 
     def tried(self) -> list[ValidatedPair]:
-        """Return all pairs of C in the order of `associate`: VDR's views, then the others."""
+        """Return all pairs of C in the order of `associate`: the views of VDR, then other pairs."""
         first = self.views("VDR")
         return first + [pair for pair in self.views("DR") if not pair.accepted]
 
 
 def in_preferred_order(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
-    """Return accepted pairs, strong ones first: the order in which they are believed."""
+    """Return the accepted pairs, strong pairs first."""
     return [pairs[i] for i in rank_accepted([pair.validation for pair in pairs])]
 
 
 def pose_error(T: Floats, truth: Floats) -> Error:
-    """Return the difference of two (4, 4) rigid transforms between the same two frames."""
+    """Return the difference between two rigid transforms (4, 4) of the same frames."""
     return Error(*pose_difference(T, truth))
 
 
-# How much two frames with known poses see of each other: the ground truth of retrieval.
+# The overlap of frames by their reference poses, which defines correct retrieval.
 #
 # Frame or Cloud  --view_of-->  AnyView        queries, database  --overlaps-->  Overlaps
 
 #: Spacing of the samples that are looked up in the other frame, pixels.
 GRID = 20
-#: Two depths agree within this, metres, plus this share of the depth.
+#: Tolerance of depths for retrieval, metres plus a share of the depth.
 TOLERANCE, RELATIVE_TOLERANCE = 0.05, 0.03
-#: Two depths of a pair agree within this, metres: the measure that sorts pairs into bins.
+#: Tolerance of depths for pairs, metres, by which they are sorted into bins.
 PAIR_TOLERANCE = 0.10
-#: Points of a cloud that are looked up in the other frame, and that are looked among, at most.
+#: Maximum numbers of points of a cloud that are looked up, and among which points are looked up.
 SAMPLES, POINTS = 2_000, 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class OverlapView:
-    """What overlap reads of a frame.
+    """The data of a depth image from which overlaps are computed.
 
     Parameters
     ----------
-    samples : (N, 3) metres, valid depth samples of a grid, in the parent frame
-    depth : (H, W) float32, metres; 0 where missing
-    intrinsics : of the depth image
+    samples : (N, 3) valid samples of a grid in the parent frame, metres
+    depth : (H, W) float32, metres; 0 if missing
+    intrinsics : intrinsics of the depth image
     pose : (4, 4) T_parent_sensor
     """
 
@@ -292,13 +292,13 @@ class OverlapView:
 
 @dataclass(frozen=True, eq=False)
 class CloudView:
-    """What overlap reads of a cloud.
+    """The data of a cloud from which overlaps are computed.
 
     Parameters
     ----------
-    samples : (N, 3) metres, points of the cloud, in the parent frame
-    points : (M, 3) of the parent frame, to find the nearest
-    viewpoint : (3,) in the parent frame; None where there is none
+    samples : (N, 3) points that are looked up, in the parent frame, metres
+    points : (M, 3) points among which points are looked up, in the parent frame, metres
+    viewpoint : (3,) viewpoint in the parent frame; None without a viewpoint
     """
 
     samples: Floats
@@ -311,16 +311,16 @@ AnyView = OverlapView | CloudView
 
 @dataclass(frozen=True, eq=False)
 class Overlaps:
-    """Overlap of queries with database frames, by its two definitions.
+    """The overlaps of queries with database frames, by two definitions.
 
     Parameters
     ----------
-    mean : (Q, N) of retrieval: mean over both directions of the share of samples that the other
-        frame sees within 5 cm + 3 % of the depth
-    least : (Q, N) of pairs: the smaller direction, agreement within 10 cm
+    mean : (Q, N) for retrieval: share of samples that the other frame sees within 5 cm + 3 % of the
+        depth, averaged over both directions
+    least : (Q, N) for pairs: the same share within 10 cm, in the smaller direction
 
-    A cloud sees a sample that has one of its points as near. As its points thin out with range,
-    10 cm + 3 % of the range from its viewpoint count there.
+    A cloud sees a sample if one of its points is within the tolerance, which is 10 cm + 3 % of the
+    range for retrieval, because the distance between points grows with range.
     """
 
     mean: Floats
@@ -328,16 +328,16 @@ class Overlaps:
 
 
 def points_at(frame: DepthFrame, y: NDArray[np.intp], x: NDArray[np.intp]) -> Floats:
-    """Return the points (..., 3) of some pixels of a depth image, metres, sensor frame."""
+    """Return the points (..., 3) of pixels of a depth image, metres, in the sensor's frame."""
     k, z = frame.intrinsics, frame.depth[y, x].astype(np.float64)
     points: Floats = np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=-1)
     return points
 
 
 def view_of(frame: AnyFrame) -> AnyView:
-    """Return what the overlap of a frame with a pose is computed from."""
+    """Return the data of a frame from which overlaps are computed."""
     if frame.pose is None:
-        raise ValueError(f"{frame.name} has no pose")
+        raise ValueError(f"{frame.name} has no pose. Pass frames with poses.")
     if isinstance(frame, Cloud):
         return _cloud_view(frame, frame.pose)
     k = frame.intrinsics
@@ -359,7 +359,7 @@ def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
 
 @kernel
 def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int, int]:
-    """Count the points of the parent frame that a frame sees where they are: both tolerances."""
+    """Return the numbers of points that a depth image sees, by both tolerances."""
     height, width = depth.shape
     loose = strict = 0
     for i in range(len(points)):
@@ -379,7 +379,7 @@ def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int
 
 
 def _near(points: Floats, cloud: CloudView) -> tuple[int, int]:
-    """Return of points in the parent frame, those that a cloud has a point at: both tolerances."""
+    """Return the numbers of points that a cloud sees, by both tolerances."""
     wide = np.zeros(len(points))
     if cloud.viewpoint is not None:
         wide = RELATIVE_TOLERANCE * np.linalg.norm(points - cloud.viewpoint, axis=1)
@@ -400,37 +400,37 @@ def _shares(points: Floats, view: AnyView) -> tuple[float, float]:
 
 
 def overlap(a: AnyView, b: AnyView) -> tuple[float, float]:
-    """Return the overlap of two frames of one parent frame: (mean, least) as in `Overlaps`."""
+    """Return the overlap (mean, least) of two frames of one parent frame; see Overlaps."""
     there, back = _shares(a.samples, b), _shares(b.samples, a)
     return (there[0] + back[0]) / 2, min(there[1], back[1])
 
 
 def overlaps(queries: Sequence[AnyView], database: Sequence[AnyView]) -> Overlaps:
-    """Return the overlap of every query with every database frame of the same parent frame."""
+    """Return the overlaps of queries with database frames of the same parent frame."""
     shares = np.array([[overlap(q, d) for d in database] for q in queries], float)
     shares = shares.reshape(len(queries), len(database), 2)
     return Overlaps(shares[..., 0], shares[..., 1])
 
 
-# How far a sensor had come between two frames of one run.
+# The distance that a sensor travelled between two frames of a run.
 #
 # Member, ...  --travelled-->  metres of travel between each query and each database frame
 
 
 def travelled(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -> Floats:
-    """Return the metres of path from each database frame to each query.
+    """Return the length of the path from each database frame to each query.
 
-    The path leads through the frames of a run that take part, straight from each to the next:
-    with every tenth frame alone it is a little shorter than it was.
+    The path consists of straight lines between the frames of the evaluation, so it is slightly too
+    short if they are sparse.
 
     Parameters
     ----------
-    queries, database : frames; those of one run have one name up to the last slash, and lie in
-        the order of their names
+    queries, database : frames; names of one run are equal up to the last slash, and their order is
+        the order of time
 
     Returns
     -------
-    (Q, N) metres; below 0 where the database frame is the later one, infinite for another run
+    (Q, N) metres; negative if the database frame is later, infinite for another run
     """
     along = {name: place for run in _runs((*queries, *database)) for name, place in run.items()}
     of_queries, of_database = ([_run(m) for m in members] for members in (queries, database))
@@ -445,7 +445,7 @@ def _run(member: SignedFrame) -> str:
 
 
 def _runs(members: Sequence[SignedFrame]) -> list[dict[str, float]]:
-    """Return of each run, the place of each frame on its path, metres from the first."""
+    """Return, for each run, the path length from the first frame to each frame, metres."""
     runs: dict[str, dict[str, SignedFrame]] = {}
     for member in members:
         runs.setdefault(_run(member), {})[member.name] = member
@@ -458,7 +458,7 @@ def _runs(members: Sequence[SignedFrame]) -> list[dict[str, float]]:
     return placed
 
 
-# A map over tasks in this process or in several, with the same answers.
+# A map over tasks in one or several processes, with equal results.
 #
 # tasks  --map_over-->  results, in order
 
@@ -468,36 +468,36 @@ R = TypeVar("R")
 
 
 class Watch(Protocol):
-    """Shows how far a stage has come: passes on what it is given."""
+    """A callback for progress, which iterates over the items of a stage."""
 
     def __call__(self, items: Iterable[T], stage: str, total: int) -> Iterable[T]:
-        """Pass the items on, one by one."""
+        """Return an iterable of the items that shows progress."""
         ...
 
 
 def unwatched(items: Iterable[T], stage: str, total: int) -> Iterable[T]:  # noqa: ARG001
-    """Pass the items on and show nothing."""
+    """Return the items without showing progress."""
     return items
 
 
 def map_over(
     tasks: Sequence[T], do: Callable[[S, T], R], opening: Callable[[], S], jobs: int,
 ) -> Iterator[R]:  # fmt: skip
-    """Do every task with what `opening` returns, which each process calls once.
+    """Call `do` for all tasks with the result of `opening`, which each process calls once.
 
-    Each process holds its libraries to one thread: sums then have one order, and processes
-    do not compete.
+    Libraries are limited to one thread per process, so that the order of sums is fixed and
+    processes do not compete.
 
     Parameters
     ----------
-    tasks : picklable, as is what comes of them
-    do : a function of a module
-    opening : the same, or a partial of one
-    jobs : processes; 1 for this one alone
+    tasks : picklable tasks with picklable results
+    do : function of a module
+    opening : function of a module, or a partial of one
+    jobs : number of processes; 1 uses this process
 
     Yields
     ------
-    results : in the order of the tasks
+    results : results in the order of the tasks
     """
     from threadpoolctl import threadpool_limits
 
@@ -512,11 +512,11 @@ def map_over(
     with ProcessPoolExecutor(jobs, context, _start, (opening,)) as pool:
         try:
             yield from pool.map(partial(_call, do), tasks)
-        finally:  # stopped half way: what is not begun is not done
+        finally:  # cancel pending tasks if the iterator is abandoned
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-#: What this process opened, if it is one of several.
+#: Result of `opening` in a process of the pool.
 _opened: list[Any] = []
 
 
@@ -531,7 +531,7 @@ def _call(do: Callable[[Any, Any], Any], task: Any) -> Any:
     return do(_opened[0], task)
 
 
-# Which frames are the database and which the queries.
+# The selection of database frames and queries.
 #
 # PATH@db=0:600:2,queries=650:  --parse_part-->  Part  --choose-->  Protocol
 
@@ -543,7 +543,7 @@ _OWN_RANGES = re.compile(r"(.+)@((?:db|queries)=[^@]*)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Range:
-    """Frames start, start + step, ... before stop; None: from the first, to the last, not said."""
+    """The frames start, start + step, ... before stop; None means first, last and default."""
 
     start: int | None
     stop: int | None
@@ -559,12 +559,12 @@ Ranges = tuple[Range, ...]
 
 @dataclass(frozen=True)
 class PathRanges:
-    """A path and the ranges given for it alone; None where it was not said.
+    """A path and its ranges.
 
     Parameters
     ----------
-    path : of sequences
-    database, queries : ranges over the frames of all its sequences, in order
+    path : path of sequences
+    database, queries : ranges over the frames of all sequences, in order; None if unspecified
     """
 
     path: Path
@@ -574,14 +574,14 @@ class PathRanges:
 
 @dataclass(frozen=True, eq=False)
 class ProtocolFrame:
-    """A frame that takes part.
+    """A selected frame.
 
     Parameters
     ----------
-    name : unique in the protocol
-    scene : its parent frame; frames of one scene have comparable poses
-    use : database, query, or both: what it may find is then limited by the travel between
-    reference : where it is
+    name : name, unique in the protocol
+    scene : parent frame; poses of one scene are comparable
+    use : database, query, or both, in which case the distance travelled limits the allowed matches
+    reference : location of the frame
     """
 
     name: str
@@ -590,7 +590,7 @@ class ProtocolFrame:
     reference: FrameReference
 
     def is_for(self, use: Use) -> bool:
-        """Return whether the frame takes part as this."""
+        """Return whether the frame has a use."""
         return self.use in (use, "both")
 
 
@@ -600,8 +600,8 @@ class EvaluationProtocol:
 
     Parameters
     ----------
-    frames : database and queries, in the order given
-    split : whether they come from TrainSplit.txt and TestSplit.txt: the paper's 7-Scenes table
+    frames : database frames and queries, in the order of the arguments
+    split : whether TrainSplit.txt and TestSplit.txt select them, as for the paper's 7-Scenes table
     """
 
     frames: tuple[ProtocolFrame, ...]
@@ -613,31 +613,31 @@ def parse_ranges(text: str) -> Ranges:
 
     Raises
     ------
-    DatasetError : it is none of these, a range is empty, or its step is 0.
+    DatasetError : If the text does not consist of ranges, a range is empty, or its step is 0.
     """
     ranges = []
     for one in text.split("+"):
         match = _RANGE.fullmatch(one.strip())
         if match is None:
             raise DatasetError(
-                f"{text!r} is no range of frames. Write START:STOP or START:STOP:STEP, such as "
+                f"{text!r} is not a range of frames. Write START:STOP or START:STOP:STEP, such as "
                 "0:600:2, and join several with +, such as 0:25+50:75."
             )
         start, stop, step = (None if part is None else int(part) for part in match.groups())
         if step == 0 or (stop is not None and stop <= (start or 0)):
             raise DatasetError(
-                f"{text!r} holds no frame. STOP must exceed START, and STEP be 1 up."
+                f"{text!r} contains no frame. Use a STOP above START, and a STEP of at least 1."
             )
         ranges.append(Range(start, stop, step))
     return tuple(ranges)
 
 
 def parse_part(text: str) -> PathRanges:
-    """Parse PATH, or PATH@db=RANGES,queries=RANGES with either of the two.
+    """Parse PATH, or PATH@db=RANGES,queries=RANGES, in which one of the two is optional.
 
     Raises
     ------
-    DatasetError : what follows the @ is not of this form.
+    DatasetError : If the part after the @ does not have this form.
     """
     match = _OWN_RANGES.fullmatch(text)
     if match is None:
@@ -647,7 +647,7 @@ def parse_part(text: str) -> PathRanges:
         key, _, ranges = one.partition("=")
         if key not in ("db", "queries") or key in own:
             raise DatasetError(
-                f"{text}: {one!r} is not understood. Write PATH@db=0:600:2,queries=650:1000:2."
+                f"{text}: {one!r} is invalid. Write PATH@db=0:600:2,queries=650:1000:2."
             )
         own[key] = parse_ranges(ranges)
     return PathRanges(Path(match[1]), own.get("db"), own.get("queries"))
@@ -659,24 +659,24 @@ def choose(
     query_step: int = 1, shared: bool = False,
     find: Callable[[Path], tuple[Run, ...]] = find_sequences,
 ) -> EvaluationProtocol:  # fmt: skip
-    """Return assign the frames of each path to the database or the queries; no frame is read.
+    """Assign the frames of paths to the database or the queries, without reading frames.
 
-    A path's own ranges go before `database` and `queries`, and these before the split files of
-    its scenes.
+    The ranges of a path have precedence over `database` and `queries`, and these over the split
+    files of its scenes.
 
     Parameters
     ----------
-    parts : paths, with ranges of their own or without
-    distractors : paths of which every frame is in the database
-    database, queries : for paths without ranges of their own
-    database_step, query_step : take every so manieth frame, where a range says no step itself
-    shared : a frame may be both, and paths without ranges are, as a whole, both
-    find : what finds the sequences of a path; asked once for each
+    parts : paths with optional ranges
+    distractors : paths whose frames all belong to the database
+    database, queries : ranges for paths without ranges
+    database_step, query_step : steps for ranges without a step
+    shared : whether frames may have both uses, which frames of paths without ranges then have
+    find : function that returns the sequences of a path; it is called once per path
 
     Raises
     ------
-    DatasetError : nothing says what is database and what query, a range lies outside its path,
-        a frame is chosen twice, two scenes have one name, or there is no query.
+    DatasetError : If the use of a path's frames is unspecified, a range lies outside its path, a
+        frame is selected twice, two scenes have the same name, or there is no query.
     """
     gathered = _Gathered(shared=shared, find=find)
     every = (Range(None, None, None),)
@@ -703,24 +703,24 @@ def choose(
     for use, option in wanted:
         if not any(frame.is_for(use) for frame in frames):
             raise DatasetError(
-                f"No frame is chosen as {use}, so there is nothing to measure. Add {option}."
+                f"No frame is selected as {use}, so nothing can be measured. Add {option}."
             )
     return EvaluationProtocol(frames, all(splits))
 
 
 def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
-    """Return all frames of all paths, in order, each as a query; no frame is read.
+    """Return all frames of all paths in order, as queries, without reading frames.
 
     Raises
     ------
-    DatasetError : a frame is there twice, or two scenes have one name.
+    DatasetError : If a frame occurs twice, or two scenes have the same name.
     """
     places = [path.resolve() for path in paths]
     for i, place in enumerate(places):
         for j in range(i):
             if place.is_relative_to(places[j]) or places[j].is_relative_to(place):
                 raise DatasetError(
-                    f"{paths[i]}: Its frames are those of {paths[j]} too. Give each path once."
+                    f"{paths[i]}: the path has the frames of {paths[j]}. Specify each path once."
                 )
     gathered = _Gathered()
     for path in paths:
@@ -729,7 +729,7 @@ def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
 
 
 class _Gathered:
-    """Frames so far, by the file they are in."""
+    """The selected frames, by file."""
 
     def __init__(
         self, *, shared: bool = False,
@@ -745,9 +745,9 @@ class _Gathered:
         sequences = self._find(path)
         if not any(s.split for s in sequences):
             raise DatasetError(
-                f"{path}: Nothing says which frames are the database and which the queries. "
-                "Give --db and --queries, such as --db 0:600 --queries 650:1000, or put "
-                "TrainSplit.txt and TestSplit.txt beside the sequences."
+                f"{path}: the database and the queries are not specified. Add --db and --queries, "
+                "such as --db 0:600 --queries 650:1000, or put TrainSplit.txt and TestSplit.txt "
+                "beside the sequences."
             )
         for scene in dict.fromkeys(s.parent_frame for s in sequences):
             own = [s for s in sequences if s.parent_frame == scene]
@@ -761,8 +761,8 @@ class _Gathered:
         for one in ranges:
             if (one.start or 0) >= len(every) or (one.stop or 0) > len(every):
                 raise DatasetError(
-                    f"{path}: The range {one} lies outside its {len(every)} frames. "
-                    f"Choose from 0:{len(every)}."
+                    f"{path}: the range {one} lies outside the {len(every)} frames. Select a range "
+                    f"within 0:{len(every)}."
                 )
             self._add(path, every[one.start : one.stop : one.step or step], use)
 
@@ -771,7 +771,7 @@ class _Gathered:
             scene, file, place = run.parent_frame, reference.path.resolve(), run.place
             if self._places.setdefault(scene, place.resolve()) != place.resolve():
                 raise DatasetError(
-                    f"{path}: Another scene is called {scene} too, {self._places[scene]}. "
+                    f"{path}: another scene, {self._places[scene]}, has the name {scene} too. "
                     "Rename one of the folders."
                 )
             known = self.frames.get(file)
@@ -780,24 +780,24 @@ class _Gathered:
                 continue
             if known is not None:
                 raise DatasetError(
-                    f"{path}: {reference.name} is chosen twice, as {known.use} and as "
-                    f"{use}. A frame must not be asked for itself: give ranges that do not meet."
+                    f"{path}: {reference.name} is selected twice, as {known.use} and as {use}, but "
+                    "a query must not find itself. Specify ranges that do not overlap."
                 )
             own = reference.name.startswith(f"{scene}/")
             name = reference.name if own else f"{scene}/{reference.name}"
             if name in self._names:
-                raise DatasetError(f"{path}: Two frames are called {name}. Rename one of them.")
+                raise DatasetError(f"{path}: two frames have the name {name}. Rename one of them.")
             self._names.add(name)
             self.frames[file] = ProtocolFrame(name, scene, use, reference)
 
 
 @dataclass(frozen=True)
 class FrameStore:
-    """A folder with what is too large to hold: depth and geometry of every frame by its number.
+    """A folder with depth and geometry of frames by number, which would exceed the memory.
 
     Parameters
     ----------
-    folder : of the files; whoever made it removes it
+    folder : folder of the files, which the caller removes
     """
 
     folder: Path
@@ -825,20 +825,20 @@ class FrameStore:
         return DepthFrame(depth, camera, member.name, member.pose)
 
     def geometry(self, number: int) -> Geometry:
-        """Read the geometry of a frame, as a service would load it."""
+        """Read the geometry of a frame as a service does."""
         return read_geometry((self.folder / f"{number}.geometry").read_bytes())
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """The frames that can be used, and why others cannot.
+    """The usable frames, and the reasons why others are unusable.
 
     Parameters
     ----------
-    queries, database : in the order of the protocol
-    left_out : (name, reason) of the others
-    milliseconds : median time to sign a frame and work out its geometry; None without frames
-    validation, metric, answer, unrelated_distance : of the model
+    queries, database : frames in the order of the protocol
+    left_out : (name, reason) of unusable frames
+    milliseconds : median time to sign a frame and compute its geometry; None without frames
+    validation, metric, answer, unrelated_distance : parameters of the model
     """
 
     queries: list[SignedFrame]
@@ -871,25 +871,25 @@ def prepare_all(
     levels: int | None = None, jobs: int = 1, cache_dir: Path | None = None,
     watch: Watch = unwatched,
 ) -> Prepared:  # fmt: skip
-    """Read, sign and store every frame.
+    """Read, sign and store all frames.
 
-    A frame without a pose cannot be judged, and is left out; but a database frame of a scene
-    that no query is of needs none, as it is wrong wherever it lies.
+    Frames without a pose are omitted, because their errors are unknown, except database frames of
+    scenes without queries, which are always wrong.
 
     Parameters
     ----------
-    chosen : see Protocol
-    signer : see `open_signer`
-    store : an empty one
-    levels : how many levels of psi to keep, finest first; None for all, or what is stored
-    jobs : processes
-    cache_dir : of derived files of the model
-    watch : told of each frame
+    chosen : frames of a protocol
+    signer : result of `open_signer`
+    store : empty store
+    levels : number of levels of psi, finest first; None selects all levels, or stored signatures
+    jobs : number of processes
+    cache_dir : folder of derived files of the model
+    watch : callback for progress
     """
     scenes = {one.scene for one in chosen if one.is_for("query")}
     length = signer.model.level_length * levels if levels else None
     tasks = [_Task(i, one, one.scene in scenes, length) for i, one in enumerate(chosen)]
-    # a process of its own opens the model itself: a table is too large to send
+    # other processes open the model, because its table is too large to send
     own = signer if jobs == 1 else signer.model
     results = map_over(tasks, _prepare, partial(_open, own, cache_dir, store), jobs)
     by_use: dict[str, list[SignedFrame]] = {"query": [], "database": []}
@@ -921,7 +921,7 @@ def _prepare(opened: tuple[Signer, FrameStore], task: _Task) -> _Done:
     try:
         frame = task.chosen.reference.read()
         if frame.pose is None and task.judged:
-            return _Done(None, "no pose is known, so nothing can be judged by it", 0.0)
+            return _Done(None, "its pose is unknown, so no error can be computed", 0.0)
         start = time.perf_counter()
         signature, geometry = prepare(replace(frame, name=task.chosen.name), signer)
         spent = 1e3 * (time.perf_counter() - start)
@@ -929,7 +929,7 @@ def _prepare(opened: tuple[Signer, FrameStore], task: _Task) -> _Done:
         return _Done(None, str(error), 0.0)
     store.keep(task.number, frame, geometry)
     vector: Bytes = signature.vector[: task.length]
-    # of a distractor without a pose only this is known: no other frame can be placed by it
+    # a distractor without a pose gets a separate scene
     scene = task.chosen.name if frame.pose is None else task.chosen.scene
     pose = np.eye(4) if frame.pose is None else frame.pose
     return _Done(SignedFrame(task.number, task.chosen.name, scene, pose, vector), "", spent)

@@ -1,4 +1,4 @@
-"""Report an evaluation: its figures as JSON, and as lines to read in a terminal.
+"""Reports of evaluations, as JSON and as text for a terminal.
 
 Evaluation  --figures-->  dict  --to_json-->  bytes        dict  --table-->  lines
 """
@@ -39,8 +39,8 @@ from sceneprint_lab.evaluation.run import Evaluation
 def recalls(evaluation: Evaluation) -> dict[str, Any]:
     """Return the recall of R, of C, and of a random frame; see `recall`.
 
-    `within_m`: a frame is the query's place if it was taken within so many metres; null: if the two
-    overlap by half.
+    `within_m` is the maximum distance in metres of a frame that shows the query's place; null
+    means that such frames overlap the query by half.
     """
     relevant, allowed = evaluation.relevant, evaluation.allowed
     good, n = (relevant & allowed).sum(axis=1), allowed.sum(axis=1)
@@ -54,11 +54,11 @@ def recalls(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
-    """Return the figures of each baseline by its name: those of R, by its ranking.
+    """Return the figures of each baseline by name: the figures of R for its ranking.
 
-    `milliseconds`: see Compared. `ratio`: the time to describe a query and to rank the database for
-    it, over the same by the signature. `reason`: why the baseline cannot be used; it has no figures
-    then.
+    `milliseconds`: see Compared. `ratio`: time to describe a query and to rank the database,
+    divided by the same time for the signature. `reason`: reason why the baseline cannot be used and
+    has no figures.
     """
     outcomes = evaluation.outcomes
     ours = float(np.median([o.milliseconds["rank"] for o in outcomes]))
@@ -85,7 +85,7 @@ def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
 
 @dataclass(frozen=True, eq=False)
 class FramePlace:
-    """Where a frame was taken: T_parent_sensor (4, 4), in a parent frame."""
+    """The pose T_parent_sensor (4, 4) of a frame, and its parent frame."""
 
     parent: str
     pose: Floats
@@ -93,13 +93,13 @@ class FramePlace:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """How far off the answers to one query are.
+    """The errors of the answers to one query.
 
     Parameters
     ----------
-    first : of each row, error of its first answer; infinite where it has none
-    spread : of each row, mean and standard deviation of the distance between the query and the
-        first five frames, metres; None with fewer than two of its parent frame
+    first : error of the first answer of each row; infinite without an answer
+    spread : mean and standard deviation of the distance between the query and the first five
+        frames of each row, metres; None with fewer than two frames in its parent frame
     """
 
     first: Mapping[str, Error]
@@ -109,14 +109,14 @@ class Judgement:
 def judge_answers(
     truth: FramePlace, ranked: Answer, diverse: Answer, places: Mapping[str, FramePlace]
 ) -> Judgement:
-    """Judge two answers to one query.
+    """Return the errors of two answers to one query.
 
     Parameters
     ----------
-    truth : of the query
-    ranked : without diversification, with as many matches as are validated
-    diverse : of all stages, likewise
-    places : of the database frames by their id
+    truth : reference pose of the query
+    ranked : answer without diversification, with all validated matches
+    diverse : answer of all stages, with all validated matches
+    places : reference poses of the database frames by id
     """
     rows: dict[str, list[Match]] = {}
     for answer, names in ((ranked, ("R", "VR")), (diverse, ("DR", "VDR"))):
@@ -134,7 +134,7 @@ def judge_answers(
 def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
     """Return the figures of each row over queries, as `measures.rows` defines them.
 
-    `spread_mean_m` and `spread_std_m`: as in Judgement, averaged over the queries that have them.
+    `spread_mean_m` and `spread_std_m`: the spread of Judgement, averaged over the queries with one.
     """
     rows: dict[str, Figures] = {}
     for row in ("R", "VR", "DR", "VDR", "pose_average"):
@@ -166,7 +166,7 @@ def _spread(
     return (float(np.mean(metres)), float(np.std(metres))) if len(metres) >= 2 else None
 
 
-#: Of JSON: raised when a key changes its meaning.
+#: Version of the JSON, which increases if the meaning of a key changes.
 SCHEMA_VERSION = 1
 
 ROWS = ("R", "VR", "DR", "VDR", "pose_average", "pose_average_vr")
@@ -175,18 +175,18 @@ ROWS = ("R", "VR", "DR", "VDR", "pose_average", "pose_average_vr")
 def figures(
     evaluation: Evaluation, database: Callable[[int], AnyFrame], settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return every figure of an evaluation, ready for JSON.
+    """Return all figures of an evaluation as JSON values.
 
-    At the top, all queries against the whole database (of several scenes, the paper's
-    `Combine`). `by_scene` has the same for the queries of each scene, where there are several;
-    `scenes` has each scene with a database of its own and `average` the mean of their rows,
-    for a 7-Scenes table. `recall` and `baselines`: see there.
+    The figures at the top are for all queries and the whole database (`Combine` in the paper).
+    `by_scene` contains the figures for the queries of each scene if there are several. For a
+    7-Scenes table, `scenes` contains each scene with a separate database, and `average` the mean of
+    their rows. For `recall` and `baselines`, see `recalls` and `baseline_rows`.
 
     Parameters
     ----------
     evaluation : see Evaluation
-    database : returns the frame of a database index, with its pose
-    settings : all that is needed to repeat it
+    database : function that returns the frame of a database index, with its pose
+    settings : all settings with which the evaluation can be repeated
     """
     prepared, outcomes = evaluation.prepared, evaluation.outcomes
     poses = [member.pose for member in prepared.database]
@@ -221,7 +221,7 @@ def figures(
 def measured(
     outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
-    """Return all figures of some queries."""
+    """Return all figures of a set of queries."""
     return {
         **rows(outcomes), "bound": bound(outcomes), **oracle_and_random(outcomes),
         "validation": validation(outcomes), "diversity": diversity(outcomes, poses, database),
@@ -231,7 +231,7 @@ def measured(
 
 
 def average(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the mean of each figure of each row over scenes; null where a scene has none."""
+    """Return the mean of each figure of each row over scenes; null if a scene lacks the figure."""
     result: dict[str, Any] = {}
     for row in ROWS:
         columns = {key: [scene[row][key] for scene in scenes] for key in scenes[0][row]}
@@ -243,7 +243,7 @@ def average(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
-    """Return median time of each stage: of a query, or under `validate` of one pair."""
+    """Return the median time of each stage per query, or per pair for `validate`."""
     stages: dict[str, list[float]] = {
         stage: [o.milliseconds[stage] for o in outcomes if stage in o.milliseconds]
         for stage in ("rank", "compare_ranking", "diversify", "average", "answer")
@@ -253,10 +253,10 @@ def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
 
 
 def per_query(outcome: QueryOutcome, names: Sequence[str]) -> dict[str, Any]:
-    """Return the results of one query, by which other answers can be compared with it.
+    """Return the results of one query, for comparison with other answers.
 
-    `ranking` has the first of R, `selection` all of C, `matches` all pairs of C in the order in
-    which `associate` returns them.
+    `ranking` contains the first members of R, `selection` all of C, and `matches` all pairs of C in
+    the order of `associate`.
     """
     answers = outcome.views("VDR")
     overlaps = outcome.overlap_mean
@@ -293,7 +293,7 @@ def _matches(outcome: QueryOutcome, names: Sequence[str]) -> list[dict[str, Any]
 
 
 def mistakes(outcomes: Sequence[QueryOutcome], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return pairs that were accepted with a wrong transform, or not accepted with a right one."""
+    """Return accepted pairs with wrong transforms, and other pairs with right transforms."""
     return [
         {
             "query": outcome.name,
@@ -332,12 +332,12 @@ def _described(pair: ValidatedPair, names: Sequence[str]) -> dict[str, Any]:
 
 
 def error_figures(error: Error) -> dict[str, float]:
-    """Return an error in metres and degrees."""
+    """Return an error as JSON values, metres and degrees."""
     return {"translation_m": error.metres, "rotation_deg": math.degrees(error.radians)}
 
 
 def without_infinities(value: Any) -> Any:
-    """Return the value with null for numbers that JSON lacks."""
+    """Return the value with None in place of infinite numbers, which JSON lacks."""
     if isinstance(value, dict):
         return {key: without_infinities(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -346,7 +346,7 @@ def without_infinities(value: Any) -> Any:
 
 
 def to_json(found: dict[str, Any]) -> bytes:
-    """Return bytes of a JSON file."""
+    """Return the bytes of a JSON file."""
     return (json.dumps(found, indent=1, allow_nan=False) + "\n").encode()
 
 
@@ -356,7 +356,7 @@ _OVERLAP_HEAD = f"{'overlap':>10}{'top1 @.5':>10}{'top5 @.5':>10}{'top1 @.3':>10
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """Return the rows and a line for each of the rest; figures as `report.figures` gives them."""
+    """Return the result of `figures` as lines of text."""
     lines = []
     for scene, figures in found.get("scenes", {}).items():
         lines += [f"{scene}, alone", *_rows(figures), ""]
@@ -377,7 +377,7 @@ def table(found: dict[str, Any]) -> list[str]:
     return [*lines, _times(found)]
 
 
-#: Share of queries within 5 cm and 5 degrees, %: R and VDR in the table of the paper.
+#: Percentages of queries within 5 cm and 5 degrees for R and VDR, from the table of the paper.
 PAPER = {
     "chess": (97.3, 99.5), "fire": (92.3, 97.8), "heads": (93.5, 98.9), "office": (89.7, 98.4),
     "pumpkin": (78.3, 82.8), "redkitchen": (87.9, 93.7), "stairs": (54.8, 61.0),
@@ -386,15 +386,15 @@ PAPER_OVERALL = {"average": (84.8, 90.3), "combine": (84.8, 90.4)}
 
 
 def seven_scenes_table(found: dict[str, Any], scene: str) -> list[str]:
-    """Return the percentage of queries within 5 cm and 5 degrees by scene, beside the paper's.
+    """Return a table of the percentages of queries within 5 cm and 5 degrees, with the paper's.
 
-    Average and Combine are of the scenes that are there. The paper prints no DR, as its first match
+    Average and Combine cover the scenes of the evaluation. The paper omits DR, whose first match
     is that of R.
 
     Parameters
     ----------
-    found : as `figures` gives them
-    scene : name of the first scene, for figures of one alone
+    found : result of `figures`
+    scene : name of the first scene, for figures of a single scene
     """
     rows = ("R", "DR", "VDR", "pose_average")
     lines = [
@@ -441,8 +441,8 @@ def _overlap(row: dict[str, Any]) -> str:
 
 
 def _recalls(found: dict[str, Any]) -> list[str]:
-    """Return recall by every way to rank, and what a query costs beside the signature."""
-    if "recall" not in found:  # of figures that were kept before there was one
+    """Return lines on the recall of all rankings, and their times relative to the signature."""
+    if "recall" not in found:  # figures of an older version
         return []
     within = found["recall"]["within_m"]
     place = "overlap by half" if within is None else f"taken within {within:g} m"
@@ -454,7 +454,7 @@ def _recalls(found: dict[str, Any]) -> list[str]:
     lines += [_recall(name, found["recall"][name]) for name in ("R", "DR", "random")]
     for name, row in found.get("baselines", {}).items():
         if "recall" not in row:
-            lines.append(f"{name:18}not asked: {row['reason']}")
+            lines.append(f"{name:18}not used: {row['reason']}")
             continue
         spent = row["milliseconds"]["describe"] + row["milliseconds"]["rank"]
         ratio = f"{spent:>10.1f}{decimal(row['ratio'], 2):>8}"
@@ -479,8 +479,8 @@ _ANSWERS = {
 
 
 def _answers(found: dict[str, Any]) -> list[str]:
-    """Return a row for each thing that a robot may be told."""
-    if "answers" not in found:  # of figures that were kept before there were any
+    """Return lines on the answers of robots."""
+    if "answers" not in found:  # figures of an older version
         return []
     told = found["answers"]
     lines = [f"{'answers':18}{'share':>10}"]
@@ -539,7 +539,7 @@ def _left_out(found: dict[str, Any]) -> str:
     more = len(found["left_out"]) - 1
     name = first["name"] if first["name"].isprintable() else ascii(first["name"])
     reason = first["reason"] if first["reason"].isprintable() else ascii(first["reason"])
-    rest = f"; and {more} more (all are named in --json)" if more else ""
+    rest = f"; and {more} more (--json lists all)" if more else ""
     return f"left out      {name}: {reason}{rest}"
 
 
@@ -553,5 +553,5 @@ def _times(found: dict[str, Any]) -> str:
 
 
 def decimal(value: float | None, digits: int = 3) -> str:
-    """Return a number for a table, and "-" for None."""
+    """Format a number for a table; None is "-"."""
     return "-" if value is None else f"{value:.{digits}f}"

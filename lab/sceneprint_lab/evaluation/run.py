@@ -1,4 +1,4 @@
-"""Evaluate a recording: sign all frames, answer every query, and judge the answers.
+"""Evaluation of a recording: signatures of all frames, answers to all queries, and their errors.
 
 EvaluationProtocol, Signer  --evaluate-->  Evaluation
 """
@@ -48,24 +48,24 @@ from sceneprint_lab.evaluation.protocol import (
     view_of,
 )
 
-#: A sample lies in a plane within this, metres.
+#: Maximum distance of a sample from its plane, metres.
 OFF_PLANE = 0.05
-#: A frame is planar where one plane holds at least this share of its samples.
+#: Minimum share of samples in one plane of a planar frame.
 PLANAR = 0.6
-#: Planes that are tried, each through three samples.
+#: Number of planes that are tested, each through three samples.
 _TRIES = 200
 
 
 def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
-    """Return the share of samples in the plane that holds most; the same each time.
+    """Return the share of samples in the largest plane; the result is deterministic.
 
-    It uses no normals and patches: the choice of frames is independent of the method that is
-    judged on them.
+    The function uses neither normals nor patches, so that the selection of frames does not depend
+    on the evaluated method.
 
     Parameters
     ----------
-    samples : (N, 3) metres, as of `view_of`
-    off : how far from its plane a sample may lie, metres
+    samples : (N, 3) metres; see `view_of`
+    off : maximum distance of a sample from the plane, metres
     """
     n = len(samples)
     if n < 3:
@@ -74,20 +74,20 @@ def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
     corners = samples[rng.integers(0, n, (_TRIES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
-    fixed = length > off * off  # else the three lie on a line, or are two
+    fixed = length > off * off  # else the three samples lie on a line
     if not fixed.any():
         return 0.0
     normals = normals[fixed] / length[fixed, None]
     offsets = (corners[fixed, 0] * normals).sum(axis=1)
     inside = np.abs(samples @ normals.T - offsets) < off
     best = samples[inside[:, inside.sum(axis=0).argmax()]]
-    centre = best.mean(axis=0)  # its own least squares: three noisy samples tilt a plane
+    centre = best.mean(axis=0)  # refit by least squares, since three noisy samples tilt a plane
     normal = np.linalg.svd(best - centre, full_matrices=False)[2][2]
     fitted = np.abs((samples - centre) @ normal) < off
     return float(max(fitted.mean(), inside.mean(axis=0).max()))
 
 
-#: Frames of queries, and of the database, that are in memory at once.
+#: Number of queries, and of database frames, in memory.
 BLOCK = 256
 
 
@@ -97,21 +97,21 @@ class EvaluationSettings:
 
     Parameters
     ----------
-    metric : of signatures; None for the model's
-    levels : of psi to use, finest first; None for all
-    mode, matching : of validation
-    candidates : size of C, and of the part of R that is validated
-    max_overlap : a query may find only database frames that overlap it by less (by the smaller
-        direction, within 10 cm); None for all
-    absent : a query may find only frames of other scenes
-    gap_m : a query may find only frames more than so much travel before it, or of other runs;
-        None for all
-    within_m : a frame is the query's place where it was taken within so many metres; None: where
-        the two overlap by half
-    baselines : names of other ways to rank; see BASELINES
-    seed : of every pair that is validated
-    jobs : processes; no figure depends on it
-    cache_dir : of derived files of the model; None for the user's
+    metric : metric of signatures; None selects the model's
+    levels : number of levels of psi, finest first; None selects all
+    mode, matching : arguments of `validate`
+    candidates : size of C, and number of validated members of R
+    max_overlap : maximum overlap (smaller direction, within 10 cm) of the database frames that a
+        query may find; None allows all
+    absent : whether a query may find only frames of other scenes
+    gap_m : minimum distance travelled since a database frame of the same run that a query may find,
+        metres; None allows all
+    within_m : maximum distance of a frame that shows the query's place, metres; None requires an
+        overlap by half instead
+    baselines : names of baselines; see BASELINES
+    seed : seed of all validations
+    jobs : number of processes, on which no figure depends
+    cache_dir : folder of derived files of the model; None selects the user's cache folder
     """
 
     metric: Metric | None = None
@@ -135,13 +135,13 @@ class Evaluation:
 
     Parameters
     ----------
-    prepared : the frames
-    outcomes : of all queries, against the whole database
-    alone : of a 7-Scenes table of several scenes, the outcomes of each scene with a database of
-        its own; else empty
-    allowed, relevant : (Q, N), whether a query may find a frame, and whether it shows its place
+    prepared : frames of the evaluation
+    outcomes : outcomes of all queries with the whole database
+    alone : outcomes of each scene with a separate database, for a 7-Scenes table of several scenes;
+        else empty
+    allowed, relevant : (Q, N) masks of the frames that a query may find, and that show its place
     within_m : see EvaluationSettings
-    compared : of each baseline
+    compared : answers of each baseline
     """
 
     prepared: Prepared
@@ -157,24 +157,24 @@ def evaluate(
     protocol: EvaluationProtocol, signer: Signer, store: FrameStore, settings: EvaluationSettings,
     watch: Watch = unwatched,
 ) -> Evaluation:  # fmt: skip
-    """Sign all frames, ask every query, and judge the answers by the true poses.
+    """Sign all frames, answer all queries, and compute the errors of the answers.
 
     Parameters
     ----------
-    protocol : see `choose`
-    signer : see `open_signer`
-    store : empty
-    settings : see EvaluationSettings
-    watch : follows the steps of every stage
+    protocol : result of `choose`
+    signer : result of `open_signer`
+    store : empty store
+    settings : settings of the evaluation
+    watch : callback for progress
 
     Raises
     ------
-    DatasetError : no query or no database frame could be used.
-    MissingDependency : a baseline needs a library that is absent.
+    DatasetError : If no query or no database frame is usable.
+    MissingDependency : If the library of a baseline is missing.
     """
     baselines = open_baselines(
         settings.baselines, signer.model.parameters.depth.maximum_depth
-    )  # before the work: a missing library must not cost it
+    )  # detect a missing library before the work
     prepared = prepare_all(
         protocol.frames, signer, store, levels=settings.levels, jobs=settings.jobs,
         cache_dir=settings.cache_dir, watch=watch,
@@ -206,22 +206,22 @@ def evaluate(
 
 
 def _check_used(protocol: EvaluationProtocol, prepared: Prepared) -> None:
-    """Raise DatasetError unless a query and a database frame can be used."""
+    """Raise DatasetError if no query or no database frame is usable."""
     used: dict[Use, list[SignedFrame]] = {"query": prepared.queries, "database": prepared.database}
     for use, members in used.items():
         if not members:
             own = {one.name for one in protocol.frames if one.is_for(use)}
             name, reason = next(left for left in prepared.left_out if left[0] in own)
             raise DatasetError(
-                f"No {use} frame can be used. The first that was left out is {name}: "
-                f"{reason.rstrip('.')}. Choose other frames."
+                f"No {use} frame is usable. The first omitted frame is {name}: "
+                f"{reason.rstrip('.')}. Select other frames."
             )
 
 
 def _scenes(
     protocol: EvaluationProtocol, prepared: Prepared, settings: EvaluationSettings
 ) -> Iterator[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield the scenes to evaluate alone, with the numbers of their queries and database frames."""
+    """Yield the scenes with separate databases, and the indices of their queries and frames."""
     scenes = list(dict.fromkeys(q.scene for q in prepared.queries))
     if not protocol.split or len(scenes) < 2 or settings.absent:
         return
@@ -235,7 +235,7 @@ def _scenes(
 def _allowed(
     prepared: Prepared, truth: Overlaps, settings: EvaluationSettings
 ) -> NDArray[np.bool_]:
-    """Return which database frames a query may find, (Q, N)."""
+    """Return a mask (Q, N) of the database frames that a query may find."""
     allowed = np.ones(truth.mean.shape, np.bool_)
     if settings.absent:
         scenes = [np.array([m.scene for m in of]) for of in (prepared.queries, prepared.database)]
@@ -248,7 +248,7 @@ def _allowed(
 
 
 def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched) -> Overlaps:
-    """Return the overlap of every query with every database frame; 0 between scenes."""
+    """Return the overlaps of queries with database frames; 0 between scenes."""
     queries, database = prepared.queries, prepared.database
     mean, least = np.zeros((2, len(queries), len(database)))
     total = len(queries) * -(-len(database) // BLOCK)
@@ -262,7 +262,7 @@ def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched)
 def _steps(
     prepared: Prepared, store: FrameStore
 ) -> Iterator[tuple[int, AnyView, int, list[AnyView]]]:
-    """Yield each query with each block of the database; two blocks are in memory at a time."""
+    """Yield each query with each block of the database; at most two blocks are in memory."""
     for first in range(0, len(prepared.queries), BLOCK):
         own = [view_of(store.frame(m)) for m in prepared.queries[first : first + BLOCK]]
         for begin in range(0, len(prepared.database), BLOCK):
@@ -275,7 +275,7 @@ def _evaluate_slice(
     prepared: Prepared, truth: Overlaps, may: NDArray[np.bool_], of_queries: NDArray[np.intp],
     of_database: NDArray[np.intp], store: FrameStore, settings: EvaluationSettings, watch: Watch,
 ) -> list[QueryOutcome]:  # fmt: skip
-    """Return ask some queries of some of the database."""
+    """Return the outcomes of queries with a part of the database."""
     queries, database = [prepared.queries[i] for i in of_queries], prepared.database
     same = np.array([q.scene for q in queries])[:, None] == np.array([d.scene for d in database])
     allowed = np.zeros(same.shape, np.bool_)

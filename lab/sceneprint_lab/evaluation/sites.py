@@ -1,4 +1,4 @@
-"""Build synthetic sites, sign their frames, and answer all their queries as a service does.
+"""Answers to queries at synthetic sites, by the functions of a service.
 
 kind, seed, index  --ask_site-->  SiteAnswer, ...
 """
@@ -25,15 +25,15 @@ from sceneprint_lab.synth import synthesise_lookalike, synthesise_lookalike_surv
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
 
-#: From this overlap, smaller direction, a frame of the map is enough to answer a query.
+#: Minimum overlap (smaller direction) of a frame by which a query can be answered.
 ANSWERABLE = 0.3
-#: So near, in metres, a scan of the map is near enough to answer a query of a scanner.
+#: Maximum distance of a scan by which a scanner's query can be answered, metres.
 ANSWERABLE_M = 10.0
-#: Deviations that a robot states with its prior, and how far that is turned at most, degrees.
+#: Standard deviations of a prior, metres and degrees; the latter is its maximum rotation too.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0
-#: Least and greatest side of the voxels of a surface that a site's map is joined to, metres.
+#: Minimum and maximum side of the voxels of a surface that represents a site's map, metres.
 CLOUD_VOXEL_M, MESH_VOXEL_M = (0.05, 0.2), (0.015, 0.03)
-#: Views of such a surface, at most.
+#: Maximum number of views of such a surface.
 VIEWS = 150
 
 
@@ -43,9 +43,9 @@ class SiteAnswer:
 
     Parameters
     ----------
-    site, kind, query : where the query was taken, and its number there
-    answerable : whether a frame of the map overlaps it enough, or a scan of the map is near
-    answer : see JudgedAnswer
+    site, kind, query : site of the query, its kind, and the number of the query
+    answerable : whether a frame of the map overlaps the query enough, or a scan is near enough
+    answer : answer with its error
     """
 
     site: str
@@ -61,9 +61,9 @@ class MapFlaws:
 
     Parameters
     ----------
-    missing : largest share of the frames that are left out
-    drift_m, drift_rad : deviation of the error of a pose from that of the pose before, in each
-        direction; poses drift back to the truth, so that they stay within about twice as much
+    missing : maximum share of missing frames
+    drift_m, drift_rad : standard deviation of the change of the error between successive poses, per
+        direction; errors decay, so that they stay within about twice this deviation
     """
 
     missing: float = 0.5
@@ -74,13 +74,13 @@ class MapFlaws:
 def with_flaws(
     frames: Sequence[AnyFrame], flaws: MapFlaws, rng: np.random.Generator
 ) -> list[AnyFrame]:
-    """Return some of a map's frames, in their order, with poses that drift.
+    """Return a part of a map's frames in their order, with poses that drift.
 
     Parameters
     ----------
-    frames : of the map, with poses
-    flaws : of every site, a share from 0 to each of these is drawn
-    rng : decides which frames are missing, and how the poses drift
+    frames : frames of the map with poses
+    flaws : maximum flaws; the flaws of a site are random shares of them
+    rng : random generator for missing frames and drift
     """
     share = rng.uniform(0.0, 1.0, 3) * (flaws.missing, flaws.drift_m, flaws.drift_rad)
     in_map = rng.uniform(size=len(frames)) >= share[0]
@@ -99,7 +99,7 @@ def with_flaws(
 def signed(
     frames: Sequence[AnyFrame], scene: str, signer: Signer, first: int
 ) -> tuple[list[AnyFrame], list[SignedFrame], list[Geometry]]:
-    """Return those frames that show anything, as an evaluation has them, and their geometry."""
+    """Return the usable frames, their signed frames and their geometries."""
     usable: list[AnyFrame] = []
     members: list[SignedFrame] = []
     geometries: list[Geometry] = []
@@ -119,9 +119,9 @@ def signed(
 def prior_about(
     pose: Floats, parent: str, least: float, most: float, rng: np.random.Generator
 ) -> PosePrior:
-    """Return a prior that is off by `least` to `most` metres, any way, and up to 10 degrees.
+    """Return a prior with a random error of `least` to `most` metres and up to 10 degrees.
 
-    It states deviations of 30 cm and 10 degrees, however far off it is.
+    Its standard deviations are 30 cm and 10 degrees, whatever its error.
     """
     directions = rng.standard_normal((2, 3))
     shift, axis = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -134,7 +134,7 @@ def prior_about(
 
 
 def kinds_of(model: Model) -> tuple[str, ...]:
-    """Return the kinds of sites of the sensor that a model was trained for."""
+    """Return the kinds of sites for the sensor of a model."""
     return SURVEYED_KINDS if _is_of_scans(model) else KINDS + ORDINARY
 
 
@@ -147,19 +147,18 @@ def ask_site(
     prior: tuple[float, float] | None = None, flaws: MapFlaws | None = None,
     confidence: float | None = None, as_surface: bool = False,
 ) -> list[SiteAnswer]:  # fmt: skip
-    """Build one site and ask all its queries.
+    """Create a site and return the answers to all its queries.
 
     Parameters
     ----------
-    signer : see `open_signer`; its model decides whether sites are seen by a depth camera or
-        scanned by a laser
-    work : kind, of `kinds_of`, index and number of queries
-    seed : of the collection
+    signer : result of `open_signer`, whose model determines the sensor of the site
+    work : kind (see `kinds_of`), index and number of queries
+    seed : seed of the collection of sites
     candidates : size of C
-    prior : least and most metres that the robot's prior is off; None: it has none
-    flaws : of the map; None: it has all frames, and true poses
-    confidence : least of a pose that is found; default: that of LocalizationParameters
-    as_surface : whether the map is one surface, joined from its frames, of which views are rendered
+    prior : minimum and maximum error of the robot's prior, metres; None for queries without a prior
+    flaws : flaws of the map; None for a map with all frames and exact poses
+    confidence : minimum confidence of a pose that is found; None selects the default
+    as_surface : whether the map consists of views of a surface that is fused from its frames
     """
     kind, index, queries = work
     of_scans = _is_of_scans(signer.model)
@@ -173,7 +172,7 @@ def ask_site(
     if as_surface:
         frames = _views_of(frames, signer.model, rng)
     shown, database, of_map = signed(frames, site.name, signer, 0)
-    # of another place: a pose in its own frame is a pose in no map
+    # queries of another place have a separate scene, in which no pose is right
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
     sent, queries_signed, of_queries = signed(site.queries, scene, signer, len(database))
     if not database:
@@ -197,7 +196,7 @@ def ask_site(
 def _views_of(
     frames: Sequence[AnyFrame], model: Model, rng: np.random.Generator
 ) -> Sequence[AnyFrame]:
-    """Return views of the surface that frames show together, and that somebody brings as a map."""
+    """Return views of the surface that is fused from frames, as for an imported map."""
     voxel = rng.uniform(*(CLOUD_VOXEL_M if _is_of_scans(model) else MESH_VOXEL_M))
     surface = join_frames(frames, float(voxel), np.array([0.0, 0.0, 1.0]))
     return render_views(surface, replace(view_parameters(model.parameters), most_views=VIEWS))[1]
@@ -209,15 +208,15 @@ def answers_of(
     priors: Sequence[PosePrior | None] | None = None, confidence: float | None = None,
     rendered: bool = False,
 ) -> list[JudgedAnswer]:  # fmt: skip
-    """Return answer queries on a map of some frames, as a service does.
+    """Return the answers to queries on a map.
 
     Parameters
     ----------
-    signer : its model answers
-    database, queries : numbered from 0, the queries after the database; see `signed`
-    geometries : of both, by number
+    signer : signer with the model
+    database, queries : results of `signed`, with consecutive numbers from 0
+    geometries : geometries of the database and the queries, by number
     candidates : size of C
-    priors : of each query; None: it has none
+    priors : prior of each query; None without priors
     confidence : see `ask_site`
     rendered : whether the frames of the map are views rendered from a surface
     """
@@ -248,7 +247,7 @@ def answers_of(
 def _answerable(
     site: LookalikeSite[AnyFrame], shown: Sequence[AnyFrame], sent: Sequence[AnyFrame]
 ) -> list[bool]:
-    """Return, for each query, whether a frame of the map overlaps it enough, or a scan is near."""
+    """Return whether each query can be answered; see SiteAnswer."""
     if not site.present:
         return [False] * len(sent)
     if isinstance(sent[0], Cloud):

@@ -1,4 +1,4 @@
-"""Join the frames of a map to one surface, and render views of it.
+"""Fusion of a map's frames to one surface, and views of that surface.
 
 frames  --join_frames-->  ReferenceSurface  --render_views-->  views, frames with poses
 """
@@ -15,23 +15,22 @@ from sceneprint.geometry.rigid import transform_points
 from sceneprint.geometry.views import Renderer, ViewParameters, ViewPlan, choose_views
 from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Intrinsics, ReferenceSurface
 
-#: Most blocks of a fused mesh, and the farthest depth that goes into it, metres.
+#: Parameters of the fusion, with lengths in metres.
 _FUSION = FusionParameters(most_blocks=400_000, farthest_m=4.0)
 
 
 def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> ReferenceSurface:
-    """Return the surface that frames with poses show together.
+    """Return the surface that is fused from frames with poses.
 
     Parameters
     ----------
-    frames : all clouds, which become one cloud with a point a voxel; or all depth images, which
-        become a mesh
+    frames : clouds, which give a cloud with one point per voxel, or depth images, which give a mesh
     voxel_m : side of the voxels, metres
-    up : (3,) in the parent frame
+    up : (3,) unit vector in the parent frame
 
     Raises
     ------
-    MissingDependency, UselessFrame, InvalidRequest : see `fuse`
+    MissingDependency, UselessFrame, InvalidRequest : If `fuse` raises them
     """
     clouds = [(one.points, one.pose) for one in frames if isinstance(one, Cloud)]
     if not clouds:
@@ -53,12 +52,7 @@ def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> Refer
 def render_views(
     surface: ReferenceSurface, p: ViewParameters
 ) -> tuple[ViewPlan, list[AnyFrame]]:  # fmt: skip
-    """Return the views of a surface that a map is made of, as frames with poses.
-
-    Parameters
-    ----------
-    surface, p : see `choose_views`
-    """
+    """Return the plan and the views of a surface, as frames with poses; see `choose_views`."""
     plan, renderer = choose_views(surface, p), Renderer(surface, p)
     frames: list[AnyFrame] = []
     for number, pose in enumerate(plan.poses):
