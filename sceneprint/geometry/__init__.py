@@ -1,1 +1,1 @@
-"""Compute with arrays: pure functions, a file per section of the paper."""
+"""Pure functions of arrays, with one file per section of the paper."""

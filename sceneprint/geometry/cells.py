@@ -6,12 +6,13 @@
 
     points of a session's frames  --merge_views-->  SessionCells
     cells, a frame of the other session  --frame_verdicts-->  one verdict per cell
-    verdicts of all these frames, counted  --cell_states-->  same, changed or unseen
+    counts of the verdicts of all these frames  --cell_states-->  same, changed or unseen
 
-A tile has 64 x 64 x 64 cells. Fusing is exact and independent of order: it sums integers, and the
-last view is the one with the greatest time, then number. A changed cell of the earlier session is
-gone; a changed cell of the later session is new. Verdicts use the tolerances of validation in the
-map, but from either side, since cells have no normals.
+A tile has 64 x 64 x 64 cells. Fusion is exact and independent of order: it sums integers, and the
+last view is the view with the latest time; views of equal time are ordered by number. A changed
+cell of the earlier session has disappeared; a changed cell of the later session is new. Verdicts
+use the tolerances of validation in the map, but accept both sides of a surface, since cells have no
+normals.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from sceneprint.geometry.rigid import inverse
 from sceneprint.types import Bytes, Floats, Surface
 from sceneprint_client.surface_encoding import CELL, NO_SESSION, NO_TIME, SEEN_STEPS, SIDE, STEPS
 
-#: Column, row and floor of a tile.
+#: Integer coordinates (x, y, z) of a tile.
 TilePlace = tuple[int, int, int]
 #: Sums over the views of a cell: its position in the tile as z, y, x of 6 bits each; the number of
 #: views; sums of the observed positions in 256ths of a cell; the last view's time, number, session.
@@ -50,11 +51,11 @@ CellSums = NDArray[Any]
 Cells = NDArray[Any]
 #: Ratio of the cell widths of successive levels.
 FACTOR = 4
-#: Steps of a position within a cell.
+#: Number of steps in which a position within a cell is encoded, per axis.
 _FINE = 256
-#: Greatest coordinate of a point, in cells: tile numbers are exact up to there.
+#: Maximum coordinate of a point, in cells: tile numbers are exact up to this value.
 _FARTHEST = 2.0**40
-#: Maximum number of tiles per view: those in which it fills most cells.
+#: Maximum number of tiles per view. The tiles with the most occupied cells are selected.
 MOST_TILES = 256
 
 
@@ -64,9 +65,9 @@ class ViewStamp:
 
     Parameters
     ----------
-    number : number of the view; of two views with one time, the greater counts as later
-    taken : seconds since 1970; None if unknown, which counts as the earliest
-    session : index of its session, or NO_SESSION
+    number : number of the view; of two views with equal times, the greater number is later
+    taken : seconds since 1970; None if unknown, which sorts before all times
+    session : index of the view's session, or NO_SESSION
     """
 
     number: int
@@ -87,14 +88,14 @@ class TimeScale:
 
 
 def time_scale(first: float, last: float) -> TimeScale:
-    """Return a scale for times from `first` to `last`, with room before and more room after."""
+    """Return a scale for times from `first` to `last`, with margins before and after them."""
     span = max(4.0 * (last - first), float(NO_TIME - 1))
     step = 2.0 ** np.ceil(np.log2(span / (NO_TIME - 1)))
     return TimeScale(float(np.floor(first - span / 8.0)), float(step))
 
 
 def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlace, CellSums]:
-    """Return the cells of one view by tile: CELL_SUM sorted by key, in at most MOST_TILES tiles.
+    """Return the cells of one view by tile, as CELL_SUM sorted by key, in at most MOST_TILES tiles.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlac
     cell_m : width of a cell, metres
     """
     places = points / cell_m
-    places = places[(np.abs(places) < _FARTHEST).all(axis=1)]  # false for NaN
+    places = places[(np.abs(places) < _FARTHEST).all(axis=1)]  # this removes NaN too
     cells = np.floor(places).astype(np.int64)
     fine = np.minimum((places - cells) * _FINE, _FINE - 1).astype(np.int64)
     tiles, local = cells // SIDE, cells % SIDE
@@ -133,7 +134,7 @@ def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlac
 
 
 def fuse_cells(parts: Sequence[CellSums]) -> CellSums:
-    """Return the fused cells of several views, or groups of views, of one tile; sorted by key."""
+    """Return the fused cells of one tile from several views or groups of views, sorted by key."""
     rows = np.concatenate(parts) if parts else np.zeros(0, CELL_SUM)
     if len(rows) == 0:
         return rows
@@ -147,7 +148,7 @@ def fuse_cells(parts: Sequence[CellSums]) -> CellSums:
 
 
 def encode_cells(rows: CellSums, scale: TimeScale | None) -> Cells:
-    """Encode a tile of `fuse_cells` as CELL, in the order of z, y and x of the cells.
+    """Encode a tile of `fuse_cells` as CELL, sorted by z, y and x.
 
     Parameters
     ----------
@@ -173,8 +174,8 @@ def encode_cells(rows: CellSums, scale: TimeScale | None) -> Cells:
 def coarsen_cells(parts: Mapping[TilePlace, Cells]) -> Cells:
     """Return the cells (CELL) of a tile of the next level.
 
-    A coarse cell lies at the mean of its finer cells, has their greatest `seen`, and the session
-    and time of the last seen.
+    A coarse cell has the mean position of its finer cells, their maximum `seen`, and the session
+    and time of the finer cell that was last seen.
 
     Parameters
     ----------
@@ -192,7 +193,7 @@ def coarsen_cells(parts: Mapping[TilePlace, Cells]) -> Cells:
         return cells
     at = cells["at"].astype(np.int64)
     key = _cell_keys(at)
-    # NO_TIME sorts before all times; of equal times the greater session counts, for a fixed order
+    # NO_TIME sorts before all times; sessions break ties, so that the order is fixed
     when = (cells["taken"].astype(np.int64) + 1) % (NO_TIME + 1)
     session = (cells["session"].astype(np.int64) + 1) % (NO_SESSION + 1)
     order = np.lexsort((session, when, key))
@@ -206,14 +207,14 @@ def coarsen_cells(parts: Mapping[TilePlace, Cells]) -> Cells:
 
 
 def remove_tile(cells: Cells, place: TilePlace) -> Cells:
-    """Return the cells of a coarser tile that lie outside one tile of the level below."""
+    """Return the cells of a coarser tile that lie outside one tile of the next finer level."""
     corner = np.array(place) % FACTOR
     outside: Cells = cells[(cells["at"] // (STEPS // FACTOR) != corner).any(axis=1)]
     return outside
 
 
 def merge_cells(cells: Cells, others: Cells) -> Cells:
-    """Return the cells of two disjoint parts of one tile, in order."""
+    """Return the cells of two disjoint parts of one tile, sorted."""
     merged = np.concatenate([cells, others])
     return merged[np.argsort(_cell_keys(merged["at"].astype(np.int64)), kind="stable")]
 
@@ -227,7 +228,7 @@ def _cell_keys(at: NDArray[np.int64]) -> NDArray[np.int64]:
 SessionCells = dict[TilePlace, CellSums]
 #: States of a cell: not observed by the other session, confirmed by it, or contradicted by it.
 UNSEEN, SAME, CHANGED = 0, 1, 2
-#: Number of frames that must see through a changed cell, or all if there are fewer.
+#: Number of frames that must see through a changed cell; all frames if there are fewer.
 LEAST_THROUGH = 2
 
 
@@ -237,7 +238,7 @@ class VerdictCounts:
 
     Parameters
     ----------
-    agreeing : (N,) uint16 number of frames that saw a surface there
+    agreeing : (N,) uint16 number of frames that saw a surface in the cell
     through : (N,) uint16 number of frames that saw through the cell
     """
 
@@ -245,18 +246,18 @@ class VerdictCounts:
     through: NDArray[np.uint16]
 
     def add(self, verdicts: Bytes) -> None:
-        """Count the verdicts of another frame, (N,) of `frame_verdicts`."""
+        """Count the verdicts (N,) that `frame_verdicts` returned for another frame."""
         self.agreeing[verdicts == AGREES] += 1
         self.through[verdicts == VIOLATES] += 1
 
 
 def empty_counts(count: int) -> VerdictCounts:
-    """Return counts of zero for so many cells."""
+    """Return counts of zero for `count` cells."""
     return VerdictCounts(np.zeros(count, np.uint16), np.zeros(count, np.uint16))
 
 
 def merge_views(cells: SessionCells, views: Sequence[SessionCells]) -> SessionCells:
-    """Return the cells of a session with those of more of its frames (`view_cells`) fused in."""
+    """Return the cells of a session, fused with the cells of more views from `view_cells`."""
     parts: dict[TilePlace, list[CellSums]] = {place: [rows] for place, rows in cells.items()}
     for view in views:
         for place, rows in view.items():
@@ -296,7 +297,7 @@ def frame_verdicts(
     ranges = np.linalg.norm(surface.points[surface.valid].astype(np.float64), axis=1)
     if not len(ranges):
         return verdicts
-    # relative to the sensor, where float32 resolves millimetres however far the origin is
+    # float32 resolves millimetres near the sensor, but not at a distant origin
     offsets = positions - T_parent_sensor[:3, 3]
     reach = 1.1 * float(ranges.max()) + p.point_tolerance
     near = np.flatnonzero(np.einsum("ij,ij->i", offsets, offsets) < reach * reach)
@@ -315,7 +316,7 @@ def cell_states(counts: VerdictCounts, frames: int) -> Bytes:
     Parameters
     ----------
     counts : counts over the frames of the other session
-    frames : number of these frames
+    frames : number of frames of the other session
     """
     states = np.full(len(counts.agreeing), UNSEEN, np.uint8)
     states[counts.through >= min(LEAST_THROUGH, frames)] = CHANGED

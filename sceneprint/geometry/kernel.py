@@ -1,15 +1,15 @@
-"""Compile loops to machine code, cache values per frame, and run two computations at once.
+"""Compilation of loops to machine code, caches per frame, and parallel halves of a computation.
 
 Kernels release the interpreter's lock (`nogil`) and are compiled once per installation (`cache`).
-They never use `parallel` (a forked child dies in OpenMP) or `fastmath`, so the compiler neither
-reorders sums nor fuses products, and a frame gives the same bytes on every processor. Division
-follows IEEE without a check, which would prevent vectorization: kernels guard their divisors
+They never use `parallel`, because a forked child dies in OpenMP, or `fastmath`, so the compiler
+neither reorders sums nor fuses products, and a frame gives the same bytes on every processor.
+Divisions have no check for zero, which would prevent vectorization: kernels check their divisors
 themselves. For the same reason an inner loop writes one array, unless the kernel is disjoint.
 
     with cores.shared():  run_both(first, second)  -->  both results
 
 Validation refines two independent directions, and a frame's signature and artifact come from one
-surface: `run_both` computes such halves on two cores if one is free. Results stay equal to the bit.
+surface: `run_both` computes such halves on two cores if one is free. Results are equal to the bit.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ import numpy as np
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: LLVM's name and features of the processor for which wheels and images carry machine code:
-#: x86-64 of 2013 and later.
+#: LLVM's name and features of the processor for which wheels and images contain machine code:
+#: x86-64 processors since 2013.
 TARGET = "x86-64-v3"
 TARGET_FEATURES = (
     "+avx,+avx2,+bmi,+bmi2,+cx16,+f16c,+fma,+lzcnt,+movbe,+popcnt,+sahf,+sse3,+sse4.1,+sse4.2,"
@@ -49,7 +49,7 @@ class Kernel:
     Parameters
     ----------
     function : function of arrays and numbers
-    disjoint : whether no array that it writes shares memory with another argument
+    disjoint : whether the arrays that the function writes share no memory with other arguments
     """
 
     def __init__(self, function: Callable[..., Any], *, disjoint: bool = False) -> None:
@@ -60,18 +60,18 @@ class Kernel:
         self._call: Callable[..., Any] = self._first_call
         self._stamp = ""
 
-    #: Resolves to the machine code, because a Python method would slow the thousand calls a query.
+    #: A property that resolves to the machine code: a method would slow the 1,000 calls per query.
     __call__ = property(attrgetter("_call"))
 
     def _first_call(self, *arguments: Any) -> Any:
         return self.compiler(*arguments)
 
     def __reduce__(self) -> str:
-        """Pickle by name, as functions are."""
+        """Return the name of the kernel, by which pickle restores it."""
         return self.function.__qualname__
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of numba's compiler: signatures, statistics, assembly."""
+        """Return an attribute of numba's compiler, such as its signatures."""
         if name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.compiler, name)
@@ -83,7 +83,7 @@ class Kernel:
 
     @property
     def compiler(self) -> Any:
-        """Return numba's compiler, with our cache."""
+        """Return numba's compiler with the cache of `kernel_cache`."""
         if self._compiler is None:
             with _compiler_lock:
                 if self._compiler is None:
@@ -92,7 +92,7 @@ class Kernel:
 
     @property
     def stamp(self) -> str:
-        """Return the stamp of valid code on disk; "" if there is no compiled code."""
+        """Return the stamp that valid code on disk has; "" if numba compiles no code."""
         _ = self.compiler
         return self._stamp
 
@@ -112,22 +112,22 @@ class Kernel:
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a loop over arrays to machine code on its first call; cached on disk."""
+    """Compile a loop over arrays to machine code on its first call, and cache the code on disk."""
     return cast(Callable[P, R], Kernel(function))
 
 
 def disjoint_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a loop whose written arrays share memory with no other argument; see `kernel`.
+    """Compile a loop whose output arrays share no memory with other arguments; see `kernel`.
 
-    The compiler can then vectorize look-ups of scattered numbers (gather): no store changes them.
+    The compiler can then vectorize reads of scattered numbers, since no write changes them.
     """
     return cast(Callable[P, R], Kernel(function, disjoint=True))
 
 
 class _Prefetch:
-    """Load a row of a table into the processor's caches before it is read, within a kernel.
+    """A call in a kernel that loads a row of a table into the processor's caches.
 
-    It hides the latency of scattered rows, changes no result, and does nothing in plain Python.
+    It hides the latency of scattered rows and changes no result.
     """
 
     def __call__(self, table: Any, row: Any) -> None:
@@ -135,7 +135,7 @@ class _Prefetch:
 
     @property
     def _defn(self) -> Any:
-        """Return the function that generates its code, for the stamps of kernels that use it."""
+        """Return the function that generates the code, for the stamps of kernels that use it."""
         from sceneprint.geometry.kernel_cache import prefetch_row
 
         return prefetch_row._defn
@@ -154,14 +154,14 @@ prefetch = _Prefetch()
 
 
 def code_folder(function: Any) -> tuple[str, bool]:
-    """Return the folder of a kernel's machine code, and whether it has code for this processor."""
+    """Return the folder of a kernel's code, and whether it contains code for this processor."""
     cache = getattr(function, "_cache", None)
     folder: tuple[str, bool] = ("", False) if cache is None else cache.folder()
     return folder
 
 
 def runs_here() -> bool:
-    """Return whether code for `TARGET` runs on the processor that numba compiles for."""
+    """Return whether code for `TARGET` runs on the processor for which numba compiles."""
     from numba.core.registry import cpu_target
 
     from sceneprint.geometry.kernel_cache import runs_on
@@ -172,12 +172,12 @@ def runs_here() -> bool:
 def _hash_dependencies(function: Callable[..., Any], names: dict[str, Any]) -> str:
     """Return a digest of the kernels and constants of other files that a kernel may contain.
 
-    numba's own stamp covers the kernel's file only. Imports precede definitions in our modules,
-    so `names` holds every dependency on another file.
+    The stamp of numba covers the kernel's file only. Imports precede definitions in our modules,
+    so `names` contains every dependency on another file.
 
     Parameters
     ----------
-    names : global names of the kernel's module, and their values when it was decorated
+    names : global names of the kernel's module, with their values at the time of decoration
     """
     texts = []
     for name, value in names.items():
@@ -193,7 +193,7 @@ _DEPENDENCIES: dict[tuple[str, str, int], str] = {}
 
 
 def _dependency_text(name: str, value: object, module: str) -> str:
-    """Return the content that a global name can add to a kernel; "" if none or its own file's."""
+    """Return the content of a global name that a kernel can use; "" if its own file defines it."""
     if name.startswith("__"):
         return ""
     if isinstance(value, ModuleType):  # a kernel may use any of its attributes
@@ -209,7 +209,7 @@ def _dependency_text(name: str, value: object, module: str) -> str:
 
 
 def _constant_text(value: Any, module: str) -> str:
-    """Return the content that a value can add to a kernel; "" if none or its own file's."""
+    """Return the content of a value that a kernel can use; "" if its own file defines it."""
     if isinstance(value, tuple):
         return f"({','.join(_constant_text(item, module) for item in value)})"
     if isinstance(value, bool | int | float | complex | str):
@@ -241,9 +241,9 @@ F = TypeVar("F")
 def cached_per_frame(
     function: Callable[Concatenate[F, P], R],
 ) -> Callable[Concatenate[F, P], R]:
-    """Cache results of a function of a surface, patches or a geometry until that is freed.
+    """Cache results of a function of a surface, patches or a geometry for the argument's lifetime.
 
-    The first argument is compared by identity and must not change; the others must be hashable.
+    The first argument is compared by identity and must not change. Other arguments are hashable.
     Results are shared, so callers must not write into them.
     """
     results: WeakKeyDictionary[F, dict[Hashable, R]] = WeakKeyDictionary()
@@ -254,7 +254,7 @@ def cached_per_frame(
         if own is None:
             own = results.setdefault(frame, {})
         key = args, tuple(kwargs.items())
-        if key not in own:  # two threads may both compute it, with equal results
+        if key not in own:  # two threads may compute the same result; either can be stored
             own[key] = function(frame, *args, **kwargs)
         return own[key]
 
@@ -266,7 +266,7 @@ B = TypeVar("B")
 
 
 class Cores:
-    """Cores that computations of this process share.
+    """The cores that computations of this process share.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ class Cores:
 
     @contextmanager
     def shared(self) -> Iterator[None]:
-        """Occupy a core, and let calls of `run_both` within the context use a second one."""
+        """Occupy a core, and allow `run_both` within the context to use a second core."""
         with self._lock:
             self._busy += 1
         token = _cores.set(self)
@@ -293,7 +293,7 @@ class Cores:
                 self._busy -= 1
 
     def run_both(self, first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
-        """Run two computations, in parallel if a core is free; see `run_both` of this module."""
+        """Run two computations, in parallel if a core is free; see the function `run_both`."""
         with self._lock:
             free = self._busy < self._count
             self._busy += free
@@ -305,7 +305,7 @@ class Cores:
                 return first(), later.result()
             finally:
                 if not later.cancel():
-                    later.exception()  # wait: it may still use arguments of the caller
+                    later.exception()  # wait, because it may still use the caller's arguments
         finally:
             with self._lock:
                 self._busy -= 1
@@ -321,8 +321,8 @@ _cores: ContextVar[Cores | None] = ContextVar("cores", default=None)
 def run_both(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
     """Return the results of two computations that write no common memory.
 
-    They run in parallel within `Cores.shared` if a core is free, else one after the other.
-    Exceptions of the first take precedence.
+    They run in parallel within `Cores.shared` if a core is free, otherwise sequentially. If both
+    raise an exception, the first one's is raised.
     """
     cores = _cores.get()
     return (first(), second()) if cores is None else cores.run_both(first, second)

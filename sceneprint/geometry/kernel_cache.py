@@ -1,7 +1,8 @@
-"""Find machine code of kernels in numba's folders, or in those of a wheel or an image.
+"""The cache of kernels' machine code, in numba's folders or in those of a wheel or an image.
 
-numba files code under the processor that compiled it. Code that comes with an installation was
-compiled for `TARGET` and lies in numba's folder or beside the sources, which may be read-only.
+numba stores code under the name of the processor that compiled it. Code that is shipped with an
+installation was compiled for `TARGET`. It lies in numba's folder or beside the sources, which may
+be read-only.
 This module imports numba, which takes long, so `kernel` imports it on the first call.
 """
 
@@ -26,7 +27,7 @@ from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
 
 
 class DisjointCompiler(Compiler):
-    """Compile kernels whose written arrays share memory with no other argument."""
+    """A compiler of kernels whose output arrays share no memory with other arguments."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -36,7 +37,7 @@ class DisjointCompiler(Compiler):
 def _prefetch_row(_context: Any, table: Any, row: Any) -> Any:
     """Prefetch the first 128 bytes (two cache lines) of a row of a C-contiguous table.
 
-    Arguments are numba types. Returns the signature and the generator of a call's code.
+    The arguments are numba types. The result is the signature and the generator of a call's code.
     """
     signature = types.void(table, row)
 
@@ -51,7 +52,7 @@ def _prefetch_row(_context: Any, table: Any, row: Any) -> Any:
         )
         start = builder.bitcast(array.data, byte.as_pointer())
         start = builder.gep(start, [builder.mul(at, length)])
-        # for reading, into all levels of the cache, as data
+        # the flags mean: prefetch for reading, into all levels of the cache, as data
         flags = [ir.Constant(number, value) for value in (0, 3, 1)]
         for offset in (0, 64):
             line = builder.gep(start, [ir.Constant(ir.IntType(64), offset)])
@@ -65,7 +66,7 @@ prefetch_row: Any = intrinsic(_prefetch_row)
 
 
 class _BesideTheSource(InTreeCacheLocator):
-    """Locate code beside the sources if no folder is writable."""
+    """A locator of code beside the sources, for installations without a writable folder."""
 
     def ensure_cache_path(self) -> None:
         """Accept a read-only folder: nothing is written to it."""
@@ -90,13 +91,13 @@ class KernelCache(FunctionCache):
         self._read_only = isinstance(locator, _BesideTheSource)
 
     def stamp(self, dependencies: str) -> object:
-        """Require code on disk to have this digest of dependencies; return the whole stamp."""
+        """Return the stamp that code on disk must have, including this digest of dependencies."""
         stamp = (self._cache_file._source_stamp, dependencies)
         self._cache_file._source_stamp = self._shipped._source_stamp = stamp
         return stamp
 
     def folder(self) -> tuple[str, bool]:
-        """Return the folder of valid code for this processor, and whether it has any."""
+        """Return the folder of code for this processor, and whether it contains valid code."""
         target = cpu_target.target_context.codegen().magic_tuple()
         shipped = self._shipped_target(target)
         for file in (self._shipped, self._cache_file):
@@ -111,7 +112,7 @@ class KernelCache(FunctionCache):
             super().save_overload(sig, data)
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return shipped or locally compiled code; None if there is none."""
+        """Return shipped or locally compiled code; None if neither exists."""
         signature, target, code = self._index_key(sig, target_context.codegen())
         shipped = self._shipped_target(target)
         for file in (self._shipped, self._cache_file) if shipped is not None else ():
@@ -125,7 +126,7 @@ class KernelCache(FunctionCache):
         """Return the target of shipped code; None if it does not run on `target`."""
         triple, name, features = target
         if name not in (TARGET, binding.get_host_cpu_name()) or not runs_on(features):
-            return None  # an operator configured another processor
+            return None  # the operator configured another processor
         return triple, TARGET, TARGET_FEATURES
 
 

@@ -1,6 +1,6 @@
-"""Apply, invert, compare, fit and average rigid transforms, as (4, 4) matrices.
+"""Operations on rigid transforms, as (4, 4) matrices with x_b = T_b_a @ x_a.
 
-x_b = T_b_a @ x_a. Translations are in metres, angles in radians.
+Translations are in metres, angles in radians.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sceneprint.types import Floats, Ints64
 
 
 def inverse(T: Floats) -> Floats:
-    """Return T_a_b of T_b_a, (4, 4), exactly for a rigid transform."""
+    """Return the inverse (4, 4) of a rigid transform."""
     result, R = np.zeros((4, 4)), T[:3, :3].T
     result[:3, :3] = R
     result[:3, 3] = -R @ T[:3, 3]
@@ -42,28 +42,26 @@ def _write_inverses(transforms: Floats, result: Floats) -> None:
 
 
 def transform_points(T: Floats, points: Floats) -> Floats:
-    """Return points (n, 3) of frame a in frame b, by T_b_a."""
+    """Return points (n, 3) of frame a in the coordinates of frame b; T is T_b_a."""
     result: Floats = points @ T[:3, :3].T + T[:3, 3]
     return result
 
 
 def rotation_angle(R: Floats) -> float:
-    """Return the angle of a rotation (3, 3), ||log R||, in [0, pi]."""
+    """Return the angle of a rotation (3, 3), in [0, pi] radians."""
     # atan2 is exact for angles near 0, unlike acos
     sine = math.sqrt((R[2, 1] - R[1, 2]) ** 2 + (R[0, 2] - R[2, 0]) ** 2 + (R[1, 0] - R[0, 1]) ** 2)
     return math.atan2(sine, float(R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
 
 
 def pose_difference(a: Floats, b: Floats) -> tuple[float, float]:
-    """Return the metres between the translations of two transforms, and the radians between
-    their rotations.
-    """
+    """Return the differences of two transforms in translation (metres) and rotation (radians)."""
     metres, radians = _pose_differences(a[None], b[None])[0, 0].tolist()
     return metres, radians
 
 
 def _pose_differences(a: Floats, b: Floats) -> Floats:
-    """Return the differences (n, m, 2) of each two of n and m transforms; see `pose_difference`."""
+    """Return `pose_difference` of all pairs of n and m transforms, (n, m, 2)."""
     apart = np.empty((len(a), len(b), 2))
     _write_differences(np.array(a, float), np.array(b, float), apart)
     return apart
@@ -122,8 +120,8 @@ def select_distinct(
 
     Parameters
     ----------
-    transforms, scores : (n, 4, 4) and (n,); greater scores are better
-    metres, radians : transforms within both of a better one are omitted
+    transforms, scores : (n, 4, 4) and (n,); higher scores are better
+    metres, radians : tolerances; a transform within both of a better transform is omitted
     most : maximum number of indices
     """
     order = np.argsort(-scores, kind="stable")
@@ -137,7 +135,7 @@ def select_distinct(
 def _select(
     transforms: Floats, order: Ints64, metres: float, cosine: float, chosen: Ints64
 ) -> int:  # fmt: skip
-    """Fill `chosen` with transforms that are not near an earlier choice; return their number."""
+    """Write the indices of distinct transforms to `chosen`, and return their number."""
     found = 0
     for i in order:
         if found == len(chosen):
@@ -164,7 +162,7 @@ def nearest_rotation(M: Floats) -> Floats:
 def rotation_of_covariance(H: Floats, R: Floats) -> None:
     """Write to R the rotation (3, 3) that maximises trace(R H^T) for H = sum b a^T (Horn 1987).
 
-    Its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix,
+    The quaternion of R is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix,
     computed by cyclic Jacobi rotations.
     """
     N = np.empty((4, 4))
@@ -223,7 +221,7 @@ def rotation_of_covariance(H: Floats, R: Floats) -> None:
 def apply_rotation(R: Floats, omega: Floats, result: Floats) -> None:
     """Write exp([omega]x) R to `result`, by Rodrigues' formula; omega (3,) radians."""
     angle = np.sqrt(omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2)
-    a, b = 1.0, 0.5  # sin(angle) / angle and (1 - cos(angle)) / angle^2, at 0
+    a, b = 1.0, 0.5  # limits of sin(angle) / angle and (1 - cos(angle)) / angle^2 at 0
     if angle > 1e-9:
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / (angle * angle)
     K = np.zeros((3, 3))
@@ -246,7 +244,10 @@ def apply_rotation(R: Floats, omega: Floats, result: Floats) -> None:
 
 @kernel
 def solve_positive(A: Floats, b: Floats, x: Floats) -> bool:
-    """Solve A x = b by Cholesky and overwrite A (n, n), symmetric. False if not positive."""
+    """Solve A x = b by Cholesky decomposition; return whether A is positive definite.
+
+    The symmetric matrix A (n, n) is overwritten.
+    """
     n = len(b)
     for j in range(n):
         diagonal = A[j, j]
@@ -275,10 +276,10 @@ def solve_positive(A: Floats, b: Floats, x: Floats) -> bool:
 
 @dataclass(frozen=True)
 class AveragingParameters:
-    """The distances within which a vote agrees with the medoid."""
+    """The tolerances within which a vote agrees with the medoid."""
 
-    agree_m: float = 0.15  #: metres
-    agree_rad: float = math.radians(10.0)  #: radians
+    agree_m: float = 0.15  #: maximum distance, metres
+    agree_rad: float = math.radians(10.0)  #: maximum angle, radians
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,9 +289,10 @@ class PoseAverage:
     Parameters
     ----------
     T : (4, 4) T_parent_sensor
-    spread_m, spread_rad : root mean square difference of the agreeing votes from T
+    spread_m, spread_rad : root mean square difference of the agreeing votes from T, metres and
+        radians
     support : number of votes that agree
-    votes : number of all votes
+    votes : total number of votes
     members : (support,) ascending indices of the votes that agree
     """
 
@@ -305,22 +307,22 @@ class PoseAverage:
 def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAverage:
     """Return the mean of the votes near their medoid.
 
-    The medoid is the vote with most others near it; of equals, the vote with the nearest
-    others, then the earlier, which ranks higher.
+    The medoid is the vote with the most other votes near it. Ties are resolved by the distance to
+    the other votes, then by rank.
 
     Parameters
     ----------
-    poses : (n, 4, 4) T_parent_sensor of one sensor in one parent frame, best first
+    poses : (n, 4, 4) T_parent_sensor of one sensor in one parent frame, the best pose first
 
     Raises
     ------
-    ValueError : there are no poses, or they are not (n, 4, 4)
+    ValueError : If there are no poses, or they are not (n, 4, 4)
     """
     p = p or AveragingParameters()
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
-        raise ValueError(f"poses of shape {poses.shape}, not (n, 4, 4) with n of 1 or more")
+        raise ValueError(f"poses has shape {poses.shape}. Pass at least one pose, as (n, 4, 4).")
     apart = _pose_differences(poses, poses)
-    # metres and radians in one unit: tolerances
+    # dividing by the tolerances makes metres and radians comparable
     scaled = np.hypot(apart[..., 0] / p.agree_m, apart[..., 1] / p.agree_rad)
     near = (apart[..., 0] <= p.agree_m) & (apart[..., 1] <= p.agree_rad)
     cost = np.where(near, scaled, 0.0).sum(axis=1)
@@ -336,14 +338,14 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
 
 
 def mean_direction(directions: Floats, within: float) -> Floats | None:
-    """Return the mean direction, (3,) of length 1, of the largest group of unit vectors.
+    """Return the mean direction (3,), a unit vector, of the largest group of unit vectors.
 
-    None if at most half of the vectors agree.
+    The result is None unless more than half of the vectors agree.
 
     Parameters
     ----------
     directions : (n, 3) unit vectors
-    within : maximum angle between two that agree, radians
+    within : maximum angle between two vectors that agree, radians
     """
     near = directions @ directions.T >= math.cos(within)
     agree = near.sum(axis=1)
@@ -354,25 +356,25 @@ def mean_direction(directions: Floats, within: float) -> Floats | None:
     return result
 
 
-#: Unit vectors (3,), up in the coordinates of source and target; None if unknown.
+#: The up directions, unit vectors (3,), in the coordinates of source and target; None if unknown.
 Ups = tuple[Floats | None, Floats | None]
 NO_UPS: Ups = (None, None)
 
 
 @dataclass(frozen=True)
 class GravityParameters:
-    """The maximum tilts of transforms against `up`, with room for its noise; radians."""
+    """The maximum tilts of transforms against `up`, in radians, with a margin for its noise."""
 
-    gate: float = math.radians(15.0)  #: greatest difference of two corresponding patches' slopes
-    proposed_tilt: float = math.radians(20.0)  #: greatest tilt of an unrefined hypothesis
-    refined_tilt: float = math.radians(10.0)  #: greatest tilt of a refined pose
-    rival_tilt: float = math.radians(20.0)  #: least tilt at which a rival is impossible
-    floor_tilt: float = math.radians(30.0)  #: greatest angle between a floor's normal and `up`
-    floor_stride: int = 7  #: stride of the pixels in the search for the floor
+    gate: float = math.radians(15.0)  #: maximum difference of two corresponding patches' slopes
+    proposed_tilt: float = math.radians(20.0)  #: maximum tilt of an unrefined hypothesis
+    refined_tilt: float = math.radians(10.0)  #: maximum tilt of a refined pose
+    rival_tilt: float = math.radians(20.0)  #: minimum tilt at which a rival is impossible
+    floor_tilt: float = math.radians(30.0)  #: maximum angle between a floor's normal and `up`
+    floor_stride: int = 7  #: stride of the pixels that are examined for the floor
 
 
 def tilts(transforms: Floats, ups: Ups) -> Floats:
-    """Return the angles between the transformed `up` of the source and that of the target.
+    """Return the angles between the transformed `up` of the source and the target's `up`.
 
     Parameters
     ----------
@@ -388,24 +390,27 @@ def tilts(transforms: Floats, ups: Ups) -> Floats:
         return np.zeros(len(transforms))
     carried = transforms[:, :3, :3] @ source
     across = np.linalg.norm(np.cross(carried, target), axis=1)
-    angles: Floats = np.arctan2(across, carried @ target)  # exact near 0, as acos is not
+    angles: Floats = np.arctan2(across, carried @ target)  # acos is inaccurate near 0
     return angles
 
 
 def tilt_of(T: Floats | None, ups: Ups) -> float | None:
-    """Return the tilt of one transform, radians; None if it or an `up` is unknown."""
+    """Return the tilt of a transform in radians; None if the transform or an `up` is unknown."""
     if T is None or ups[0] is None or ups[1] is None:
         return None
     return float(tilts(T[None], ups)[0])
 
 
 def are_level(transforms: Floats, ups: Ups, most: float) -> NDArray[np.bool_]:
-    """Return a mask of the transforms that tilt by at most `most`: all if an `up` is unknown."""
+    """Return a mask of the transforms that tilt by at most `most` radians.
+
+    The mask selects all transforms if an `up` is unknown.
+    """
     level: NDArray[np.bool_] = tilts(transforms, ups) <= most
     return level
 
 
 def slopes(normals: Floats, up: Floats) -> Floats:
-    """Return the angles of normals (n, 3) to up, (n,) radians: 0 for floors, pi/2 for walls."""
+    """Return the angles (n,) in radians between normals (n, 3) and `up`: 0 for floors."""
     angles: Floats = np.arccos(np.clip(normals @ up, -1.0, 1.0))
     return angles

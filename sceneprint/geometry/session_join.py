@@ -1,21 +1,21 @@
-"""Judge associations between two runs by loops, and fit the transform between the runs.
+"""Verification of associations between two runs by loops, and the transform between the runs.
 
 edges, paths of both runs  --judge_edges-->  EdgeVerdicts
 votes T_a_b with positions  --join_sessions-->  SessionJoin
 
-A wrong transform may look perfect to both of its frames. Two edges close to each other form a loop
-with the odometry between their frames; if it does not close, one of the edges is wrong. Loops use
-odometry over short ways only, so drift does no harm and the runs need no common origin (pairwise
-consistency: Mangelson et al., ICRA 2018, with the odometry's uncertainty as a tolerance).
+A wrong transform may align two frames perfectly. Two edges close to each other form a loop with the
+odometry between their frames; if the loop does not close, one of the edges is wrong. Loops use
+odometry over short distances only, so drift is negligible and the runs need no common origin
+(pairwise consistency: Mangelson et al., ICRA 2018, with the odometry's uncertainty as a tolerance).
 
-Edges of one viewpoint share their errors. So an edge is supported only if it closes a loop with an
-edge of another viewpoint on either run. Loops cannot tell the sides of a symmetric object apart,
-because all edges are wrong by the same rotation; within one run, edges that deviate from its
-odometry by more than odometry drifts are therefore not supported.
+Edges of one viewpoint share their errors. Therefore an edge is supported only if it closes a loop
+with an edge of another viewpoint on either run. Loops cannot distinguish the sides of a symmetric
+object, because all edges are wrong by the same rotation. Within one run, an edge is therefore
+unsupported if it deviates from the odometry by more than the maximum drift.
 
 Each association of a frame of run b with a frame of run a is a vote for the transform between
-their parent frames. Votes are compared at their frames, not at the origin of b: a degree moves a
-distant origin by metres.
+their parent frames. Votes are compared at the positions of their frames, because one degree moves
+a distant origin by metres.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from sceneprint.types import Floats
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """The transforms between two parent frames that associations vote for.
+    """Transforms between two parent frames, one for each association.
 
     Parameters
     ----------
     transforms : (n, 4, 4) T_a_b
     views : (n, 4, 4) T_b_source, poses of the source frames
-    source, target : (n,) identifiers of the frames in b and in a
+    source, target : (n,) identifiers of the frames of b and of a
     weights : (n,) positive weights
     """
 
@@ -61,7 +61,7 @@ def association_votes(
     transforms: Floats, source_poses: Floats, target_poses: Floats,
     source: NDArray[np.int64], target: NDArray[np.int64], weights: Floats,
 ) -> Votes:  # fmt: skip
-    """Return associations as votes.
+    """Return the votes of associations.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def association_votes(
 
 Ints64 = NDArray[np.int64]
 
-#: Length of a gap in odometry, metres: longer than any loop.
+#: Path length that stands for a gap in odometry, metres: longer than any loop.
 _GAP_M = 1e6
 
 
@@ -92,8 +92,8 @@ class RobotPath:
     Parameters
     ----------
     poses : (m, 4, 4) T_parent_sensor; NaN if unknown
-    metres, radians : (m,) path length up to each frame, very long across a gap in odometry;
-        `metres` is NaN without a pose
+    metres, radians : (m,) path length up to each frame, with _GAP_M added at each gap in odometry;
+        `metres` is NaN for frames without a pose
     """
 
     poses: Floats
@@ -106,7 +106,7 @@ def robot_path(poses: Floats, parents: Ints64) -> RobotPath:
 
     Parameters
     ----------
-    poses : (m, 4, 4) T_parent_sensor in the order of time; NaN if unknown
+    poses : (m, 4, 4) T_parent_sensor in order of time; NaN if unknown
     parents : (m,) identifiers of the parent frames; odometry has a gap at each change
     """
     known = np.isfinite(poses).all(axis=(1, 2))
@@ -127,15 +127,15 @@ def robot_path(poses: Floats, parents: Ints64) -> RobotPath:
 class CycleParameters:
     """The tolerances within which a loop of two edges closes."""
 
-    close_m: float = 0.07  #: greatest residual of a loop of length zero, metres
-    close_rad: float = math.radians(4.0)  #: and radians
+    close_m: float = 0.07  #: maximum residual of a loop of length zero, metres
+    close_rad: float = math.radians(4.0)  #: the same, radians
     drift: float = 0.05  #: drift of odometry within a loop, metres per metre, radians per radian
-    most_drift: float = 0.2  #: greatest plausible drift between any two frames of a run
-    reach_m: float = 1.0  #: greatest path length between the edges of a loop, metres
-    reach_rad: float = math.radians(60.0)  #: and radians
-    view_m: float = 0.1  #: greatest distance of two frames of one viewpoint, metres
-    view_rad: float = math.radians(6.0)  #: and radians
-    most_loops: int = 4_000_000  #: maximum number of loops; more shorten the reach
+    most_drift: float = 0.2  #: maximum plausible drift between any two frames of a run
+    reach_m: float = 1.0  #: maximum path length between the edges of a loop, metres
+    reach_rad: float = math.radians(60.0)  #: the same, radians
+    view_m: float = 0.1  #: maximum distance between two frames of one viewpoint, metres
+    view_rad: float = math.radians(6.0)  #: the same, radians
+    most_loops: int = 4_000_000  #: maximum number of loops; the reach is halved until it holds
 
     def scaled(self, scale: float) -> CycleParameters:
         """Return these parameters with all lengths multiplied by `scale`."""
@@ -145,7 +145,7 @@ class CycleParameters:
 
 @dataclass(frozen=True, eq=False)
 class LoopEdges:
-    """Associations of frames of one run with frames of another, or of the same.
+    """Associations of the frames of a run with frames of another run, or of the same run.
 
     Parameters
     ----------
@@ -165,15 +165,15 @@ class LoopEdges:
 
 @dataclass(frozen=True, eq=False)
 class EdgeVerdicts:
-    """The evidence of loops for each edge.
+    """The evidence from loops for each edge.
 
     Parameters
     ----------
-    accepted : (n,) whether other edges do not outvote it
+    accepted : (n,) mask of the edges that other edges do not outvote
     loops : (n,) number of loops with accepted edges; 0 if the edge is unchecked
-    closed : (n,) number of them that close
-    supported : (n,) whether it is accepted, closes a loop with an edge of another viewpoint, and
-        agrees with the odometry of its run
+    closed : (n,) number of these loops that close
+    supported : (n,) mask of the accepted edges that close a loop with an edge of another viewpoint
+        and agree with the odometry of their run
     """
 
     accepted: NDArray[np.bool_]
@@ -186,12 +186,12 @@ def judge_edges(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters | None = None,
     *, within_run: bool = False,
 ) -> EdgeVerdicts:  # fmt: skip
-    """Reject edges, the most outvoted first, until no edge is outvoted.
+    """Reject the most outvoted edge repeatedly, until no edge is outvoted; return all verdicts.
 
     Parameters
     ----------
-    source, target : runs of their frames; the same run twice for loop closures
-    within_run : whether both are the same run
+    source, target : runs of the source and target frames; the same run twice for loop closures
+    within_run : whether `source` and `target` are the same run
     """
     p = p or CycleParameters()
     firsts, seconds, closing, elsewhere = _loops(edges, source, target, p)
@@ -215,7 +215,7 @@ def judge_edges(
 def _match_odometry(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDArray[np.bool_]:
     """Return a mask of the edges of a run that its odometry does not contradict."""
     here, there = run.poses[edges.source], run.poses[edges.target]
-    predicted = there @ edges.transforms  # pose of the source according to the edge
+    predicted = there @ edges.transforms  # pose of the source frame that the edge implies
     metres = np.linalg.norm(predicted[:, :3, 3] - here[:, :3, 3], axis=1)
     cosines = (np.einsum("nij,nij->n", predicted[:, :3, :3], here[:, :3, :3]) - 1.0) / 2.0
     way = np.abs(run.metres[edges.source] - run.metres[edges.target])
@@ -229,8 +229,8 @@ def _match_odometry(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDA
 def _loops(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters
 ) -> tuple[Ints64, Ints64, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return pairs of edges that are near on both runs, whether their loops close, and whether
-    they have different viewpoints on either run.
+    """Return pairs (i, j) of edges that form loops, and masks of the pairs whose loop closes and
+    of the pairs whose viewpoints differ on either run.
     """
     ways = np.stack(
         [
@@ -242,7 +242,7 @@ def _loops(
     shorter = 1.0
     while True:
         limits = np.array([p.reach_m, p.reach_rad]) * shorter
-        count = _near(ways, limits)
+        count = _count_pairs(ways, limits)
         if count <= p.most_loops:
             break
         shorter /= 2.0
@@ -251,7 +251,7 @@ def _loops(
     here = np.ascontiguousarray(source.poses[edges.source])
     there = np.ascontiguousarray(target.poses[edges.target])
     numbers = np.array([p.close_m, p.close_rad, p.drift])
-    _close(
+    _write_loops(
         ways, limits, here, there, np.ascontiguousarray(edges.transforms), numbers,
         firsts, seconds, closing,
     )  # fmt: skip
@@ -272,7 +272,7 @@ def _are_elsewhere(
 
 @kernel
 def _are_near(ways: Floats, i: int, j: int, limits: Floats) -> bool:
-    # NaN compares false, so frames without a pose form no loops
+    # comparisons with NaN are false, so frames without a pose form no loops
     near: bool = (
         abs(ways[i, 0] - ways[j, 0]) <= limits[0]
         and abs(ways[i, 1] - ways[j, 1]) <= limits[1]
@@ -283,7 +283,7 @@ def _are_near(ways: Floats, i: int, j: int, limits: Floats) -> bool:
 
 
 @kernel
-def _near(ways: Floats, limits: Floats) -> int:
+def _count_pairs(ways: Floats, limits: Floats) -> int:
     count = 0
     for i in range(len(ways)):
         for j in range(i + 1, len(ways)):
@@ -292,13 +292,15 @@ def _near(ways: Floats, limits: Floats) -> int:
 
 
 @kernel
-def _left(here: Floats, there: Floats, transforms: Floats, i: int, j: int) -> tuple[float, float]:
+def _loop_residual(
+    here: Floats, there: Floats, transforms: Floats, i: int, j: int
+) -> tuple[float, float]:
     """Return the residual of the loop over edges i and j at the source of j: metres, radians."""
-    # T_parent_parent of i, applied to the source of j; and the same of j
+    # each edge predicts the position of the source of j in the target's parent frame
     R, t = np.zeros((2, 3, 3)), np.zeros((2, 3))
     for k in range(2):
         e = i if k == 0 else j
-        # T_there T_target_source
+        # (M, m) is T_parent_target T_target_source
         M, m = np.zeros((3, 3)), np.zeros(3)
         for a in range(3):
             m[a] = there[e, a, 3]
@@ -306,12 +308,12 @@ def _left(here: Floats, there: Floats, transforms: Floats, i: int, j: int) -> tu
                 m[a] += there[e, a, b] * transforms[e, b, 3]
                 for c in range(3):
                     M[a, b] += there[e, a, c] * transforms[e, c, b]
-        # then T_source_parent
+        # R is M times the rotation of T_source_parent
         for a in range(3):
             for b in range(3):
                 for c in range(3):
                     R[k, a, b] += M[a, c] * here[e, b, c]
-        # position of the source of j
+        # t is the predicted position
         for a in range(3):
             t[k, a] = m[a]
             for b in range(3):
@@ -329,7 +331,7 @@ def _left(here: Floats, there: Floats, transforms: Floats, i: int, j: int) -> tu
 
 
 @kernel
-def _close(
+def _write_loops(
     ways: Floats, limits: Floats, here: Floats, there: Floats, transforms: Floats,
     numbers: Floats, firsts: Ints64, seconds: Ints64, closing: NDArray[np.bool_],
 ) -> None:  # fmt: skip
@@ -340,8 +342,8 @@ def _close(
                 continue
             metres = abs(ways[i, 0] - ways[j, 0]) + abs(ways[i, 2] - ways[j, 2])
             radians = abs(ways[i, 1] - ways[j, 1]) + abs(ways[i, 3] - ways[j, 3])
-            left_m, left_rad = _left(here, there, transforms, i, j)
-            back_m, _ = _left(here, there, transforms, j, i)
+            left_m, left_rad = _loop_residual(here, there, transforms, i, j)
+            back_m, _ = _loop_residual(here, there, transforms, j, i)
             firsts[at], seconds[at] = i, j
             closing[at] = (
                 max(left_m, back_m) <= numbers[0] + numbers[2] * metres
@@ -378,23 +380,23 @@ Strength = Literal["strong", "weak"]
 
 @dataclass(frozen=True)
 class JoiningParameters:
-    """The tolerances within which votes agree, and the agreement that a join needs."""
+    """The tolerances within which votes agree, and the agreement that a join requires."""
 
-    agree_m: float = 0.2  #: greatest difference at a vote's position, metres
-    agree_rad: float = math.radians(6.0)  #: and radians
+    agree_m: float = 0.2  #: maximum difference at a vote's position, metres
+    agree_rad: float = math.radians(6.0)  #: the same, radians
     sigma_m: float = 0.04  #: standard deviation of a vote's position, metres
-    sigma_rad: float = math.radians(1.2)  #: and rotation, radians
-    hypotheses: int = 300  #: maximum number of votes that are tried as the transform
+    sigma_rad: float = math.radians(1.2)  #: standard deviation of a vote's rotation, radians
+    hypotheses: int = 300  #: maximum number of votes that are tested as the transform
     rounds: int = 8  #: iterations of the fit
     least_votes: int = 3  #: minimum number of agreeing votes
-    least_frames: int = 2  #: minimum number of their frames in either run
-    view_m: float = 0.1  #: greatest distance of two frames of one viewpoint, metres
-    view_rad: float = math.radians(6.0)  #: and radians
+    least_frames: int = 2  #: minimum number of frames of the agreeing votes in either run
+    view_m: float = 0.1  #: maximum distance between two frames of one viewpoint, metres
+    view_rad: float = math.radians(6.0)  #: the same, radians
     rival: float = 0.5  #: share of the support at which another transform prevents a join
     strong_votes: int = 10  #: minimum number of agreeing votes of a strong join
     strong_frames: int = 5  #: minimum number of their frames in either run
-    strong_share: float = 0.5  #: minimum share of all votes
-    strong_extent_m: float = 1.0  #: minimum extent of the frames: at one place all may be wrong
+    strong_share: float = 0.5  #: minimum share of agreeing votes among all votes
+    strong_extent_m: float = 1.0  #: minimum extent of their frames: one place can be mistaken
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,12 +405,12 @@ class SessionJoin:
 
     Parameters
     ----------
-    T : (4, 4) T_a_b; None if too few votes agree, or nearly as many agree on another
-    agree : (n,) mask of the votes that agree with it, or with the best transform
-    spread_m, spread_rad : root mean square of their differences at their frames
-    rival : number of the other votes that agree on the best other transform
+    T : (4, 4) T_a_b; None if too few votes agree or another transform has enough support
+    agree : (n,) mask of the votes that agree with the best transform, even if it was refused
+    spread_m, spread_rad : root mean square difference of these votes from it, at their frames
+    rival : number of the other votes that agree on the second-best transform
     strength : strong, or weak if few votes agree; None without a transform
-    reason : short sentence that explains the result
+    reason : short explanation of the result
     """
 
     T: Floats | None
@@ -426,34 +428,34 @@ class SessionJoin:
 
 
 def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = None) -> SessionJoin:
-    """Return the transform with the heaviest support, fitted to the votes that agree with it.
+    """Return the transform with the largest support, fitted to the votes that agree with it.
 
-    Each vote (a random sample of `hypotheses` if there are more) is tried as the transform, and
-    the best is refitted to the votes that agree. The votes of one frame share a weight of one, so
-    that a frame with many matches does not outweigh the rest.
+    Each vote (a random sample of `hypotheses` votes if there are more) is tested as the transform,
+    and the best is refitted to the votes that agree. The weights of the votes of one frame are
+    normalized to 1, so that a frame with many matches does not outweigh other frames.
 
     Parameters
     ----------
     votes : at least one vote
-    seed : seed of the sample, 0 or more
+    seed : non-negative seed of the sample
 
     Raises
     ------
-    ValueError : there are no votes
+    ValueError : If there are no votes
     """
     p = p or JoiningParameters()
     n = len(votes.transforms)
     if n == 0:
-        raise ValueError("there are no votes")
+        raise ValueError("There are no votes. Pass at least one vote.")
     weights = votes.weights / np.bincount(votes.source)[votes.source]
     every = np.ones(n, np.bool_)
     best = _best(votes, weights, _sample(np.arange(n), seed, p), every, p)
-    T, agree = _fitted(votes, weights, votes.transforms[best], p)
+    T, agree = _fit(votes, weights, votes.transforms[best], p)
     others, rivals = ~agree, np.zeros(n, np.bool_)
     if others.any():
         second = _best(votes, weights, _sample(np.flatnonzero(others), seed, p), others, p)
         rivals = _agreeing(votes, votes.transforms[second], p) & others
-    strength, reason = _belief(votes, weights, agree, rivals, p)
+    strength, reason = _join_strength(votes, weights, agree, rivals, p)
     metres, radians = _differences(votes, T)
     return SessionJoin(
         None if strength is None else T,
@@ -466,11 +468,11 @@ def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = Non
     )
 
 
-def _belief(
+def _join_strength(
     votes: Votes, weights: Floats, agree: NDArray[np.bool_], rivals: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> tuple[Strength | None, str]:  # fmt: skip
-    """Return the strength of a join, None if it is refused, and the reason."""
+    """Return the strength of a join, or None if it is refused, and the reason."""
     n, support = len(agree), int(agree.sum())
     frames = min(len(np.unique(each[agree])) for each in (votes.source, votes.target))
     reason = f"{support} of {n} associations agree"
@@ -500,7 +502,7 @@ def _sample(indices: NDArray[np.intp], seed: int, p: JoiningParameters) -> NDArr
 
 
 def _differences(votes: Votes, T: Floats) -> tuple[Floats, Floats]:
-    """Return the metres and radians by which votes differ from a transform at their positions."""
+    """Return the differences (metres, radians) of votes from a transform at their positions."""
     shifts = np.einsum("nij,nj->ni", votes.transforms[:, :3, :3] - T[:3, :3], votes.places)
     shifts += votes.transforms[:, :3, 3] - T[:3, 3]
     return np.linalg.norm(shifts, axis=1), np.linalg.norm(_rotation_vectors(votes, T), axis=1)
@@ -512,7 +514,7 @@ def _rotation_vectors(votes: Votes, T: Floats) -> Floats:
     axes = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], 1)
     sines = np.linalg.norm(axes, axis=1)
     angles = np.arctan2(sines, np.trace(D, axis1=1, axis2=2) - 1.0)
-    # near a half turn the axis is undefined, but no vote that far off enters the fit
+    # near a half turn the axis is undefined, but such distant votes are not fitted
     turns: Floats = axes * np.where(sines > 1e-9, angles / np.maximum(sines, 1e-9), 0.5)[:, None]
     half = (sines <= 1e-9) & (angles > 1.0)
     turns[half] = (math.pi, 0.0, 0.0)
@@ -529,29 +531,29 @@ def _best(
     votes: Votes, weights: Floats, chosen: NDArray[np.intp], among: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> int:  # fmt: skip
-    """Return the chosen vote with the heaviest support among others; the first of equals."""
+    """Return the chosen vote with the largest support by the votes `among`; the first if equal."""
     support = [
         float(weights[_agreeing(votes, votes.transforms[i], p) & among].sum()) for i in chosen
     ]
     return int(chosen[int(np.argmax(np.round(support, 9)))])
 
 
-def _fitted(
+def _fit(
     votes: Votes, weights: Floats, T: Floats, p: JoiningParameters
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Fit a transform to the votes that agree with it; return it and their mask."""
-    agree = _agreeing(votes, T, p)  # at least the vote that proposed it
+    """Fit a transform to the votes that agree with it; return the result and their mask."""
+    agree = _agreeing(votes, T, p)
     for _ in range(p.rounds):
         step = _step(votes, weights * agree, T, p)
         now = _agreeing(votes, step, p)
-        if not now.any():  # the mean of two distant votes may agree with neither
+        if not now.any():  # the mean of two distant votes may agree with none
             break
         T, agree = step, now
     return T, agree
 
 
 def _step(votes: Votes, weights: Floats, T: Floats, p: JoiningParameters) -> Floats:
-    """Take a Gauss-Newton step on positions and rotations, with Cauchy weights."""
+    """Return T after a Gauss-Newton step on positions and rotations, with Cauchy weights."""
     voted = np.einsum("nij,nj->ni", votes.transforms[:, :3, :3], votes.places)
     voted += votes.transforms[:, :3, 3]
     places = votes.places @ T[:3, :3].T + T[:3, 3]
@@ -559,7 +561,7 @@ def _step(votes: Votes, weights: Floats, T: Floats, p: JoiningParameters) -> Flo
     scaled = (shifts**2).sum(1) / p.sigma_m**2 + (turns**2).sum(1) / p.sigma_rad**2
     w = weights / (1.0 + scaled / 6.0)
     middle = (w[:, None] * places).sum(0) / w.sum()
-    # x moves by omega x (x - middle) + tau
+    # the step (omega, tau) moves a position x by omega x (x - middle) + tau
     J = np.zeros((len(places), 3, 6))
     x, y, z = (places - middle).T
     J[:, 0, 1], J[:, 0, 2] = z, -y

@@ -44,16 +44,16 @@ def test_what_is_good_meets_no_objection() -> None:
             {"residual_rad": math.radians(5.1)}, {"residual_rad": math.radians(4.9)},
             "rejected", "5.1 deg",
         ),
-        ({"overlap": 0.24}, {"overlap": 0.26}, "rejected", "1.0% lies where the other frame"),
+        ({"overlap": 0.24}, {"overlap": 0.26}, "rejected", "1.0% of the points lie"),
         ({"overlap": 0.19}, {"overlap": 0.26}, "rejected", "only 19% of the surfaces"),
-        ({"violations": 0.09}, {"violations": 0.07}, "rejected", "9.0% lies where"),
-        ({"plane_overlap": 0.14}, {"plane_overlap": 0.16}, "rejected", "mostly one plane (14%"),
+        ({"violations": 0.09}, {"violations": 0.07}, "rejected", "9.0% of the points"),
+        ({"plane_overlap": 0.14}, {"plane_overlap": 0.16}, "rejected", "mostly one plane agrees"),
         # plane overlap less three times the violations
         (
             {"plane_overlap": 0.159, "violations": 0.02}, {"plane_overlap": 0.161},
-            "rejected", "16% agrees by planes, and 2.0% lies where",
+            "rejected", "plane overlap is 16%, but 2.0% of the points",
         ),
-        ({"stiffness": 9e-6}, {"stiffness": 1.1e-5}, "ambiguous", "leaves a direction free"),
+        ({"stiffness": 9e-6}, {"stiffness": 1.1e-5}, "ambiguous", "do not constrain one direction"),
     ],
 )  # fmt: skip
 def test_each_objection_has_its_threshold(
@@ -64,7 +64,7 @@ def test_each_objection_has_its_threshold(
     assert found[0] == status
     assert reason in found[1]
     assert objection(replace(GOOD, **just), P, "full") is None
-    # the paper asks for the residual alone
+    # the paper checks the residual only
     alone = objection(replace(GOOD, **worse), P, "paper")
     assert (alone is not None) == ("disagree" in found[1])
 
@@ -74,11 +74,11 @@ def test_each_objection_has_its_threshold(
     [
         (
             {"worst_violations": 0.051}, {"worst_violations": 0.049},
-            "rejected", "5.1% lies where the other frame saw through",
+            "rejected", "5.1% of the points lie where the other frame saw",
         ),
         (
             {"plane_violations": 0.081}, {"plane_violations": 0.079},
-            "rejected", "8.1% lies where the other frame saw through",
+            "rejected", "8.1% of the points lie where the other frame saw",
         ),
         ({"planes": 5.4}, {"planes": 6.1}, "ambiguous", "only 5 distinct planes agree"),
     ],
@@ -106,8 +106,9 @@ def test_scans_may_share_little_but_not_against_free_space() -> None:
     assert belief(replace(little, plane_overlap=0.14), 0.0, scans)[:2] == ("accepted", "weak")
     found = objection(replace(little, violations=0.025), scans, "full")
     assert found == (
-        "rejected", "16% agrees by planes, and 2.5% lies where the other frame saw through"
-    )  # fmt: skip
+        "rejected",
+        "the plane overlap is 16%, but 2.5% of the points lie where the other frame saw free space",
+    )
 
 
 SPARSE = Evidence(0.01, 0.01, 0.15, 0.2, 0.004, 1e-3, planes=8.0, worst_violations=0.01)

@@ -91,5 +91,5 @@ def test_moving_the_map_moves_the_average() -> None:
 
 @pytest.mark.parametrize("shape", [(0, 4, 4), (4, 4), (2, 3, 4), (1, 4, 4, 1), (0,)])
 def test_what_is_no_pose(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="poses of shape"):
+    with pytest.raises(ValueError, match="poses has shape"):
         average_poses(np.zeros(shape))

@@ -25,7 +25,7 @@ def test_points_out_of_range_are_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("factor", "says"),
-    [(1000.0, "if the coordinates are millimetres, say 1000 units per metre"), (0.01, "units")],
+    [(1000.0, "if the coordinates are millimetres, set 1000 units per metre"), (0.01, "units")],
 )
 def test_out_of_range_names_the_range_and_what_to_do(
     cloud_scenes: ModuleType, factor: float, says: str

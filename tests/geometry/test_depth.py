@@ -181,7 +181,7 @@ def test_minimum_number_of_valid_pixels() -> None:
 def test_wrong_shape_is_the_callers_mistake() -> None:
     camera = Intrinsics(8, 6, 10.0, 10.0, 0.0, 0.0)
     for shape in ((8, 6), (6, 8, 1), (48,)):
-        with pytest.raises(ValueError, match=r"is not \(6, 8\)"):
+        with pytest.raises(ValueError, match=r"intrinsics are for \(6, 8\)"):
             inverse_depth(DepthFrame(np.ones(shape, np.float32), camera), parameters())
 
 
@@ -195,5 +195,5 @@ def test_images_too_thin_for_a_surface(shape: tuple[int, int]) -> None:
 def test_few_samples_in_range_are_not_blamed_on_the_scale() -> None:
     few = np.zeros((8, 8), np.float32)
     few[0, :5] = 2.0
-    with pytest.raises(UselessFrame, match=r"only 5 of its 5 .* sees more of the scene"):
+    with pytest.raises(UselessFrame, match=r"only 5 of its 5 .* shows more of the scene"):
         inverse_depth(frame(few), DepthParameters())

@@ -186,7 +186,7 @@ def test_a_wrong_up_gives_a_sentence_and_no_pose(rooms: list[Views], degrees: in
             )  # fmt: skip
             assert checked.contradicts_up
             assert checked.tilt_rad == pytest.approx(math.radians(degrees), abs=math.radians(2))
-            assert f"only tilted by {math.degrees(checked.tilt_rad):.0f} deg" in checked.reason
+            assert f"only if tilted by {math.degrees(checked.tilt_rad):.0f} deg" in checked.reason
             said += 1
     assert said >= 5
 

@@ -145,7 +145,7 @@ def test_too_few_votes_or_too_few_frames_are_none() -> None:
     one = np.zeros(12, np.int64)
     assert join_sessions(association_votes(T, b, a, one, n, np.ones(12))).T is None
     assert join_sessions(association_votes(T, b, a, n, n, np.ones(12))).strength == "strong"
-    with pytest.raises(ValueError, match="there are no votes"):
+    with pytest.raises(ValueError, match="There are no votes"):
         join_sessions(association_votes(T[:0], b[:0], a[:0], n[:0], n[:0], np.ones(0)))
 
 

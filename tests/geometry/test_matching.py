@@ -69,5 +69,5 @@ def test_fewer_patches_than_wanted() -> None:
 
 def test_descriptors_of_two_lengths() -> None:
     a, b = np.zeros((3, 8), np.uint8), np.zeros((3, 9), np.uint8)
-    with pytest.raises(ValueError, match="descriptors have 8 and 9 bytes"):
+    with pytest.raises(ValueError, match="lengths, 8 and 9 bytes"):
         correspondences(a, b, np.random.default_rng(0), MatchingParameters())

@@ -148,10 +148,10 @@ def test_some_rows_are_compared_where_they_are(metric: Metric) -> None:
     short = np.arange(50, dtype=np.int16)
     assert distances(query, database, metric, short).tolist() == whole.tolist()  # type: ignore[arg-type]
     for rows in ([0, 50], [-1, 3], [2**40]):
-        with pytest.raises(ValueError, match="of 50 signatures"):
+        with pytest.raises(ValueError, match="the database has 50"):
             distances(query, database, metric, np.array(rows, np.int64))
     for strange in (np.array([0.0, 1.0]), np.array([[0, 1]]), np.array([True, False])):
-        with pytest.raises(ValueError, match="not indices"):
+        with pytest.raises(ValueError, match="integer indices"):
             distances(query, database, metric, strange)
 
 
@@ -166,7 +166,7 @@ def test_inputs_are_left_alone() -> None:
 
 def test_shapes_types_and_metric_must_be_right() -> None:
     for query, database in (((8,), (3, 9)), ((1, 8), (3, 8)), ((8,), (8,)), ((8,), (2, 8, 1))):
-        with pytest.raises(ValueError, match="signatures have"):
+        with pytest.raises(ValueError, match=r"signatures have|query has shape"):
             distances(np.zeros(query, np.uint8), np.zeros(database, np.uint8), "l1")
     for queries, database in (((2, 8), (3, 9)), ((8,), (3, 8)), ((2, 8), (8,)), ((8,), (8,))):
         with pytest.raises(ValueError, match="signatures have"):
@@ -175,9 +175,9 @@ def test_shapes_types_and_metric_must_be_right() -> None:
         pairwise_distances(np.zeros(8, np.uint8), "l1")
     one, many = np.zeros(8, np.uint8), np.zeros((3, 8), np.uint8)
     for dtype in (np.int8, np.float64, np.int64, np.bool_):
-        with pytest.raises(ValueError, match="not bytes"):
+        with pytest.raises(ValueError, match="uint8 arrays"):
             distances(one.astype(dtype), many, "l1")
-        with pytest.raises(ValueError, match="not bytes"):
+        with pytest.raises(ValueError, match="uint8 arrays"):
             distances(one, many.astype(dtype), "l1")
     with pytest.raises(ValueError, match="cosine"):
         distances(one, many, "cosine")  # type: ignore[arg-type]

@@ -268,5 +268,5 @@ def test_two_views_are_aligned_by_sequences() -> None:
     assert again.T_match_query is not None
     np.testing.assert_array_equal(again.T_match_query, found.T_match_query)
     unknown: Any = "letters"
-    with pytest.raises(ValueError, match="neither"):
+    with pytest.raises(ValueError, match="does not exist"):
         validate(query, match, matching=unknown)

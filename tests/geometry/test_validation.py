@@ -278,7 +278,7 @@ def test_too_few_patches(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None
             assert (v.status, v.T_match_query, v.seed) == ("rejected", None, 3)
             assert f"{n} patches" in v.reason
     for n in (10, 11):
-        assert "validation needs" not in sane(validate(few(query, n), match)).reason
+        assert "validation requires" not in sane(validate(few(query, n), match)).reason
 
 
 def test_patches_that_agree_on_nothing(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
@@ -422,7 +422,7 @@ def test_what_one_search_alone_finds_is_judged_by_the_evidence(
             assert found.strength == "weak"
             assert found.residual_m <= p.acceptance.residual_m
             assert found.covariance is not None
-            assert found.reason.endswith("planes, but one direction alone found it")
+            assert found.reason.endswith("planes, but only one direction found it")
     assert accepted >= len(pairs)
 
 
@@ -455,14 +455,14 @@ def test_a_free_direction_is_seen_without_rivals(model: Model) -> None:
     blind = AcceptanceParameters(ambiguous=9.0, ambiguous_share=9.0, weak=9.0)
     v = sane(validate(wall, wall, 0, ValidationParameters(acceptance=blind)))
     assert v.status == "ambiguous"
-    assert "leaves a direction free" in v.reason
+    assert "do not constrain one direction" in v.reason
 
 
 def test_wrong_calls(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
     query, match, _ = pairs[0]
-    with pytest.raises(ValueError, match="mode 'other' is neither 'full' nor 'paper'"):
+    with pytest.raises(ValueError, match="mode 'other' does not exist"):
         validate(query, match, mode="other")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="descriptors have 128 and 127 bytes"):
+    with pytest.raises(ValueError, match="lengths, 128 and 127 bytes"):
         validate(query, replace(match, descriptors=match.descriptors[:, :127]))
     with pytest.raises(ModelMismatch, match="Frames of two models cannot be compared"):
         pipeline.validate(query, replace(match, model_id="0" * 64))

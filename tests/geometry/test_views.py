@@ -421,5 +421,5 @@ def test_parameters_follow_the_model() -> None:
     assert own.camera == CAMERA
     assert own.heights == (0.2, 0.7)
     for wrong in ([], [0.0], [-1.0, 1.0], [math.nan]):
-        with pytest.raises(InvalidRequest, match="above 0 metres"):
+        with pytest.raises(InvalidRequest, match="above 0 m"):
             view_parameters(read_model("depth").parameters, heights=wrong)

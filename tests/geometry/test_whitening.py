@@ -114,7 +114,7 @@ def test_the_mean_itself_and_a_zero(psi: Floats, fit: Whitening) -> None:
 
 
 def test_what_is_refused(psi: Floats, fit: Whitening) -> None:
-    with pytest.raises(ValueError, match=r"psi \(299,\) does not fit the basis \(32, 300\)"):
+    with pytest.raises(ValueError, match=r"shape \(299,\), but the basis has shape \(32, 300\)"):
         whiten(psi[0, :299], fit)
     units = psi_units(psi)
     with pytest.raises(ValueError, match="200 frames cannot determine 200 axes"):

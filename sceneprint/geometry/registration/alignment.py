@@ -1,23 +1,23 @@
-"""Search for the transform that best explains two frames, and for alternatives (Sec. III-E).
+"""The search for the transform that best explains two frames, and for alternatives (Sec. III-E).
 
-    correspondences (M)  --consensus-->  transforms (S, 4, 4), best supported first
-    Geometry, Geometry  --align-->  Alignment               one direction
-    Geometry, Geometry  --align_scans-->  two Alignments    scans, one search for both directions
-    Geometry, Geometry, T  --align_guided-->  Alignment     without a search, from a known transform
+    correspondences (M)  --consensus-->  transforms (S, 4, 4), by descending support
+    Geometry, Geometry  --align-->  Alignment               for one direction
+    Geometry, Geometry  --align_scans-->  two Alignments    for scans, with one search
+    Geometry, Geometry, T  --align_guided-->  Alignment     from a predicted transform
 
 Two correspondences are compatible if a rigid motion could map both: their patches agree in
 distance, in heights over each other's planes, in the angle of their normals, and in handedness. A
-seed correspondence and the compatible ones that are also compatible with each other (second-order
-compatibility: Chen et al., SC2-PCR, CVPR 2022) give one transform, refined over all correspondences
-that it explains.
+seed correspondence and compatible correspondences that are also compatible with each other
+(second-order compatibility: Chen et al., SC2-PCR, CVPR 2022) determine one transform, which is
+refined over all correspondences that it explains.
 
-The directions of depth images are searched independently: that they meet is evidence, which one
-search for both would destroy. Scans see so much more that one search suffices; their directions are
-refined separately.
+The directions of depth images are searched independently: the agreement of their results is
+evidence, which a common search would destroy. Scans contain much more surface, so one search is
+sufficient; their directions are refined separately.
 
-Gravity excludes transforms that tilt, if both frames know up (an IMU measures it to half a degree).
-`up` may be wrong, so the gates leave room, and if nothing fits, the search is repeated without it.
-Gravity is not in the paper.
+If `up` is known in both frames, gravity excludes transforms that tilt (an IMU measures `up` to half
+a degree). `up` may be wrong, so the gates have a margin, and if no transform fits, the search is
+repeated without `up`. The paper does not use gravity.
 """
 
 from __future__ import annotations
@@ -95,23 +95,23 @@ class ConsensusParameters:
 
     distance_tolerance: float = 0.12  #: tolerance of lengths and heights, metres
     angle_tolerance: float = 0.5  #: tolerance of the angle between two patches' normals, radians
-    minimum_distance: float = 0.15  #: nearer pairs constrain no rotation, metres
-    n_seeds: int = 40  #: number of transforms that are tried
-    n_support: int = 16  #: number of correspondences of a seed's first fit
+    minimum_distance: float = 0.15  #: minimum distance of two patches of a pair, metres
+    n_seeds: int = 40  #: number of transforms that are fitted
+    n_support: int = 16  #: number of correspondences in the first fit of a seed
     normal_weight: float = 0.05  #: weight of normals relative to positions, square metres
     rounds: int = 3  #: number of refits to the explained correspondences
-    inlier_distance: float = 0.15  #: greatest distance of patches under a transform, metres
-    inlier_cosine: float = 0.85  #: least cosine between their normals
+    inlier_distance: float = 0.15  #: maximum distance of patches under a transform, metres
+    inlier_cosine: float = 0.85  #: minimum cosine between the normals of these patches
 
 
 @kernel
 def _alike_angles(a: float, b: float, most: float) -> bool:
-    """Return whether two angles, as cosines, differ by at most `most`."""
+    """Return whether two angles, specified by their cosines, differ by at most `most` radians."""
     a, b = min(max(a, -1.0), 1.0), min(max(b, -1.0), 1.0)
     return not abs(np.arccos(a) - np.arccos(b)) > most
 
 
-#: Results of `_compare` for two correspondences; the last requires a comparison of angles.
+#: Results of `_compare` for two correspondences; _UNDECIDED requires a comparison of angles.
 _APART, _ALIKE, _UNDECIDED = 0, 1, 2
 
 
@@ -120,14 +120,13 @@ def _compare(
     p: Floats, n: Floats, q: Floats, m: Floats, i: int,
     tolerance: float, angle: float, minimum: float, said: Bytes, cosines: Floats,
 ) -> None:  # fmt: skip
-    """Compare correspondence i with each later one; all arrays (3, M), said (M,), cosines (2, M).
+    """Compare correspondence i with each later one; all arrays are (3, M), cosines (2, M).
 
     They are compatible if lengths, heights above each other's planes, angles between normals and
-    the signed triple product, which excludes mirror images, agree. A difference of angles is at
-    least that of their cosines, and greatest if one of them is 0: only between these bounds an
-    arccosine is needed.
+    the signed triple product, which excludes mirror images, agree. The cosines bound the difference
+    of two angles from both sides; an arccosine is necessary only between these bounds.
     """
-    later = i + 1  # slices, because possibly negative indices prevent vectorization
+    later = i + 1  # slices, because indices that can be negative prevent vectorization
     px, py, pz, nx, ny, nz = (
         p[0, later:], p[1, later:], p[2, later:], n[0, later:], n[1, later:], n[2, later:],
     )  # fmt: skip
@@ -173,7 +172,7 @@ def _graph(
     p: Floats, n: Floats, q: Floats, m: Floats,
     tolerance: float, angle: float, minimum: float, bits: NDArray[np.uint64],
 ) -> None:  # fmt: skip
-    """Set bit j of row i if correspondences i and j are compatible. All arrays (3, M)."""
+    """Set bit j of row i if correspondences i and j are compatible; all arrays are (3, M)."""
     count = p.shape[1]
     said, cosines = np.empty(count, np.uint8), np.empty((2, count))
     for i in range(count):
@@ -188,7 +187,7 @@ def _graph(
 
 @kernel
 def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
-    """Write the number of correspondences compatible with both i and j, 0 if these are not."""
+    """Write the number of correspondences compatible with both i and j; 0 if i and j are not."""
     count, words = bits.shape
     m1, m2 = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
     m4, h = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
@@ -209,7 +208,7 @@ def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
 
 @disjoint_kernel
 def _select_weighted(weights: Floats, places: Ints32) -> int:
-    """Write the indices of the weights above 0; return their number."""
+    """Write the indices of the positive weights; return their number."""
     found = 0
     for i in range(len(weights)):
         places[found] = i
@@ -222,9 +221,9 @@ def _fit(
     p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
     places: Ints32, T: Floats,
 ) -> bool:  # fmt: skip
-    """Fit T by weighted Kabsch to positions and normals, (3, M) each; False with fewer than three.
+    """Fit T to positions and normals, (3, M) each, by weighted Kabsch; return whether it succeeded.
 
-    places (M,) is scratch space: many correspondences have no weight.
+    `places` (M,) is scratch space for the indices of weighted correspondences.
     """
     used = _select_weighted(weights, places)
     if used < 3:
@@ -261,7 +260,7 @@ def _weigh_inliers(
     p: Floats, n: Floats, q: Floats, m: Floats, T: Floats,
     distance: float, cosine: float, weights: Floats,
 ) -> None:  # fmt: skip
-    """Write the weight (1 - d^2 / distance^2)^2 of each correspondence under T; arrays (3, M)."""
+    """Write the weights (1 - d^2 / distance^2)^2 of correspondences under T; arrays are (3, M)."""
     px, py, pz, qx, qy, qz = p[0], p[1], p[2], q[0], q[1], q[2]
     ax, ay, az, bx, by, bz = n[0], n[1], n[2], m[0], m[1], m[2]
     xx, xy, xz, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
@@ -282,7 +281,7 @@ def _weigh_inliers(
 
 @kernel
 def _largest(row: Ints32, order: Ints32) -> None:
-    """Write the indices of the largest of a row, largest first, of equals the earlier."""
+    """Write the indices of the largest values of a row, in descending order; ties by index."""
     found = 0
     for j in range(len(row)):
         if found == len(order) and row[j] <= row[order[found - 1]]:
@@ -319,7 +318,7 @@ def _hypotheses(
         weights[seed] = max(row[order[0]], 1)
         for k in order:
             weights[k] = max(float(row[k]), weights[k])
-        for j in range(count):  # avoid seeds that would repeat this hypothesis
+        for j in range(count):  # skip seeds that would repeat this hypothesis
             if row[j] > 0:
                 support[j] *= 1.0 - 0.5 * row[j] / row[order[0]]
         support[seed] = 0.0
@@ -339,11 +338,11 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
     Parameters
     ----------
     source, target : patches of the two frames
-    pairs : (M, 2) int32 correspondences, index in source and in target
+    pairs : (M, 2) int32 correspondences, indices in source and in target
 
     Returns
     -------
-    (S, 4, 4) at most `n_seeds` transforms T_target_source; none if no three agree
+    (S, 4, 4) T_target_source, at most `n_seeds`; none if fewer than three correspondences agree
     """
     if len(pairs) < 3:
         return np.empty((0, 4, 4))
@@ -364,10 +363,10 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
 
 
 def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
-    """Return the angle of `up` (3,) to the nearest dominant direction of the frame's surface, rad.
+    """Return the angle between `up` (3,) and the nearest dominant direction of the surface, rad.
 
-    Visible floors and tables show up as precisely as an IMU, but a ramp misleads and a floor may be
-    out of view: the angle is a hint, no evidence.
+    Visible floors and tables show the up direction as precisely as an IMU, but a ramp misleads and
+    the floor may be out of view. Therefore the angle is a hint, not evidence.
     """
     facing = frame.surface.normals[frame.surface.valid][:: p.floor_stride].astype(float)
     if not len(facing):
@@ -379,7 +378,7 @@ def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
 def contradiction(
     tilt: float, query: Geometry, match: Geometry, ups: Ups, p: GravityParameters
 ) -> str:
-    """Return the reason for refusing surfaces that fit only if tilted against `up`.
+    """Return the reason for refusing a transform that fits, but tilts against `up`.
 
     Parameters
     ----------
@@ -394,13 +393,13 @@ def contradiction(
     ]
     whose = f" of the {wrong[0]}, whose own floor disagrees with it" if len(wrong) == 1 else ""
     return (
-        f"the surfaces fit, but only tilted by {math.degrees(tilt):.0f} deg against `up`: a place "
-        f"that looks alike, or a wrong `up`{whose}. Check the IMU's calibration and the axes of "
-        "`up`"
+        f"the surfaces fit only if tilted by {math.degrees(tilt):.0f} deg against `up`: either the "
+        f"place only looks similar, or `up` is wrong{whose}. Check the IMU's calibration and the "
+        "axes of `up`"
     )
 
 
-#: Source of a proposed transform: correspondences, plans, or the map's poses.
+#: Source of a proposed transform: correspondences, plans or the map's poses.
 Search = Literal["correspondences", "plans", "guided"]
 
 
@@ -412,15 +411,15 @@ class AlignmentParameters:
     consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
     n_refined: int = 16  #: number of hypotheses that are refined
     score_stride: int = 2  #: stride of the points that score hypotheses
-    n_fine: int = 6  #: number of scans' hypotheses that are refined finely before ranking
-    fine_stride: int = 4  #: stride of the pixels for that
+    n_fine: int = 6  #: number of hypotheses of scans that are refined finely before ranking
+    fine_stride: int = 4  #: stride of the pixels in this refinement
     violation_weight: float = 3.0  #: weight of a violation in the score of a hypothesis
     rank_violations: float = 1.0  #: weight of violations in the rank of a refined hypothesis
-    same_m: float = 0.1  #: distance within which hypotheses are equal, metres
-    same_rad: float = math.radians(6.0)  #: and radians
+    same_m: float = 0.1  #: maximum difference of equal hypotheses, metres
+    same_rad: float = math.radians(6.0)  #: the same, radians
     coarse: RefinementParameters = COARSE
     fine: RefinementParameters = FINE
-    lever: float = 1.0  #: metres that count as a radian in `stiffness`
+    lever: float = 1.0  #: length that counts as one radian in `stiffness`, metres
     sequence: SequenceParameters = field(default_factory=SequenceParameters)
     plan: PlanParameters = field(default_factory=PlanParameters)
     gravity: GravityParameters = field(default_factory=GravityParameters)
@@ -428,12 +427,12 @@ class AlignmentParameters:
 
 @dataclass(frozen=True, eq=False)
 class FrameSamples:
-    """A frame prepared for the scoring of hypotheses.
+    """A frame that is prepared for the scoring of hypotheses.
 
     Parameters
     ----------
     points : (N, 6) float32 result of `sample_points`
-    up : (3,) unit vector in the sensor's coordinates, or None
+    up : (3,) unit vector in the sensor's coordinates; None if unknown
     """
 
     geometry: Geometry
@@ -456,7 +455,7 @@ def _upright_plan(surface: Surface, p: PlanParameters) -> ScanPlan:
 def frame_samples(
     geometry: Geometry, stride: int, p: PlaneParameters, up: Floats | None = None
 ) -> FrameSamples:
-    """Return a frame prepared for `align`; stride in pixels."""
+    """Return a frame that is prepared for `align`; the stride is in pixels."""
     return FrameSamples(
         geometry, sample_points(geometry.surface, stride), plane_view(geometry, p), up
     )
@@ -469,12 +468,12 @@ class Alignment:
     Parameters
     ----------
     T : (4, 4) T_target_source
-    others : (n, 4, 4) the other refined hypotheses, best first
-    stiffness : ratio of the least to the largest eigenvalue of the information, 0 with a free
-        direction
-    refined : the last refinement, with its information; None if it failed
+    others : (n, 4, 4) other refined hypotheses, best first
+    stiffness : ratio of the smallest to the largest eigenvalue of the information; 0 if a direction
+        is unconstrained
+    refined : last refinement, with its information; None if it failed
     search : source of the transform
-    proposed : (n, 4, 4) for scans, all hypotheses before refinement, best first
+    proposed : (n, 4, 4) all hypotheses before refinement, best first; for scans only
     """
 
     T: Floats
@@ -495,18 +494,20 @@ def align(
 ) -> Alignment | None:
     """Search for the transform from source to target: Sec. III-E, in one direction.
 
-    Correspondences propose some forty hypotheses. These are scored by the agreement of both frames'
-    points, the best distinct ones are refined and ranked by planes, and the best is refined finely.
+    Correspondences propose about 40 hypotheses, which are scored by the agreement of both frames'
+    points. The best distinct hypotheses are refined and ranked by planes, and the best is refined
+    finely.
 
     Parameters
     ----------
     source, target : samples of two frames
-    rng : generator of the sampled patches
+    rng : random generator for the sampled patches
     matching : method of matching
 
     Returns
     -------
-    alignment : or None if no three correspondences agree, or all refinements fail
+    alignment : the result, or None if fewer than three correspondences agree or all refinements
+        fail
     """
     a, b = source.geometry, target.geometry
     ups = source.up, target.up
@@ -531,20 +532,20 @@ def align_scans(
     *,
     other_axes: bool = False,
 ) -> tuple[Alignment, Alignment] | None:
-    """Search for the transforms between two scans: one search, refined in each direction.
+    """Search for the transform between two scans, and refine it in both directions.
 
-    Plans add to the hypotheses of correspondences. The best few are refined finely before ranking:
-    plans are coarse, and coarsely refined hypotheses rank badly.
+    Both correspondences and plans propose hypotheses. The best are refined finely before ranking,
+    since plans are coarse and the ranks of coarsely refined hypotheses are unreliable.
 
     Parameters
     ----------
     query, match : samples of two scans
     rng, p, overlap_p, matching : arguments of `align`
-    other_axes : whether the scanners may not have stood upright
+    other_axes : whether to consider scanners that did not stand upright
 
     Returns
     -------
-    alignments : there and back, or None if all refinements fail
+    alignments : query to match and match to query, or None if all refinements fail
     """
     a, b = query.geometry, match.geometry
     ups = query.up, match.up
@@ -580,7 +581,7 @@ def align_scans(
 def align_guided(
     source: FrameSamples, target: FrameSamples, T: Floats, p: AlignmentParameters
 ) -> Alignment | None:
-    """Refine a known transform, (4, 4) T_target_source, in one direction; None if that fails."""
+    """Refine a predicted T_target_source (4, 4) in one direction; return None if that fails."""
     surface, onto = source.geometry.surface, target.geometry.surface
     coarse = refine(
         sample_points(surface, p.coarse.stride), onto, T, p.coarse, kind_of(surface.camera)
@@ -600,7 +601,7 @@ def _vote(
     source: Geometry, target: Geometry, rng: np.random.Generator, p: AlignmentParameters,
     matching: Matching, ups: Ups,
 ) -> Floats:  # fmt: skip
-    """Return the hypotheses of correspondences, except those that tilt."""
+    """Return the hypotheses from correspondences, without tilted ones."""
     pairs = _pairs(source, target, rng, p, matching, ups)
     voted = consensus(source.patches, target.patches, pairs, p.consensus)
     return voted[are_level(voted, ups, p.gravity.proposed_tilt)]
@@ -626,7 +627,6 @@ def _refine_finally(
     source: FrameSamples, target: FrameSamples, T: Floats, others: Floats, p: AlignmentParameters,
     search: Search,
 ) -> Alignment:  # fmt: skip
-    """Refine a transform finely."""
     surface = source.geometry.surface
     onto = target.geometry.surface.fitted
     fine = refine(sample_points(surface, p.fine.stride), onto, T, p.fine, kind_of(surface.camera))
@@ -642,7 +642,7 @@ def _scores(
     source: FrameSamples, target: FrameSamples, transforms: Floats, p: AlignmentParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Return the shares of inliers, less weighted violations, of both frames' points."""
+    """Return the shares of inliers minus weighted violations, over both frames' points."""
     total = np.zeros(len(transforms))
     for frame, other, direction in (
         (source, target, transforms), (target, source, inverses(transforms)),

@@ -1,20 +1,20 @@
-"""Refine a transform by point-to-plane ICP, and estimate its covariance (Sec. III-E).
+"""Refinement of a transform by point-to-plane ICP, and its covariance (Sec. III-E).
 
     points of the source, surface of the target, T  --refine-->  T, information
-    refinement there, refinement back, T  --pair_covariance-->  covariance (6, 6)
+    refinements in both directions, T  --pair_covariance-->  covariance (6, 6)
     covariance  --free_directions-->  directions in which the surfaces can slide
     covariance, R, lever  --transform_covariance-->  covariance in another frame
 
-Projective point-to-plane alignment compares a point with the plane that the target saw in its
-direction. Depth errors of structured-light sensors grow with z^2, so distant points weigh less. In
-a target without a viewpoint, a point is compared with the plane of the nearest point with a similar
+Projective point-to-plane alignment compares a point with the plane that the target observed in its
+direction. Depth errors of structured-light sensors grow with z^2, so distant points weigh less. If
+the target has no viewpoint, a point is compared with the plane of the nearest point with a similar
 normal.
 
 The error of T_parent_child is (x, y, z, rx, ry, rz), as in ROS's PoseWithCovariance: x is added to
 its translation, metres along the parent's axes, and the rotation vector r, radians about the
 parent's axes, is applied before its rotation, T_true = [exp(r) R, t + x], to first order. The
-inverse of Gauss-Newton's information alone is no covariance, because the errors of neighbouring
-pixels are correlated: docs/uncertainty.md measures their effective number.
+inverse of the Gauss-Newton information is not a covariance, because the errors of neighbouring
+pixels are correlated: docs/uncertainty.md measures the effective number of points.
 """
 
 from __future__ import annotations
@@ -53,24 +53,24 @@ class RefinementParameters:
 
     stride: int  #: stride of the source's pixels
     iterations: int  #: number of Gauss-Newton steps
-    first_gate: float  #: greatest distance of a point from the plane in the first step, metres
-    last_gate: float  #: and in the last
-    normal_cosine: float = 0.7  #: least cosine between corresponding normals
-    reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / this)^growth)
-    minimum_points: int = 20  #: least number of points
-    growth: int = 2  #: 2 for the noise of a depth sensor, 1 or 0 for a scanner's
+    first_gate: float  #: maximum distance of a point from the plane in the first step, metres
+    last_gate: float  #: the same in the last step, metres
+    normal_cosine: float = 0.7  #: minimum cosine between corresponding normals
+    reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / reference_depth)^growth)
+    minimum_points: int = 20  #: minimum number of corresponding points
+    growth: int = 2  #: exponent of noise: 2 for a depth sensor, 1 or 0 for a scanner
     weight_depth: float = 1.0  #: depth at which weights start to fall as 1 / z^4, metres
-    nearest: float = 0.1  #: least depth of a point in the target's camera, metres
-    reach: float = 0.25  #: greatest distance to a point of an unordered target, metres
+    nearest: float = 0.1  #: minimum depth of a point in the target's camera, metres
+    reach: float = 0.25  #: maximum distance to a point of an unordered target, metres
     thinning: int = 1  #: stride of the points in the first iterations
     last_iterations: int = 2  #: number of iterations with all points
 
 
-#: For a quick check of a hypothesis.
+#: Parameters for a quick check of a hypothesis.
 QUICK = RefinementParameters(10, 4, 0.25, 0.15)
-#: For hypotheses: few points, wide gates.
+#: Parameters for hypotheses, with few points and wide gates.
 COARSE = RefinementParameters(5, 8, 0.25, 0.08)
-#: For the best hypotheses.
+#: Parameters for the best hypotheses.
 FINE = RefinementParameters(2, 8, 0.08, 0.03, thinning=4)
 
 
@@ -81,11 +81,10 @@ class Refinement:
     Parameters
     ----------
     T : (4, 4) T_target_source
-    information : (6, 6) J^T W J per point: rotation (radians), then translation (metres), about the
+    information : (6, 6) J^T W J per point, in rotation (radians) and translation (metres) about the
         target's origin
     points : number of points in the last step
-    mean_square : mean weighted square of their residuals: the noise of this pair, in the weights of
-        `information`
+    mean_square : mean weighted square of the points' residuals, which measures the noise
     """
 
     T: Floats
@@ -99,7 +98,7 @@ def _add(
     A: Floats, g: Floats, row: Floats, x: float, y: float, z: float,
     mx: float, my: float, mz: float, residual: float, weight: float,
 ) -> None:  # fmt: skip
-    """Add a moved point (x, y, z), on a plane with normal m, to the normal equations."""
+    """Add a transformed point (x, y, z), on a plane with normal m, to the normal equations."""
     row[0], row[1], row[2] = y * mz - z * my, z * mx - x * mz, x * my - y * mx
     row[3], row[4], row[5] = mx, my, mz
     for a in range(6):
@@ -114,13 +113,13 @@ def _nearest_in_line(
     points: Floats32, width: int, column: Ints32, line: Ints32, beside: int,
     x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
 ) -> None:  # fmt: skip
-    """Update the nearest pixel of each point with three pixels of the line `beside` its own.
+    """Update the nearest pixel of each point with three pixels, `beside` lines from its own line.
 
-    nearest: squared distances. best: indices in the flat map.
+    `nearest` are squared distances, and `best` indices of pixels in row-major order.
     """
     for i in range(count):
         start, middle = (line[i] + beside) * width, column[i]
-        # the last column of a closed sphere adjoins the first
+        # in a closed sphere, the last column adjoins the first column
         first = start + (middle - 1 if middle > 0 else width - 1)
         second = start + middle
         third = start + (middle + 1 if middle < width - 1 else 0)
@@ -169,8 +168,9 @@ def _weigh_points(
     x: Floats, y: Floats, z: Floats, depth: Floats, nearest: Floats, best: Ints32, T: Floats,
     gate: float, numbers: Floats, count: int, rows: Floats, weights: Floats,
 ) -> None:  # fmt: skip
-    """Write rows of the Jacobian and residuals, (7, n), of points with their nearest pixels, and
-    weights: negative if the two do not correspond.
+    """Write Jacobians and residuals (7, n) of points at their nearest pixels, and their weights.
+
+    A weight is negative if point and pixel do not correspond.
     """
     least_cosine, reference, power = numbers[3], numbers[4], numbers[6]
     per_depth = numbers[7]
@@ -205,7 +205,7 @@ def _weigh_points(
 
 @disjoint_kernel
 def _select_compatible(weights: Floats, count: int, places: Ints32) -> int:
-    """Write the indices of the weights that are not negative; return their number."""
+    """Write the indices of all non-negative weights; return their number."""
     found = 0
     for i in range(count):
         places[found] = i
@@ -217,8 +217,8 @@ def _select_compatible(weights: Floats, count: int, places: Ints32) -> int:
 def _add_all(rows: Floats, weights: Floats, places: Ints32, count: int, sums: Floats) -> None:
     """Add points to the normal equations in their order.
 
-    sums (28,): the lower triangle of A row by row, then -g and the weighted squares. Single
-    variables, because numba keeps only these in registers.
+    `sums` (28,) are the lower triangle of A by rows, -g and the weighted squares. The loop uses
+    scalar variables, because numba keeps only these in registers.
     """
     r0, r1, r2, r3, r4, r5, r6 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6]
     aa, ba, bb, ca, cb, cc = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
@@ -259,14 +259,14 @@ def _accumulate(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats, gate: float,
     numbers: Floats, room: Floats, indices: Ints32, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Write the normal equations of a Gauss-Newton step on the points of (7, N); return the number
-    of points used, and the sum of their weighted squares.
+    """Write the normal equations of a Gauss-Newton step on points (7, N); return the number of
+    points used, and the sum of their weighted squares.
 
-    Each step processes a block of points, which vectorizes; sums keep the order of the points.
+    Points are processed in blocks, which can be vectorized, but summed in their order.
     """
     height, width = points.shape[0], points.shape[1]
     shown, facing = points.reshape(-1), normals.reshape(-1)
-    # the first column of a closed sphere adjoins the last
+    # in a closed sphere, the first column adjoins the last column
     edge = 0.0 if camera[0] == 1 and camera[6] > 0 else 1.0
     moved, seen, inside, rows = room[:3], room[3:6], room[6:10], room[10:17]
     nearest, weights, sums, used = room[17], room[18], np.zeros(28), 0
@@ -349,10 +349,10 @@ def _refine_one(
     camera: Floats, heads: Ints32, chain: Ints32, T: Floats, numbers: Floats,
     room: Floats, indices: Ints32, information: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Run Gauss-Newton on T; return the number of points in the last step, 0 if it failed, and
-    their mean weighted square before it.
+    """Refine T by Gauss-Newton steps; return the number of points in the last step, 0 if it failed,
+    and their mean weighted square before that step.
 
-    whole, few : points of the last iterations, and of the first; see `_transpose`
+    `whole` and `few` are the points of the last and of the first iterations; see `_transpose`.
     """
     iterations, minimum = int(numbers[0]), int(numbers[5])
     thinned = iterations - int(numbers[10])
@@ -432,7 +432,7 @@ def refine_in_place(
 
 @lru_cache(maxsize=32)
 def kernel_numbers(p: RefinementParameters, kind: int) -> Floats:
-    """Return the parameters and the kind of the source's camera as an array for the kernels."""
+    """Return the parameters and the kind of the source's camera as an array for kernels."""
     return np.array(
         [p.iterations, p.first_gate, p.last_gate, p.normal_cosine, p.reference_depth,
          p.minimum_points, p.growth, 1.0 / p.weight_depth, kind, p.thinning, p.last_iterations],
@@ -448,14 +448,15 @@ def refine(
 
     Parameters
     ----------
-    source : (N, 6) float32 points and normals, of `overlap.sample_points` with the stride of `p`
+    source : (N, 6) float32 result of `overlap.sample_points` with the stride of `p`
     target : (h, w) surface, or unordered points
     T_target_source : (4, 4) initial transform
     kind : kind of the source's camera (`camera.kind_of`), which determines the weights
 
     Returns
     -------
-    refinement : or None if fewer than `minimum_points` stay within the gates, or a step is singular
+    refinement : the result, or None if a step is singular or fewer than `minimum_points` points
+        remain within the gates
     """
     T, information, used, squares = _refine(source, target, T_target_source[None], p, kind)
     return Refinement(T[0], information[0], int(used[0]), float(squares[0])) if used[0] else None
@@ -475,14 +476,14 @@ def _refine(
 def refine_all(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> Floats:
-    """Refine hypotheses (n, 4, 4), and omit those that fail."""
+    """Return the refined hypotheses (n, 4, 4) without those whose refinement failed."""
     return refine_with_index(source, target, hypotheses, p)[0]
 
 
 def refine_with_index(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> tuple[Floats, NDArray[np.intp]]:
-    """Refine hypotheses as `refine_all`; return the indices of the successful ones too."""
+    """Return the results of `refine_all` and the indices of their hypotheses."""
     points = sample_points(source, p.stride)
     T, _, used, _ = _refine(points, target, hypotheses, p, kind_of(source.camera))
     index = np.flatnonzero(used)
@@ -490,11 +491,11 @@ def refine_with_index(
 
 
 Method = Literal["information-scaled", "votes-and-spread"]
-#: Methods of the covariances of a pair, and of an averaged pose.
+#: Name of the method of `pair_covariance`.
 PAIR_METHOD: Method = "information-scaled"
 PLACE_METHOD: Method = "votes-and-spread"
 
-#: Reorders rotation, translation (as in a refinement) to translation, rotation.
+#: Indices that reorder (rotation, translation), as in a refinement, to (translation, rotation).
 _SHIFT_FIRST = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 
 
@@ -503,19 +504,19 @@ class CovarianceParameters:
     """Parameters of covariances; docs/uncertainty.md describes how they were tuned."""
 
     independent: float = 5.3  #: effective number of independent points per direction
-    least_square: float = 1e-7  #: least mean weighted square: no sensor is more accurate
-    most: float = 10.0  #: deviation in unconstrained directions, metres and radians
-    lever: float = 1.0  #: metres that count as a radian
-    free: float = 30.0  #: least ratio of a free direction's deviation to the least deviation
+    least_square: float = 1e-7  #: minimum mean weighted square: no sensor is more accurate
+    most: float = 10.0  #: maximum deviation, for unconstrained directions, metres and radians
+    lever: float = 1.0  #: length that counts as one radian, metres
+    free: float = 30.0  #: minimum ratio of a free direction's deviation to the minimum deviation
 
 
 @dataclass(frozen=True, eq=False)
 class SlidingDirection:
-    """A direction in which a transform is hardly constrained.
+    """A direction in which the surfaces hardly constrain a transform.
 
     Parameters
     ----------
-    translation, rotation : (3,) each, together of unit length: the error, metres and radians
+    translation, rotation : (3,) each, in metres and radians; together a unit vector
     deviation : standard deviation in this direction, metres for translations, radians for rotations
     """
 
@@ -525,7 +526,7 @@ class SlidingDirection:
 
 
 def cross_matrix(v: Floats) -> Floats:
-    """Return [v]x (3, 3): cross_matrix(v) @ u = v x u."""
+    """Return the matrix [v]x (3, 3), for which [v]x @ u = v x u."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -534,8 +535,8 @@ def adjoint(R: Floats, lever: Floats) -> Floats:
 
     Parameters
     ----------
-    R : (3, 3) old parent's axes in the new one's
-    lever : (3,) from the old child's origin to the new one's, along the new axes
+    R : (3, 3) rotation from the old parent's axes to the new parent's axes
+    lever : (3,) vector from the old child's origin to the new child's origin, along the new axes
     """
     result = np.zeros((6, 6))
     result[:3, :3], result[3:, 3:] = R, R
@@ -544,13 +545,15 @@ def adjoint(R: Floats, lever: Floats) -> Floats:
 
 
 def transform_covariance(covariance: Floats, R: Floats, lever: Floats) -> Floats:
-    """Return a covariance (6, 6) in other axes, and at another point of the same body: A S A^T.
+    """Return a covariance (6, 6) in other axes and at another point of the same body: A S A^T.
 
-    For T_a_b with rotation R and translation t, and exact transforms beside it, use as (R, lever):
+    For T_a_b with rotation R and translation t, the arguments (R, lever) are:
 
     * (R_c_a, 0) for T_c_a T_a_b
-    * (identity, R t_b_d) for T_a_b T_b_d, as of a robot's base
+    * (identity, R t_b_d) for T_a_b T_b_d
     * (R^T, -R^T t) for the inverse T_b_a
+
+    The other transforms are exact.
     """
     A = adjoint(R, lever)
     moved: Floats = A @ covariance @ A.T
@@ -567,16 +570,16 @@ def pair_covariance(
 
     Parameters
     ----------
-    there, back : the last refinement of each direction, or None if it failed
+    there, back : last refinement of T_match_query and of its inverse; None if it failed
     T : (4, 4) T_match_query
 
     Returns
     -------
-    (6, 6) covariance of T, or None if both failed
+    (6, 6) covariance of T; None if both refinements failed
     """
     p = p or CovarianceParameters()
     information, squares = [], []
-    # one is an error at the match's origin; the other is in the query's axes, of opposite sign
+    # `there` has errors at the match's origin; `back` in the query's axes, with opposite sign
     for refinement, R, lever in (
         (there, np.eye(3), -T[:3, 3]), (back, T[:3, :3].T, np.zeros(3))
     ):  # fmt: skip
@@ -599,10 +602,10 @@ def pair_covariance(
 def free_directions(
     covariance: Floats, p: CovarianceParameters | None = None
 ) -> tuple[SlidingDirection, ...]:
-    """Return the directions whose deviation is far above the least, the freest first.
+    """Return the directions whose deviation far exceeds the minimum, in descending order.
 
-    A plane has three: two translations within it, and the rotation about its normal; a corridor has
-    one, along it; a corner has none.
+    A plane has three: two translations within it, and the rotation about its normal. A corridor has
+    its own direction, and a corner has none.
     """
     p = p or CovarianceParameters()
     scale = _scale(p)
@@ -621,15 +624,14 @@ def free_directions(
 def place_covariance(average: PoseAverage, poses: Floats, covariances: Floats) -> Floats:
     """Return the covariance of an averaged pose, from its votes' covariances and their spread.
 
-    All votes share the query. So half of the mean covariance stays whole, and the other half is
-    divided by the number of votes, as is their spread, which contains the errors of the map's
-    poses.
+    All votes share the query, so only half of the mean covariance is divided by the number of
+    votes. The votes' spread, which contains the errors of the map's poses, is divided too.
 
     Parameters
     ----------
     average : result of `average_poses`
     poses : (n, 4, 4) poses that were averaged
-    covariances : (n, 6, 6) of each pose
+    covariances : (n, 6, 6) covariances of the poses
     """
     own: Floats = covariances[average.members].mean(axis=0)
     n = len(average.members)
@@ -641,7 +643,7 @@ def place_covariance(average: PoseAverage, poses: Floats, covariances: Floats) -
 
 
 def pose_error(T: Floats, true: Floats) -> Floats:
-    """Return the error (x, y, z, rx, ry, rz) of a transform (4, 4); see the module."""
+    """Return the error (x, y, z, rx, ry, rz) of a transform (4, 4), as this module defines it."""
     turn = true[:3, :3] @ T[:3, :3].T
     axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     sine = float(np.linalg.norm(axis))  # twice the sine of the angle
@@ -651,5 +653,5 @@ def pose_error(T: Floats, true: Floats) -> Floats:
 
 
 def _scale(p: CovarianceParameters) -> Floats:
-    """Return the factors that convert an error's six numbers to metres."""
+    """Return the factors that convert the six components of an error to metres."""
     return np.array([1.0, 1.0, 1.0, p.lever, p.lever, p.lever])

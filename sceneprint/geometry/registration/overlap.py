@@ -1,4 +1,4 @@
-"""Measure how well two surfaces agree under a transform (Sec. III-E, evidence).
+"""The agreement of two surfaces under a transform (Sec. III-E, evidence).
 
     points of the source, surface of the target, T  --agreements-->  inliers, violations
     Surface  --lookup_target-->  LookupTarget    LookupTarget, point  --nearest_alike-->  index
@@ -8,11 +8,11 @@ Points are projected into the target's camera: no search tree is needed, and a p
 target's surface violates free space, because the target would have seen it. If the target has no
 viewpoint, points are looked up by position, and free space is unknown.
 
-Unordered points are stored in a hash of cubes. One point per small cube is kept, so a cube holds a
-bounded number of points.
+Unordered points are stored in a hash table of cubes. Only one point per small cube is stored, so
+the number of points in a cube is bounded.
 
-A floor may be half of what a sensor sees, yet a floor on a floor is weak evidence for a transform.
-So patches that lie in one plane share one weight.
+A floor may fill half of a frame, but two floors that coincide are weak evidence for a transform.
+Therefore all patches in one plane share one weight.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from sceneprint.types import (
     camera_of,
 )
 
-#: Number of small cubes along the reach; a cube of the hash is two reaches wide.
+#: Number of small cubes along the reach; a cube of the hash table is two reaches wide.
 FINENESS = 5.0
 
 
@@ -63,9 +63,9 @@ class LookupTarget(NamedTuple):
     Parameters
     ----------
     points, normals : (h, w, 3); (1, N, 3) if unordered
-    camera : (7,) of `camera_of`; if unordered, its third number is the reach, and its fourth the
-        secret of the hash
-    heads, chain : hash table: first point of each slot, and next point of each point; -1 for none
+    camera : (7,) result of `camera_of`; if unordered, the third number is the reach, and the fourth
+        the secret of the hash table
+    heads, chain : first point of each slot, and successor of each point in its slot; -1 if none
     """
 
     points: Floats32
@@ -77,13 +77,13 @@ class LookupTarget(NamedTuple):
 
 @kernel
 def _slot(i: int, j: int, k: int, slots: int, secret: int) -> int:
-    """Return the slot of a cube; the number of slots is a power of two."""
+    """Return the slot of a cube in a table whose number of slots is a power of two."""
     return hash_key((((i << 21) + j) << 21) + k, secret) & (slots - 1)
 
 
 @kernel
 def _fill(points: Floats32, cube: float, secret: int, heads: Ints32, chain: Ints32) -> None:
-    """Enter every point into the slot of its cube, the last first."""
+    """Insert every point into the slot of its cube, in reverse order."""
     for n in range(len(points)):
         slot = _slot(
             int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
@@ -98,10 +98,12 @@ def nearest_alike(
     points: Floats32, normals: Floats32, camera: Floats, heads: Ints32, chain: Ints32,
     at: Floats, facing: Floats, least_cosine: float,
 ) -> tuple[int, float]:  # fmt: skip
-    """Return the nearest point in reach with a similar normal: index, -1 for none, and square."""
+    """Return the nearest point within reach with a similar normal: index, -1 if none, and squared
+    distance.
+    """
     reach, secret, slots = camera[2], int(camera[3]), len(heads)
     cube = 2.0 * reach
-    # the eight cubes that a ball of this reach can touch
+    # a ball with the reach as its radius touches at most eight cubes
     i0 = int(np.floor(at[0] / cube - 0.5))
     j0 = int(np.floor(at[1] / cube - 0.5))
     k0 = int(np.floor(at[2] / cube - 0.5))
@@ -115,7 +117,7 @@ def nearest_alike(
                         at[0] - points[0, n, 0], at[1] - points[0, n, 1], at[2] - points[0, n, 2]
                     )  # fmt: skip
                     square = ex * ex + ey * ey + ez * ez
-                    # of equals the first, independent of the order of the slots
+                    # the lower index wins a tie, whatever the order in the slot
                     if square < least or (square == least and found > n):
                         cosine = (
                             facing[0] * normals[0, n, 0]
@@ -134,7 +136,7 @@ def _first_in_cubes(
 ) -> int:
     """Write the indices of the points that are first in their cubes; return their number.
 
-    table: slots, a power of two, all -1. cells: (N, 3), cubes of these points.
+    `table` has slots of -1, in a number that is a power of two; `cells` (N, 3) are the cubes.
     """
     mask, found = len(table) - 1, 0
     for n in range(len(points)):
@@ -159,7 +161,7 @@ def _first_in_cubes(
 
 
 def first_per_cube(points: Floats32, cube: float) -> Ints32:
-    """Return ascending indices of the first point (N, 3) in each occupied cube; width in metres."""
+    """Return the ascending indices of the first point in each cube of width `cube`, metres."""
     n = len(points)
     table = np.full(1 << max((2 * n - 1).bit_length(), 1), -1, np.int32)
     cells, kept = np.empty((n, 3), np.int64), np.empty(n, np.int32)
@@ -175,8 +177,8 @@ def lookup_target(surface: Surface, nearest: float, reach: float) -> LookupTarge
     Parameters
     ----------
     surface : surface of any kind
-    nearest : least depth of a point in its camera, metres
-    reach : greatest distance to an unordered point, metres
+    nearest : minimum depth of a point in the surface's camera, metres
+    reach : maximum distance to an unordered point, metres
     """
     camera, none = camera_of(surface.camera, nearest), np.zeros(0, np.int32)
     if surface.camera is not None:
@@ -193,24 +195,24 @@ def lookup_target(surface: Surface, nearest: float, reach: float) -> LookupTarge
 
 
 def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
-    """Return at most `most` of a surface's unordered points, spread evenly.
+    """Return at most `most` of a surface's unordered points, evenly distributed.
 
     Parameters
     ----------
     surface : surface without a camera
     most : maximum number of points, at least 1
-    cube : width of the first grid, metres; default: a 4096th of the extent
+    cube : width of the cubes of the first grid, metres; 0 selects 1/4096 of the extent
 
     Returns
     -------
-    surface : the first point in each cube of a grid that is wide enough; all valid points if there
-        are few
+    surface : first point in each cube of a sufficiently coarse grid; all valid points if there are
+        at most `most`
     """
     points = surface.points[surface.valid]
     indices = np.arange(len(points), dtype=np.int32)
     cube = cube or float(np.ptp(points, axis=0).max(initial=0.0)) / 4096
     while len(indices) > most:
-        # widening by the root of 2 halves the number of cubes that a surface occupies
+        # a factor of the root of 2 halves the number of cubes that a surface occupies
         cube *= max((len(indices) / most) ** 0.5, 1.02)
         indices = first_per_cube(points, cube) if cube > 0 else indices[:1]
     return Surface(
@@ -222,7 +224,7 @@ def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
     )
 
 
-#: Number of pixels of a depth image's surface: 160 x 120.
+#: Number of pixels of the surface of a depth image: 160 x 120.
 DEPTH_PIXELS = 19_200
 
 
@@ -230,22 +232,22 @@ DEPTH_PIXELS = 19_200
 class OverlapParameters:
     """Parameters of agreement; lengths grow by max(1, (z / `reference_depth`)^`growth`)."""
 
-    surface_tolerance: float = 0.05  #: greatest distance of a point from the target's plane, metres
-    point_tolerance: float = 0.15  #: greatest distance of a point from the target's point, metres
-    normal_cosine: float = 0.7  #: least cosine between normals that agree
-    free_space_margin: float = 0.1  #: least distance of a violation before the surface, metres
-    reference_depth: float = 5.0**0.5  #: depth from which a depth sensor's noise matters, metres
-    edge_px: int = 2  #: least distance of a violation from a pixel that agrees, pixels
+    surface_tolerance: float = 0.05  #: maximum distance of a point from the target's plane, metres
+    point_tolerance: float = 0.15  #: maximum distance of a point from the target's point, metres
+    normal_cosine: float = 0.7  #: minimum cosine between normals that agree
+    free_space_margin: float = 0.1  #: minimum distance of a violation before the surface, metres
+    reference_depth: float = 5.0**0.5  #: depth from which tolerances grow, metres
+    edge_px: int = 2  #: minimum distance of a violation from a pixel that agrees, pixels
     stride: int = 5  #: stride of the pixels that are looked up
-    growth: int = 2  #: 2 for the noise of a depth sensor, 1 or 0 for a scanner's
-    nearest: float = 0.1  #: least depth of a point in the target's camera, metres
+    growth: int = 2  #: exponent of noise: 2 for a depth sensor, 1 or 0 for a scanner
+    nearest: float = 0.1  #: minimum depth of a point in the target's camera, metres
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Counts of the source's points."""
+    """Counts of the source's points by agreement."""
 
-    points: int  #: number of all points
+    points: int  #: total number of points
     inliers: int  #: points on the target's surface with similar normals
     violations: int | None  #: points in the target's free space; None without a viewpoint
 
@@ -263,7 +265,7 @@ def _copy_valid(
 ) -> int:  # fmt: skip
     """Copy points and normals of valid pixels line by line; return their number.
 
-    rows, columns: first and step.
+    `rows` and `columns` are the first index and the step.
     """
     found = 0
     for y in range(rows[0], valid.shape[0], rows[1]):
@@ -277,11 +279,10 @@ def _copy_valid(
 
 @cached_per_frame
 def sample_points(surface: Surface, stride: int) -> Floats32:
-    """Return every `stride`-th row and column's valid points and normals, (N, 6) float32.
+    """Return the valid points and normals of every `stride`-th row and column, (N, 6) float32.
 
-    Frames of all sensors should contribute equally: a sphere with more pixels than `DEPTH_PIXELS`
-    gets a greater stride, and about as many points of a scan are returned. A stride of 1 returns
-    the whole map.
+    Frames of all sensors should contribute equally. Therefore the stride is larger for a sphere
+    with more than `DEPTH_PIXELS` pixels, unless it is 1.
     """
     if surface.spread is not None and stride > 1:
         points, normals = surface.spread.points[0], surface.spread.normals[0]
@@ -302,7 +303,7 @@ def sample_points(surface: Surface, stride: int) -> Floats32:
 
 #: Verdicts of a target on a point: unobserved, on its surface, or in its free space.
 UNKNOWN, AGREES, VIOLATES = 0, 1, 2
-#: Preliminary verdict of `_compare`, decided by `_saw_through`.
+#: Preliminary verdict of `_compare`, which `_saw_through` replaces.
 _BEFORE = 3
 
 
@@ -313,8 +314,8 @@ def _compare(
 ) -> None:  # fmt: skip
     """Write the verdict of each point's pixel; `_BEFORE` if the point lies before its surface.
 
-    source (6, N), places : indices from `start` on; moved (4, n), pixels (2, n) : coordinates,
-    depth and pixels of these points
+    `places` are indices of `source` (6, N) relative to `start`; `moved` (4, n) and `pixels` (2, n)
+    are transformed coordinates, depths and pixels of these points.
     """
     on_surface, on_point, least_cosine = tolerances[0], tolerances[1], tolerances[2]
     margin, reference, power = tolerances[3], tolerances[4], tolerances[6]
@@ -349,9 +350,9 @@ def _compare(
 def _saw_through(
     points: Floats32, camera: Floats, u: int, v: int, depth: float, tolerances: Floats
 ) -> bool:
-    """Return whether a point lies before the surfaces of its pixel and of all pixels nearby.
+    """Return whether a point lies before the surfaces of its pixel and of all neighbouring pixels.
 
-    At an edge, a pixel nearby may show the surface of the point.
+    At an edge, a neighbouring pixel may show the surface of the point.
     """
     height, width, edge = points.shape[0], points.shape[1], int(tolerances[5])
     nearest = depth_at(camera, points, v, u)
@@ -361,7 +362,7 @@ def _saw_through(
             if column < 0 or column >= width:
                 if camera[0] == 0 or camera[6] == 0:
                     continue
-                beside = column % width  # across the seam of a closed sphere
+                beside = column % width  # neighbours across the seam of a closed sphere
             there = depth_at(camera, points, line, beside)
             if there > 0:
                 nearest = min(nearest, there)
@@ -483,7 +484,7 @@ def tolerances(p: OverlapParameters) -> Floats:
 
 
 def overlap_target(surface: Surface, p: OverlapParameters) -> LookupTarget:
-    """Return a surface prepared for `weigh_overlap`."""
+    """Return a surface that is prepared for `weigh_overlap`."""
     return lookup_target(surface, p.nearest, p.point_tolerance)
 
 
@@ -501,7 +502,7 @@ def agreements(
     source : (N, 6) float32 result of `sample_points`
     target : (h, w) surface, or unordered points, which have no violations
     transforms : (n, 4, 4) T_target_source
-    weights : (N,) weights of the points; default: 1 each
+    weights : (N,) weights of the points; None gives each point a weight of 1
     """
     out = np.zeros((len(transforms), 2))
     w = np.ones(len(source), np.float32) if weights is None else weights
@@ -546,7 +547,7 @@ def count_verdicts(
 def overlap_counts(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Overlap:
-    """Return the counts of agreement under one transform; see `agreements`."""
+    """Return the counts of agreeing and violating points under a transform; see `agreements`."""
     inliers, violations = agreements(source, target, T_target_source[None], p)[0].tolist()
     has_viewpoint = target.camera is not None
     return Overlap(len(source), round(inliers), round(violations) if has_viewpoint else None)
@@ -554,20 +555,20 @@ def overlap_counts(
 
 @dataclass(frozen=True)
 class PlaneParameters:
-    """Limits within which patches lie in one plane."""
+    """The limits within which patches lie in one plane."""
 
-    coplanar: float = math.radians(15.0)  #: greatest angle between normals
-    same_plane: float = 0.06  #: greatest offset, metres
+    coplanar: float = math.radians(15.0)  #: maximum angle between normals
+    same_plane: float = 0.06  #: maximum distance of a patch from another patch's plane, metres
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneView:
-    """A frame with its patches weighed by planes.
+    """The patches of a frame, weighted by planes.
 
     Parameters
     ----------
     points : (P, 6) float32, means and normals of the patches
-    weights : (P,) float32; those of one plane add up to 1
+    weights : (P,) float32; weights of patches in one plane have the sum 1
     """
 
     surface: Surface
@@ -578,11 +579,11 @@ class PlaneView:
 
 @dataclass(frozen=True, eq=False)
 class PlaneAgreement:
-    """The agreement of two frames under transforms, all planes weighing the same.
+    """The agreement of two frames under transforms, with equal weights for all planes.
 
     Parameters
     ----------
-    share : (n,) share of both frames that agrees, 0 to 1
+    share : (n,) agreeing share of both frames, 0 to 1
     violations : (n,) violations of free space as a share of agreements and violations, 0 to 1
     """
 
@@ -592,7 +593,7 @@ class PlaneAgreement:
 
 @kernel
 def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Ints32) -> None:
-    """Write the number of patches in the plane of each patch, itself included; arrays (3, P)."""
+    """Write the number of patches in the plane of each patch; means and normals are (3, P)."""
     x, y, z, nx, ny, nz = means[0], means[1], means[2], normals[0], normals[1], normals[2]
     for i in range(len(out)):
         ix, iy, iz, a, b, c = x[i], y[i], z[i], nx[i], ny[i], nz[i]
@@ -605,7 +606,7 @@ def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Int
 
 
 def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
-    """Return the weights of patches, (P,): 1 over the number of patches in the plane of each."""
+    """Return the weights of patches, (P,): the inverse number of patches in each one's plane."""
     counts = np.zeros(len(patches), np.int32)
     means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
     _count(means, normals, math.cos(p.coplanar), p.same_plane, counts)
@@ -615,7 +616,7 @@ def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
 
 @cached_per_frame
 def plane_view(geometry: Geometry, p: PlaneParameters) -> PlaneView:
-    """Return a frame prepared for `plane_agreement`."""
+    """Return a frame that is prepared for `plane_agreement`."""
     patches = geometry.patches
     points = np.concatenate([patches.means, patches.normals], axis=1).astype(np.float32)
     return PlaneView(geometry.surface, patches, points, plane_weights(patches, p))

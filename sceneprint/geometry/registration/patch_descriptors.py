@@ -1,14 +1,15 @@
-"""Describe the surroundings of each patch by histograms, and match patches by them (Sec. III-E).
+"""Histograms of the surroundings of patches, and correspondences by histograms (Sec. III-E).
 
     Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
     descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
 
-The properties resemble those of Eq. (1) and are as macro-scale: for every other patch within reach,
-its distance in the plane of the patch, its height over it, and the angles of its normal to the
-patch's normal and to its direction. All are invariant under rigid motion.
+The properties resemble those of Eq. (1) and have the same scale. For every other patch within
+reach, they are its distance in the plane of the patch, its height over that plane, and the angles
+of its normal to the patch's normal and to its direction. All are invariant under rigid motion.
 
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching is public. A random sample
-of the source's patches is compared with all of the target's, and each keeps its nearest.
+of the source's patches is compared with all patches of the target, and each patch corresponds to
+the nearest ones.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ import numpy as np
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Bytes, Floats, Floats32, Ints32, Patches
 
-#: Bins of the two angles, the same at every scale.
+#: Number of bins of each angle, the same at every scale.
 ANGLES = 3
 
 
 @dataclass(frozen=True)
 class PatchDescriptorParameters:
-    """Parameters of the histograms: reach in metres, then bins of distance and of height."""
+    """Parameters of the histograms: reach in metres, number of bins of distance and of height."""
 
     near_radius: float = 0.4
     near_distances: int = 4
@@ -43,7 +44,7 @@ class PatchDescriptorParameters:
 
     @property
     def scales(self) -> Floats:
-        """Return radius, bins of distance, and bins of height of each scale, (3, 3)."""
+        """Return radius, number of distance bins and number of height bins by scale, (3, 3)."""
         return np.array(
             [
                 (self.near_radius, self.near_distances, self.near_heights),
@@ -55,18 +56,18 @@ class PatchDescriptorParameters:
 
     @property
     def dimension(self) -> int:
-        """Return D, the number of bins of all scales."""
+        """Return D, the total number of bins."""
         return int((self.scales[:, 1] * self.scales[:, 2]).sum()) * ANGLES * ANGLES
 
 
 @dataclass(frozen=True, eq=False)
 class Compression:
-    """The principal components of histograms, learnt once.
+    """The principal components of histograms, fitted once.
 
     Parameters
     ----------
     mean : (D,) float32
-    matrix : (d, D) float32, rows orthonormal
+    matrix : (d, D) float32, with orthonormal rows
     """
 
     mean: Floats32
@@ -74,7 +75,7 @@ class Compression:
 
     @cached_property
     def offset(self) -> Floats32:
-        """Return the mean's own components, (d,)."""
+        """Return the components of the mean, (d,)."""
         result: Floats32 = (self.matrix.astype(float) @ self.mean).astype(np.float32)
         return result
 
@@ -84,8 +85,8 @@ class Compression:
         return np.ascontiguousarray(self.matrix.T)
 
 
-#: Limit of the components of a unit vector. Few of 128 exceed it; clipping keeps one large
-#: component, such as that of floors, from outweighing all others.
+#: Maximum absolute value of a component of a unit vector. Few of 128 exceed it. Clipping prevents
+#: one large component, such as that of floors, from outweighing all other components.
 RANGE = 0.25
 
 
@@ -100,7 +101,7 @@ def _squares(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> None:
 
 @disjoint_kernel
 def _nearer(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
-    """Write the indices of squared distances below a limit, except `but`; return their number."""
+    """Write the indices, except `but`, of squared distances below a limit; return their number."""
     found = 0
     for j in range(count):
         places[found] = j
@@ -115,8 +116,8 @@ def _locate(
 ) -> None:  # fmt: skip
     """Write the positions of other patches relative to patch i.
 
-    lies (6, n): squared distance, distance in the plane, height, share of the upper bin of either
-    angle, and area. bins (4, n): bins of both angles; that of the second changes first.
+    `lies` (6, n): squared distance, distance in the plane, height, share of the upper bin of each
+    angle, and area. `bins` (4, n): bins of both angles, of which the second varies fastest.
     """
     x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
     ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
@@ -127,7 +128,7 @@ def _locate(
         height = dx * ax + dy * ay + dz * az
         cosine = ax * bx + ay * by + az * bz
         flat = np.sqrt(max(squares[j] - height * height, 0.0))
-        # component of the other normal along the direction in the plane
+        # the component of the other normal along its direction in the plane
         radial = (bx * dx + by * dy + bz * dz - height * cosine) / flat
         radial = radial if flat > 1e-3 else 0.0
         e = min(max((cosine + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
@@ -146,7 +147,9 @@ def _spread(
     lies: Floats, places: Ints32, count: int, radius: float, n_flat: int, n_high: int,
     n_angles: int, weights: Floats, starts: Ints32,
 ) -> None:  # fmt: skip
-    """Write the weights (4, n) of patches in bins of distance and height, and the bins' starts."""
+    """Write the weights (4, n) of patches in bins of distance and height, and the starts of these
+    bins.
+    """
     flat, height, area = lies[1], lies[2], lies[5]
     for k in range(count):
         i = np.uint64(places[k])
@@ -169,7 +172,7 @@ def _add(
     lies: Floats, bins: Ints32, places: Ints32, count: int, weights: Floats, starts: Ints32,
     histogram: Floats32,
 ) -> None:  # fmt: skip
-    """Add the sixteen shares of each patch to the histogram, in the order of the patches."""
+    """Add the 16 shares of each patch to the histogram, in the order of the patches."""
     for k in range(count):
         i = np.uint64(places[k])
         fe, fg = lies[3, i], lies[4, i]
@@ -186,9 +189,9 @@ def _add(
 def _accumulate(
     points: Floats, normals: Floats, areas: Floats, scales: Floats, angles: int, out: Floats32
 ) -> None:
-    """Add the area of each pair to the sixteen bins around it, at each scale that reaches it.
+    """Add the area of each pair to the 16 nearest bins at each scale that reaches it.
 
-    points, normals : (3, P)
+    `points` and `normals` are (3, P).
     """
     count, n_angles = len(areas), angles * angles
     reach = 0.0
@@ -223,9 +226,9 @@ def _occupied_bins(row: Floats32, first: int, last: int, places: Ints32) -> int:
 
 @kernel
 def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
-    """Take the root of every bin, and normalise every scale to 1 / sqrt(scales) (Hellinger kernel).
+    """Replace bins by their roots, and normalise each scale to 1 / sqrt(scales) (Hellinger kernel).
 
-    Two thirds of the bins are empty and stay so.
+    Two thirds of the bins are empty and are skipped.
     """
     places = np.empty(out.shape[1], np.int32)
     for i in range(len(out)):
@@ -248,7 +251,7 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
 
     Returns
     -------
-    (P, D) float32, rows of unit length if there is a patch within the nearest reach
+    (P, D) float32; a row has unit length if there is another patch within the smallest reach
     """
     out = np.zeros((len(patches), p.dimension), np.float32)
     points, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
@@ -257,15 +260,15 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
     return out
 
 
-#: Number of bins whose rows of the matrix stay in the cache during multiplication.
+#: Number of bins per block of a multiplication, whose matrix rows fit the cache.
 _BINS = 256
 
 
 @disjoint_kernel
 def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floats32) -> None:
-    """Write rows times matrix (D, d), less the offset; most bins of a histogram are empty.
+    """Write rows times matrix (D, d), minus the offset; most bins of a histogram are empty.
 
-    Four bins are added at a time, in their order, which quarters the reads and writes of a row.
+    Four bins are added at a time, in their order, to reduce reads and writes of a row by 75 %.
     """
     places = np.empty(_BINS, np.int32)
     for i in range(len(histograms)):
@@ -292,13 +295,13 @@ def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floa
 def compress(histograms: Floats32, by: Compression) -> Bytes:
     """Compress histograms to the bytes that are stored and compared.
 
-    They are components on the principal axes, normalised to unit length; a byte is 1/255 of
-    [-RANGE, RANGE].
+    The bytes encode the principal components, normalised to unit length, in steps of 1/255 of the
+    interval [-RANGE, RANGE].
 
     Parameters
     ----------
     histograms : (P, D) result of `patch_descriptors`
-    by : compression learnt on histograms of the same layout
+    by : compression that was fitted to histograms of the same layout
 
     Returns
     -------
@@ -322,16 +325,19 @@ def fit_compression(histograms: Floats32, dimension: int) -> Compression:
 
     Raises
     ------
-    ValueError : there are fewer histograms than bins, or more components than bins
+    ValueError : If there are fewer histograms than bins, or more components than bins
     """
     count, bins = histograms.shape
     if count <= bins or not 1 <= dimension <= bins:
-        raise ValueError(f"{histograms.shape} histograms cannot determine {dimension} components")
+        raise ValueError(
+            f"Histograms of shape {histograms.shape} cannot determine {dimension} components. "
+            "Train on more frames."
+        )
     mean = histograms.mean(axis=0, dtype=float)
     covariance = histograms.T.astype(float) @ histograms / count - np.outer(mean, mean)
     _, vectors = np.linalg.eigh(covariance)
     rows = vectors.T[::-1][:dimension]
-    signs = np.sign(rows[np.arange(dimension), np.abs(rows).argmax(axis=1)])  # eigenvectors lack it
+    signs = np.sign(rows[np.arange(dimension), np.abs(rows).argmax(axis=1)])  # signs are arbitrary
     return Compression(mean.astype(np.float32), (rows * signs[:, None]).astype(np.float32))
 
 
@@ -339,7 +345,7 @@ def fit_compression(histograms: Floats32, dimension: int) -> Compression:
 class MatchingParameters:
     """Parameters of matching."""
 
-    n_sources: int = 100  #: number of patches drawn from the source
+    n_sources: int = 100  #: number of sampled patches of the source
     n_nearest: int = 3  #: number of correspondences per patch
 
 
@@ -348,7 +354,7 @@ def _nearest(
     source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int, slopes: Floats, onto: Floats,
     gate: float, pairs: Ints32,
 ) -> int:  # fmt: skip
-    """Write the targets nearest to each sampled source; return the number of pairs."""
+    """Write the nearest targets of each sampled source; return the number of pairs."""
     count, length = target.shape
     farthest = np.int32(2147483647)
     squares = np.empty(count, np.int32)
@@ -370,7 +376,7 @@ def _nearest(
             for j in range(1, count):
                 if squares[j] < squares[best]:
                     best = j
-            if squares[best] == farthest:  # no other patch has this angle to up
+            if squares[best] == farthest:  # all other patches have another angle to up
                 break
             pairs[found, 0] = drawn[row]
             pairs[found, 1] = best
@@ -381,12 +387,12 @@ def _nearest(
 
 @dataclass(frozen=True, eq=False)
 class SlopeGate:
-    """The gate of correspondences by the slopes of patches, if up is known in both frames.
+    """A gate of correspondences by the slopes of patches, if up is known in both frames.
 
     Parameters
     ----------
-    source, target : (P,) and (P',) angles of the patches' normals to up, radians
-    most : greatest difference of corresponding angles
+    source, target : (P,) and (P',) angles between the patches' normals and up, radians
+    most : maximum difference of corresponding angles, radians
     """
 
     source: Floats
@@ -401,25 +407,28 @@ def correspondences(
     p: MatchingParameters,
     gate: SlopeGate | None = None,
 ) -> Ints32:
-    """Return correspondences of a random sample of the source's patches: Sec. III-E.
+    """Return the correspondences of a random sample of the source's patches: Sec. III-E.
 
     Parameters
     ----------
     source : (P, d) uint8 descriptors
-    target : (P', d) uint8
-    rng : generator of the sample
-    gate : gate of slopes, or None
+    target : (P', d) uint8 descriptors
+    rng : random generator for the sample
+    gate : gate by slopes; None accepts all pairs
 
     Returns
     -------
-    (M, 2) int32, index in source and in target; each sampled patch with its nearest, nearest first
+    (M, 2) int32, indices in source and in target; for each sampled patch, the nearest comes first
 
     Raises
     ------
-    ValueError : the descriptors have different lengths
+    ValueError : If the descriptors have different lengths
     """
     if source.shape[1] != target.shape[1]:
-        raise ValueError(f"descriptors have {source.shape[1]} and {target.shape[1]} bytes")
+        raise ValueError(
+            f"The descriptors have different lengths, {source.shape[1]} and {target.shape[1]} "
+            "bytes. Compare descriptors of one model only."
+        )
     drawn = np.sort(rng.choice(len(source), min(p.n_sources, len(source)), replace=False))
     n_nearest = min(p.n_nearest, len(target))
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)

@@ -1,11 +1,11 @@
-"""Propose transforms between scans by correlating their plans, seen from above (Sec. III-E).
+"""Transforms between scans by correlation of their plans, as seen from above (Sec. III-E).
 
     Surface  --draw_plan-->  ScanPlan        ScanPlan, ScanPlan  --plan_hypotheses-->  (n, 4, 4)
 
-Distant scans share few patches with similar surroundings, so correspondences find no right
-transform. Their plans still fit: upright surfaces are drawn, with their normals, into an image seen
-from above, which is rotated through all yaws and correlated with the other. Level surfaces give the
-height. The method is not the paper's.
+Scans from distant viewpoints share few patches with similar surroundings, so correspondences yield
+no correct transform, but their plans fit. Upright surfaces are drawn, with their normals, into an
+image as seen from above, which is rotated through all yaws and correlated with the other image.
+Level surfaces determine the height. This method is not part of the paper.
 """
 
 from __future__ import annotations
@@ -21,47 +21,46 @@ from sceneprint.geometry.registration.overlap import first_per_cube
 from sceneprint.geometry.rigid import select_distinct
 from sceneprint.types import Floats, Floats32, Ints32, Sphere, Surface
 
-#: Limits within which a normal votes for a candidate for up: along it, or across it with half a
-#: vote.
+#: Minimum cosine at which a normal votes for a candidate for up, and maximum cosine at which a
+#: perpendicular normal gives half a vote.
 _ALONG, _ACROSS = math.cos(math.radians(6.0)), math.sin(math.radians(4.0))
-#: The same limits of the normals that refine up.
+#: The same limits for the normals that refine up.
 _NEAR, _LEVEL = math.cos(math.radians(8.0)), math.sin(math.radians(8.0))
-#: Maximum numbers of candidates for up and of voting normals; steps that refine the best.
+#: Maximum numbers of candidates for up and of voting normals, and number of refinement steps.
 _MOST_CANDIDATES, _MOST_VOTERS, _REFINEMENTS = 100, 1500, 8
-#: Vertical components of the normals: least of surfaces that give heights, greatest of those that
-#: give azimuths.
+#: Minimum vertical component of the normals of level surfaces, and maximum of upright surfaces.
 _FLAT, _UPRIGHT = 0.9, 0.5
 
 
 @dataclass(frozen=True)
 class PlanParameters:
-    """Parameters of the search over plans; tuned on the hall: docs/clouds.md."""
+    """Parameters of the search over plans, tuned on the hall of docs/clouds.md."""
 
     cell: float = 0.1  #: width of a cell of the plan image, metres
     side: int = 128  #: width of the plan image, cells
-    voxel: float = 0.08  #: width of a cube of which one point is drawn, metres
-    tilt: float = math.radians(50.0)  #: greatest angle of up to the scanner's axis
+    voxel: float = 0.08  #: width of the cubes, one point of which is drawn, metres
+    tilt: float = math.radians(50.0)  #: maximum angle between up and the scanner's axis
     n_yaws: int = 72  #: number of yaws
     kept_yaws: int = 24  #: number of yaws whose plans are correlated
     n_peaks: int = 6  #: number of shifts per yaw
     n_kept: int = 50  #: number of transforms that differ by two cells or one and a half yaws
-    n_heights: int = 2  #: number of heights of each of them
+    n_heights: int = 2  #: number of heights per transform
     height_step: float = 0.05  #: step of the histogram of heights, metres
-    height_range: float = 3.0  #: its range each way, metres
-    blur: float = 0.7  #: standard deviation, cells
-    flat_weight: float = 0.3  #: weight of the vertical component
+    height_range: float = 3.0  #: maximum absolute value of a height in the histogram, metres
+    blur: float = 0.7  #: standard deviation of the Gaussian blur, cells
+    flat_weight: float = 0.3  #: weight of the vertical component of normals
 
 
 @dataclass(frozen=True, eq=False)
 class ScanPlan:
-    """A scan as seen from above.
+    """The plan of a scan, as seen from above.
 
     Parameters
     ----------
-    R : (3, 3) R_level_sensor: rows are two level axes, then up
-    points, normals : (N, 3) float32 each, one per voxel, along the level axes
-    azimuths : (n_yaws,) histogram of the directions that upright surface faces
-    heights : (2, n) histograms of the heights of surface that faces up, and down
+    R : (3, 3) R_level_sensor; its rows are two level axes and up
+    points, normals : (N, 3) float32, one row per voxel, in the axes of R
+    azimuths : (n_yaws,) histogram of the directions that upright surfaces face
+    heights : (2, n) histograms of the heights of surfaces that face up and down
     """
 
     R: Floats
@@ -76,17 +75,17 @@ Plans = list[tuple[ScanPlan, ScanPlan]]
 
 
 def dominant_up(normals: Floats, axis: Floats, tilt: float) -> Floats:
-    """Return the direction that most surface faces, or stands across.
+    """Return the direction to which most surfaces are perpendicular or parallel.
 
     Parameters
     ----------
     normals : (N, 3)
     axis : (3,) unit vector
-    tilt : greatest angle between result and axis, radians
+    tilt : maximum angle between the result and the axis, radians
 
     Returns
     -------
-    (3,) unit vector, on the axis's side; the axis itself if no normal is near it
+    (3,) unit vector on the side of the axis; the axis if no normal is near it
     """
     cosines = normals @ axis
     near = np.abs(cosines) > math.cos(tilt)
@@ -107,7 +106,7 @@ def dominant_up(normals: Floats, axis: Floats, tilt: float) -> Floats:
 
 @kernel
 def _vote(normals: Floats, candidates: Floats, along: float, across: float, votes: Floats) -> None:
-    """Write the votes for each candidate: the normals along it, and half of those across it."""
+    """Write each candidate's votes: 1 for a parallel normal, 1/2 for a perpendicular normal."""
     for k in range(len(candidates)):
         a, b, c = candidates[k, 0], candidates[k, 1], candidates[k, 2]
         total = 0.0
@@ -122,7 +121,7 @@ def _vote(normals: Floats, candidates: Floats, along: float, across: float, vote
 
 @kernel
 def _gather(normals: Floats, up: Floats, near: float, level: float, spread: Floats) -> None:
-    """Write the sum of n n^T of the normals along a direction, less half of those across it."""
+    """Write the sum of n n^T over normals along `up`, minus half the sum over those across it."""
     spread[:] = 0.0
     for i in range(len(normals)):
         cosine = abs(normals[i, 0] * up[0] + normals[i, 1] * up[1] + normals[i, 2] * up[2])
@@ -140,9 +139,9 @@ def draw_plan(
 
     Parameters
     ----------
-    surface : at least one valid point
-    axis : (3,) expected up; default: the scanner's axis
-    up : (3,) unit vector in the scanner's coordinates, if known; it is not estimated then
+    surface : surface with at least one valid point
+    axis : (3,) expected up; None selects the scanner's axis
+    up : (3,) unit vector in the scanner's coordinates; None estimates it
     """
     shown = surface.fitted
     points = shown.points[shown.valid]
@@ -165,8 +164,8 @@ def draw_plan(
 def other_plans(source: Surface, target: Surface, p: PlanParameters) -> Plans:
     """Return pairs of plans for scanners that did not stand upright.
 
-    Either the source lay on its side or upside down and the target did not, or both were mounted on
-    their sides alike.
+    In each pair, only the source lay on its side or upside down, or both scanners were mounted on
+    the same side.
     """
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     usual_source, usual_target = scanner_axis(source), scanner_axis(target)
@@ -181,14 +180,17 @@ def other_plans(source: Surface, target: Surface, p: PlanParameters) -> Plans:
 
 
 def scanner_axis(surface: Surface) -> Floats:
-    """Return the axis of a scanner's rotation, (3,) in its own coordinates; z if unknown."""
+    """Return the axis (3,) of a scanner's rotation in its coordinates; z if unknown."""
     axis = np.zeros(3)
     axis[surface.camera.pole if isinstance(surface.camera, Sphere) else 2] = 1.0
     return axis
 
 
 def _azimuths(normals: Floats, n_yaws: int) -> Floats:
-    """Return the directions of upright surface, (n_yaws,); roots keep one wall from dominating."""
+    """Return the histogram (n_yaws,) of upright surfaces' directions.
+
+    Square roots prevent one wall from dominating.
+    """
     upright = normals[np.abs(normals[:, 2]) < _UPRIGHT]
     turns = np.arctan2(upright[:, 1], upright[:, 0]) / (2 * math.pi) % 1.0
     counts = np.bincount((turns * n_yaws).astype(int) % n_yaws, minlength=n_yaws)
@@ -198,7 +200,7 @@ def _azimuths(normals: Floats, n_yaws: int) -> Floats:
 
 
 def _heights(points: Floats, normals: Floats, p: PlanParameters) -> Floats:
-    """Return smoothed roots of the height histograms of surface that faces up and down, (2, n)."""
+    """Return smoothed roots of the height histograms of surfaces that face up and down, (2, n)."""
     n = 2 * round(p.height_range / p.height_step)
     rows = []
     for sign in (1.0, -1.0):
@@ -210,7 +212,7 @@ def _heights(points: Floats, normals: Floats, p: PlanParameters) -> Floats:
 
 
 def _height_offsets(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> list[float]:
-    """Return heights of the source's origin above the target's that align level surfaces."""
+    """Return heights of the source's origin over the target's origin that align level surfaces."""
     scores = sum(
         np.correlate(b, a, "full") for a, b in zip(source.heights, target.heights, strict=True)
     )
@@ -230,7 +232,7 @@ def _draw(
     points: Floats32, normals: Floats32, cosine: float, sine: float, cell: float, flat: float,
     image: Floats32,
 ) -> None:  # fmt: skip
-    """Add normals, rotated by a yaw, to an image (3, side, side), bilinearly."""
+    """Add normals, rotated by a yaw, to an image (3, side, side), with bilinear weights."""
     side = image.shape[1]
     middle = 0.5 * side - 0.5
     for i in range(len(points)):
@@ -248,7 +250,7 @@ def _draw(
                 image[0, v + b, u + a] += share * nx
                 image[1, v + b, u + a] += share * ny
                 image[2, v + b, u + a] += share * nz
-    for v in range(side):  # roots keep one wall from dominating
+    for v in range(side):  # square roots prevent one wall from dominating
         for u in range(side):
             x, y, z = image[0, v, u], image[1, v, u], image[2, v, u]
             length = np.sqrt(x * x + y * y + z * z)
@@ -259,7 +261,9 @@ def _draw(
 
 @kernel
 def _take_peaks(scores: Floats32, n: int, values: Floats, cells: Ints32) -> None:
-    """Write the n greatest values of a torus (side, side), three cells apart, and their cells."""
+    """Write the n highest peaks of a torus (side, side), at least three cells apart, and their
+    cells.
+    """
     side = len(scores)
     for k in range(n):
         best, line, column = scores[0, 0], 0, 0
@@ -281,11 +285,11 @@ def _spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.compl
 
 
 def plan_hypotheses(plans: Plans, p: PlanParameters) -> Floats:
-    """Return transforms that lay the plan of a scan onto that of another, best first.
+    """Return transforms that align the plan of a scan with the plan of another, best first.
 
     Parameters
     ----------
-    plans : pairs of source and target, one per guess of up
+    plans : pairs of source and target, one for each hypothesis of up
 
     Returns
     -------
@@ -301,12 +305,12 @@ def plan_hypotheses(plans: Plans, p: PlanParameters) -> Floats:
 def _correlate_plans(
     source: ScanPlan, target: ScanPlan, p: PlanParameters
 ) -> tuple[Floats, Floats]:
-    """Return transforms (n, 4, 4) that lay one plan onto the other, and their correlations."""
+    """Return transforms (n, 4, 4) that align one plan with the other, and their correlations."""
     yaws = np.arange(p.n_yaws)
     ways = [float(np.roll(source.azimuths, k) @ target.azimuths) for k in yaws]
     best_yaws = np.argsort(-np.array(ways), kind="stable")[: p.kept_yaws]
     lines = np.fft.fftfreq(p.side)[:, None] ** 2 + np.fft.rfftfreq(p.side)[None] ** 2
-    # both images are blurred: the square of a Gaussian's transform
+    # a blur of both images is the square of a Gaussian's Fourier transform
     blurred = _spectrum(target, 0.0, p) * np.exp(-((2 * math.pi * p.blur) ** 2) * lines)
     blurred = blurred.astype(np.complex64)
     values = np.empty(len(best_yaws) * p.n_peaks)
@@ -322,7 +326,7 @@ def _correlate_plans(
     flat[:, 0, 0], flat[:, 0, 1] = np.cos(angles), -np.sin(angles)
     flat[:, 1, 0], flat[:, 1, 1] = np.sin(angles), np.cos(angles)
     flat[:, :2, 3] = ((cells[:, ::-1] + p.side // 2) % p.side - p.side // 2) * p.cell
-    # neighbouring yaws propose the same shifts, which would crowd out others
+    # neighbouring yaws propose the same shifts, which would displace different ones
     best = select_distinct(flat, values, 2 * p.cell, 3 * math.pi / p.n_yaws, p.n_kept)
     lifts = _height_offsets(source, target, p)
     level = np.repeat(flat[best], len(lifts), axis=0)

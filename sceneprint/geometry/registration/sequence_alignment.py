@@ -1,11 +1,11 @@
-"""Match patches by aligning the sequences of their neighbours, as in the paper (Sec. III-E).
+"""Correspondences of patches by alignment of neighbour sequences, as in the paper (Sec. III-E).
 
     Patches  --neighbour_sequences-->  Sequences
     Patches, Patches  --sequence_correspondences-->  pairs (M, 2)
 
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching (GASP, 3DV 2014) is public.
-A patch is described by the patches around it, in the order of their azimuths about its normal,
-which does not depend on the viewpoint. Two such cyclic sequences are compared by their
+The descriptor of a patch is the sequence of the patches around it, sorted by azimuth about its
+normal, which does not depend on the viewpoint. Two such cyclic sequences are compared by their
 Damerau-Levenshtein distance: the cost of replacing, inserting, omitting and swapping neighbours.
 "It suffices to validate at a coarse hierarchical level" (Sec. III-F): the neighbours are coarse
 patches.
@@ -21,7 +21,7 @@ import numpy as np
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Floats, Ints32, Patches
 
-#: Method of matching: the histograms of `patch_descriptors.py`, or sequences.
+#: Method of matching: by the histograms of `patch_descriptors.py`, or by sequences.
 Matching = Literal["histograms", "sequence"]
 
 
@@ -30,27 +30,27 @@ class SequenceParameters:
     """Parameters of sequences and of their alignment."""
 
     n_coarse: int = 60  #: number of coarse patches
-    opposite_distance: float = 0.5  #: distance of patches with opposite normals, metres
+    opposite_distance: float = 0.5  #: distance that opposite normals add, metres
     n_neighbours: int = 12  #: number of nearest neighbours of a patch
-    minimum_distance: float = 0.1  #: nearer patches are the patch itself, metres
-    radius: float = 1.6  #: greatest distance of a neighbour, metres
+    minimum_distance: float = 0.1  #: minimum distance of a neighbour, metres
+    radius: float = 1.6  #: maximum distance of a neighbour, metres
     length_scale: float = 0.35  #: difference of lengths that costs one half, metres
     angle_scale: float = 1.0  #: difference of angles that costs one half, radians
     gap_cost: float = 0.5  #: cost of an inserted or omitted neighbour; a replacement costs 1
-    swap_cost: float = 0.1  #: cost of a swap, beside that of the differences
-    n_sources: int = 100  #: number of patches drawn from the source
+    swap_cost: float = 0.1  #: cost of a swap, without the costs of the differences
+    n_sources: int = 100  #: number of sampled patches of the source
     n_nearest: int = 3  #: number of correspondences per patch
 
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """The neighbours of each patch, in the order of azimuth about its normal.
+    """The neighbours of each patch, sorted by azimuth about its normal.
 
     Parameters
     ----------
-    symbols : (P, n_neighbours, 4): each neighbour's distance in the plane of the patch and height
-        over it, metres, and the angles of its normal to the patch's normal and to its direction,
-        radians
+    symbols : (P, n_neighbours, 4): distance of each neighbour in the plane of the patch and height
+        over the plane, metres; angles of its normal to the patch's normal and to the direction of
+        the neighbour, radians
     lengths : (P,) int32, number of neighbours
     """
 
@@ -59,10 +59,10 @@ class Sequences:
 
 
 def coarse_patches(patches: Patches, p: SequenceParameters) -> Patches:
-    """Return up to `n_coarse` distant patches, each the mean of the patches nearest to it.
+    """Return up to `n_coarse` patches, each the mean of the patches around a distant seed.
 
-    The largest is first, and each next one is the farthest from all before it, so the selection
-    does not depend on rigid motion.
+    The largest patch is the first seed, and each next seed is the farthest from all previous seeds,
+    so the selection does not depend on rigid motion.
     """
     chosen = [int(np.argmax(patches.areas))]
     squares = np.full(len(patches), np.inf)
@@ -102,7 +102,7 @@ def _sequences(
     found = np.empty((most, 4))
     for i in range(len(means)):
         n = normals[i]
-        # any direction in the plane can be azimuth 0, since the start is selected below
+        # any direction in the plane can be azimuth 0, since the start is selected later
         k = 0
         for d in range(1, 3):
             if abs(n[d]) < abs(n[k]):
@@ -143,7 +143,7 @@ def _sequences(
             m += 1
         lengths[i] = m
         order = np.argsort(azimuths[:m], kind="mergesort")
-        # start after the widest gap, where a swap across the seam is least likely
+        # after the widest gap, a swap across the start of the sequence is least likely
         start, widest = 0, -1.0
         for s in range(m):
             before = azimuths[order[s - 1]] - (2 * np.pi if s == 0 else 0.0)
@@ -156,13 +156,13 @@ def _sequences(
 def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters) -> Sequences:
     """Return the canonical sequence of each patch's nearest neighbours.
 
-    Neighbours are ordered counter-clockwise, seen from the side of the normal, starting after the
-    widest gap.
+    Neighbours are in counter-clockwise order, as seen from the side of the normal. The sequence
+    starts after the widest gap.
 
     Parameters
     ----------
     patches : P patches
-    about : the neighbours, see `coarse_patches`
+    about : potential neighbours, the result of `coarse_patches`
     """
     symbols = np.zeros((len(patches), p.n_neighbours, 4))
     lengths = np.zeros(len(patches), np.int32)
@@ -177,7 +177,7 @@ def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters)
 def _replacement_costs(
     a: Floats, m: int, b: Floats, n: int, length: float, angle: float, out: Floats
 ) -> None:
-    """Write the cost of each of `m` neighbours in place of each of `n`: 0 if alike, at most 1."""
+    """Write the costs, in [0, 1], of replacing each of `m` neighbours by each of `n`."""
     for i in range(m):
         for j in range(n):
             off = (abs(a[i, 0] - b[j, 0]) + abs(a[i, 1] - b[j, 1])) / length
@@ -189,10 +189,10 @@ def _replacement_costs(
 def _edit_cost(
     costs: Floats, m: int, n: int, turn: int, gap: float, swap: float, most: float, rows: Floats
 ) -> float:
-    """Return the Damerau-Levenshtein cost of sequence 1 against sequence 2 started at `turn`.
+    """Return the Damerau-Levenshtein cost between sequence 1 and sequence 2 from position `turn`.
 
-    It is the optimal string alignment, in which a swapped pair is not edited again; infinite once
-    it must exceed `most`. `rows`: (3, n + 1) scratch space.
+    In this variant (optimal string alignment), a swapped pair is not edited again. The result is
+    infinite if it must exceed `most`. `rows` (3, n + 1) is scratch space.
     """
     for j in range(n + 1):
         rows[0, j] = j * gap
@@ -211,7 +211,7 @@ def _edit_cost(
                 cost = min(cost, earlier[j - 2] + both + swap)
             now[j] = cost
             least = min(least, cost)
-        if least > most and least_before > most:  # a swap reaches back two rows
+        if least > most and least_before > most:  # a swap uses the cost of two rows before
             return np.inf
         least_before = least
     result: float = rows[m % 3, n]
@@ -223,11 +223,11 @@ def _cyclic_cost(
     a: Floats, m: int, b: Floats, n: int, length: float, angle: float, gap: float, swap: float,
     most: float, costs: Floats, rows: Floats,
 ) -> float:  # fmt: skip
-    """Return the least cost over the starts of the second sequence, as a share of the greatest."""
+    """Return the minimum cost over the starts of sequence 2, as a share of the maximum cost."""
     if m == 0 or n == 0:
         return 1.0
     _replacement_costs(a, m, b, n, length, angle, costs)
-    # a cheap lower bound, which excludes most pairs: each neighbour is replaced or omitted
+    # a fast lower bound, by which most pairs are excluded: each neighbour is replaced or omitted
     bound = 0.0
     for i in range(m):
         nearest = gap
@@ -241,7 +241,7 @@ def _cyclic_cost(
     for turn in range(n):
         cost = _edit_cost(costs, m, n, turn, gap, swap, best, rows)
         best = min(best, cost)
-    # limit / whole may round to less than `most` and would displace an equal cost
+    # limit / whole can be rounded to less than `most` and would displace an equal cost
     return best / whole if best < limit else 1.0
 
 
@@ -256,7 +256,7 @@ def _nearest(
     found = 0
     for row in range(len(drawn)):
         i = drawn[row]
-        best[:] = 1.0  # sequences with nothing in common do not correspond
+        best[:] = 1.0  # sequences that have nothing in common do not correspond
         at[:] = -1
         for j in range(len(target)):
             cost = _cyclic_cost(
@@ -279,16 +279,16 @@ def _nearest(
 def sequence_correspondences(
     source: Patches, target: Patches, rng: np.random.Generator, p: SequenceParameters
 ) -> Ints32:
-    """Return correspondences of a random sample of the source's patches by sequences: Sec. III-E.
+    """Return the correspondences, by sequences, of a random sample of patches: Sec. III-E.
 
     Parameters
     ----------
     source, target : patches of the two frames
-    rng : generator of the sample
+    rng : random generator for the sample
 
     Returns
     -------
-    (M, 2) int32, index in source and in target; each sampled patch with its nearest, nearest first
+    (M, 2) int32, indices in source and in target; for each sampled patch, the nearest comes first
     """
     drawn = np.sort(rng.choice(len(source), min(p.n_sources, len(source)), replace=False))
     of_source = neighbour_sequences(source, coarse_patches(source, p), p)

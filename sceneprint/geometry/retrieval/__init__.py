@@ -1,1 +1,1 @@
-"""Rank signatures, and select diverse matches."""
+"""Ranking of signatures and selection of diverse matches."""

@@ -1,15 +1,16 @@
-"""Rank stored signatures by distance, and select a diverse subset (Sec. III-C and III-D).
+"""Ranking of stored signatures by distance, and a diverse selection (Sec. III-C and III-D).
 
     query (n,), database (N, n) uint8  --distances-->  (N,)  --rank-->  Ranking: R of Sec. III-C
     distances to the query (R,), among R (R, R)  --diversify-->  Selection (k of R)
 
-This is the oracle of every index. Distances are exact integers, and ties go to the lower index.
+Tests compare every index with these functions. Distances are exact integers, and ties prefer the
+lower index.
 
 The kernel of Sec. III-D is L_XY = rho_X rho_Y exp(s(X, Y) / sigma) with rho_X = exp(s(X, Q) / (2
-omega)) and s = -distance. The most probable set of k maximises det L_C; the greedy procedure
-repeatedly takes the candidate that multiplies the determinant most. That factor is rho_X^2 times
-the variance of X given the set so far, under exp(-D / sigma) alone, so logarithms of quality and
-diversity neither overflow nor underflow.
+omega)) and s = -distance. The most probable set of k maximises det L_C; the greedy algorithm
+repeatedly selects the candidate that increases the determinant by the largest factor. This factor
+is rho_X^2 times the conditional variance of X given the selection under exp(-D / sigma), so
+logarithms of quality and diversity neither overflow nor underflow.
 """
 
 from __future__ import annotations
@@ -27,26 +28,26 @@ from sceneprint.types import Bytes, Floats
 
 Ints64 = NDArray[np.int64]
 
-#: Number of rows per tile of columns, bytes of the tiles of all queries, which stay in a core's
-#: cache, and least length of a tile, since shorter ones cost more calls.
+#: Number of rows per tile of columns; number of bytes of all queries' tiles, which stay in a core's
+#: cache; and minimum length of a tile, since shorter tiles need more calls.
 GROUP, _CACHED, _SHORTEST = 16, 262144, 4096
 
-#: Number of bytes summed in 32 bits: the greatest power of 2 whose squares fit.
+#: Number of bytes that are summed in 32 bits: the maximum power of 2 whose squares fit.
 BLOCK = 32768
 
 
 def scan(
     queries: Bytes, database: Bytes, rows: Ints64, *, squared: bool = False, half: bool = False
 ) -> Ints64:
-    """Return the sums of |x - y|, or (x - y)^2, over the bytes of each query and row, (Q, r) int64.
+    """Return the sums of |x - y| or (x - y)^2 over the bytes of each query and row, (Q, r) int64.
 
     Parameters
     ----------
     queries : (Q, n) uint8, in C order
     database : (N, n) uint8, in C order
-    rows : (r,) indices of the database from 0 to N - 1, unchecked
+    rows : (r,) indices of the database from 0 to N - 1, which are not checked
     squared : whether to sum squares
-    half : whether to compute only entries (q, i) with q < i; the others are undefined
+    half : whether to compute only entries (q, i) with q < i; all other entries are undefined
     """
     result = np.zeros((len(queries), len(rows)), np.int64)
     tile = max(_CACHED // max(len(queries), 1), _SHORTEST)
@@ -55,7 +56,7 @@ def scan(
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a read-only view: code compiled for it serves mapped files and arrays alike."""
+    """Return a read-only view, so that mapped files and arrays use the same machine code."""
     view = array.view()
     view.flags.writeable = False
     return view
@@ -66,7 +67,7 @@ def _absolute(a: Bytes, b: Bytes) -> int:
     """Return the sum of |a - b| over at most BLOCK bytes."""
     total = np.int32(0)
     for i in range(len(a)):
-        # the magnitude of 32 bits added to 32 bits, and no other form, becomes one instruction
+        # only a 32-bit magnitude that is added to 32 bits compiles to one instruction
         d = np.int32(np.int32(a[i]) - np.int32(b[i]))
         total = np.int32(total + abs(d))
     return int(total)
@@ -78,7 +79,7 @@ def _squares(a: Bytes, b: Bytes) -> int:
     total = np.int32(0)
     for i in range(len(a)):
         d = np.int32(np.int32(a[i]) - np.int32(b[i]))
-        total = np.int32(total + np.int32(d * d))  # becomes pmaddwd
+        total = np.int32(total + np.int32(d * d))  # compiles to pmaddwd
     return int(total)
 
 
@@ -92,7 +93,6 @@ def _sums(
     tile: int,
     result: Ints64,
 ) -> None:
-    """Add sums to result (Q, r)."""
     n = queries.shape[1]
     for group in range(0, len(rows), GROUP):
         for start in range(0, n, tile):
@@ -102,59 +102,61 @@ def _sums(
                     asked = queries[q, start : start + tile]
                     total = 0
                     for low in range(0, len(stored), BLOCK):
-                        # slices start at 0, because a loop from `low` does not vectorize
+                        # slices, because a loop that starts at `low` is not vectorized
                         a, b = asked[low : low + BLOCK], stored[low : low + BLOCK]
                         total += _squares(a, b) if squared else _absolute(a, b)
                     result[q, i] += total
 
 
-#: "l1": sum |x - y|, as in the paper; "l2": squared Euclidean, sum (x - y)^2.
+#: "l1": sum of |x - y|, as in the paper; "l2": squared Euclidean distance, sum of (x - y)^2.
 Metric = Literal["l1", "l2"]
 
-#: Size of a ranking: share of the map, minimum and maximum.
+#: Size of a ranking: share of the map, minimum and maximum number of frames.
 RANKING_SHARE, SMALLEST_RANKING, LARGEST_RANKING = 0.4, 50, 200
 
 
 def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None = None) -> Ints64:
-    """Return the distances -s(X, Y) of one signature to many: Sec. III-C.
+    """Return the distances -s(X, Y) from one signature to many: Sec. III-C.
 
     Parameters
     ----------
     query : (n,) uint8
     database : (N, n) uint8
     metric : "l1", as in the paper, or "l2", squared Euclidean
-    rows : (r,) indices of the compared rows; default: all
+    rows : (r,) indices of the compared rows; None selects all rows
 
     Returns
     -------
-    (N,) or (r,) int64, in units of a byte ("l2": of a byte squared); exact
+    (N,) or (r,) int64, exact, in units of a byte, or of a squared byte for "l2"
 
     Raises
     ------
-    ValueError : the lengths differ, the arrays are not of bytes, or the metric or a row does not
-        exist
+    ValueError : If the lengths differ, the arrays do not contain bytes, or the metric or a row does
+        not exist
     """
     if query.ndim != 1:
-        raise ValueError(f"signatures have {query.shape} and {database.shape[1:]} bytes")
+        raise ValueError(f"The query has shape {query.shape}. Pass the bytes of one signature.")
     _check(query[None], database, metric)
     if rows is not None:
         if rows.ndim != 1 or rows.dtype.kind not in "iu":
-            raise ValueError(f"rows are {rows.dtype} {rows.shape}, not indices (r,)")
+            raise ValueError(f"rows are {rows.dtype} {rows.shape}. Pass integer indices (r,).")
         if len(rows) and not 0 <= rows.min() <= rows.max() < len(database):
-            raise ValueError(f"rows {rows.min()} to {rows.max()} of {len(database)} signatures")
+            raise ValueError(
+                f"There are no rows {rows.min()} to {rows.max()}: the database has {len(database)}."
+            )
     result: Ints64 = _distances(query[None], database, metric, rows)[0]
     return result
 
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """R of Sec. III-C, nearest first, ties by index.
+    """The ranking R of Sec. III-C: the nearest first, ties by index.
 
     Parameters
     ----------
     indices : (r,) rows of the database
-    distances : (r,) int64, rising
-    similarities : (r,) in [0, 1], falling; see `similarity`
+    distances : (r,) int64, ascending
+    similarities : (r,) in [0, 1], descending; see `similarity`
     """
 
     indices: NDArray[np.intp]
@@ -166,9 +168,9 @@ class Ranking:
 
 
 def cross_distances(queries: Bytes, database: Bytes, metric: Metric) -> Ints64:
-    """Return the distances -s(X, Y) of many signatures to many, (Q, N) int64: Sec. III-C.
+    """Return the distances -s(X, Y) between two sets of signatures, (Q, N) int64: Sec. III-C.
 
-    The database streams through the cache once for all queries that fit in it.
+    The database is read once for all queries that fit in the cache.
 
     Parameters
     ----------
@@ -178,14 +180,14 @@ def cross_distances(queries: Bytes, database: Bytes, metric: Metric) -> Ints64:
 
     Raises
     ------
-    ValueError : see `distances`
+    ValueError : If see `distances`
     """
     _check(queries, database, metric)
     return _distances(queries, database, metric)
 
 
 def pairwise_distances(signatures: Bytes, metric: Metric) -> Ints64:
-    """Return the distances of signatures among each other, each pair computed once: Sec. III-C.
+    """Return the distances between all signatures of a set: Sec. III-C.
 
     Parameters
     ----------
@@ -198,7 +200,7 @@ def pairwise_distances(signatures: Bytes, metric: Metric) -> Ints64:
 
     Raises
     ------
-    ValueError : see `distances`
+    ValueError : If see `distances`
     """
     _check(signatures, signatures, metric)
     above = np.triu(_distances(signatures, signatures, metric, half=True), 1)
@@ -207,11 +209,16 @@ def pairwise_distances(signatures: Bytes, metric: Metric) -> Ints64:
 
 def _check(queries: Bytes, database: Bytes, metric: Metric) -> None:
     if queries.ndim != 2 or database.ndim != 2 or queries.shape[1] != database.shape[1]:
-        raise ValueError(f"signatures have {queries.shape[1:]} and {database.shape[1:]} bytes")
+        raise ValueError(
+            f"The signatures have {queries.shape[1:]} and {database.shape[1:]} bytes. "
+            "Compare signatures of one model only."
+        )
     if queries.dtype != np.uint8 or database.dtype != np.uint8:
-        raise ValueError(f"signatures are {queries.dtype} and {database.dtype}, not bytes")
+        raise ValueError(
+            f"The signatures are {queries.dtype} and {database.dtype}. Pass uint8 arrays."
+        )
     if metric not in get_args(Metric):
-        raise ValueError(f"metric {metric!r} is not one of {get_args(Metric)}")
+        raise ValueError(f"The metric {metric!r} does not exist. Pass one of {get_args(Metric)}.")
 
 
 def _distances(
@@ -227,35 +234,37 @@ def _distances(
 
 
 def similarity(distances: Ints64, unrelated_distance: float) -> Floats:
-    """Return 1 - d / d0, at least 0: 1 for equal signatures, 0 for unrelated ones (Sec. III-C).
+    """Return 1 - d / d0, at least 0: 1 for equal, 0 for unrelated signatures (Sec. III-C).
 
     Parameters
     ----------
     distances : (...) distances in one metric
-    unrelated_distance : d0, the model's median distance of unrelated frames, in that metric
+    unrelated_distance : d0, the model's median distance of unrelated frames, in the same metric
 
     Raises
     ------
-    ValueError : d0 is not a positive, finite number
+    ValueError : If d0 is not positive and finite
     """
     if not (unrelated_distance > 0 and math.isfinite(unrelated_distance)):
-        raise ValueError(f"the distance of unrelated frames is {unrelated_distance}, not above 0")
+        raise ValueError(
+            f"The distance of unrelated frames is {unrelated_distance}. Pass a positive number."
+        )
     shares: Floats = np.clip(1.0 - np.asarray(distances, np.float64) / unrelated_distance, 0.0, 1.0)
     return shares
 
 
 def distance_share(distances: Ints64, unrelated_distance: float, metric: Metric) -> Floats:
-    """Return distances as shares of the distance of unrelated frames (root of squared distances).
+    """Return distances as shares of d0, or the roots of these shares for squared distances.
 
     Parameters
     ----------
-    distances : (...) distances in a metric
-    unrelated_distance : d0, see `similarity`
+    distances : (...) distances in `metric`
+    unrelated_distance : d0; see `similarity`
     metric : see `distances`
 
     Returns
     -------
-    (...) 0 for equal signatures, about 1 for unrelated ones
+    (...) 0 for equal signatures, about 1 for unrelated signatures
     """
     shares: Floats = np.asarray(distances, np.float64) / unrelated_distance
     return shares if metric == "l1" else np.sqrt(shares)
@@ -266,16 +275,19 @@ def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
 
     Parameters
     ----------
-    distances : (N,) integers, to every row of the database
+    distances : (N,) integer distances to all rows of the database
     size : maximum size of the ranking
     unrelated_distance : see `similarity`
 
     Raises
     ------
-    ValueError : the distances are not (N,) integers, the size is negative, or d0 is invalid
+    ValueError : If the distances are not (N,) integers, the size is negative, or d0 is invalid
     """
     if distances.ndim != 1 or distances.dtype.kind not in "iu" or size < 0:
-        raise ValueError(f"cannot rank {size} of {distances.shape} {distances.dtype} distances")
+        raise ValueError(
+            f"Cannot rank {size} of {distances.dtype} distances of shape {distances.shape}. "
+            "Pass integers (N,) and a non-negative size."
+        )
     size = min(size, len(distances))
     if size == 0:
         chosen = np.empty(0, np.intp)
@@ -283,34 +295,35 @@ def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
         cut = np.partition(distances, size - 1)[size - 1]
         nearer, at_cut = np.flatnonzero(distances < cut), np.flatnonzero(distances == cut)
         chosen = np.concatenate([nearer, at_cut[: size - len(nearer)]])
-        # a stable sort of ascending indices keeps the order of equal distances
+        # a stable sort of ascending indices resolves ties by index
         chosen = chosen[np.argsort(distances[chosen], kind="stable")]
     ranked = distances[chosen].astype(np.int64)
     return Ranking(chosen, ranked, similarity(ranked, unrelated_distance))
 
 
 def ranking_size(n_map: int) -> int:
-    """Return |R| for a map of `n_map` frames: 0.4 of them, from 50 to 200.
+    """Return |R| for a map of `n_map` frames: 40 % of them, but at least 50 and at most 200.
 
-    In a denser map a fixed number of ranks holds only near-duplicates, of which no selection is
-    diverse: diversification gained 10 % of seen volume among the nearest 50 of 300 frames of one
-    room, 27 % among 125 (Sec. III-D). A share of the map covers the same places. The upper bound
-    limits the cost of pairwise distances; larger maps have more places, not more views of each.
+    In a denser map, a fixed number of ranks contains only near-duplicates, of which no selection is
+    diverse: among the nearest 50 of 300 frames of one room, diversification increased the observed
+    volume by 10 %, and among 125 by 27 % (Sec. III-D). A fixed share of the map covers the same
+    places. The upper limit bounds the cost of pairwise distances; larger maps have more places, not
+    more views of each place.
 
     Raises
     ------
-    ValueError : the number is negative
+    ValueError : If the number is negative
     """
     if n_map < 0:
-        raise ValueError(f"a map cannot have {n_map} frames")
+        raise ValueError(f"A map cannot have {n_map} frames. Pass 0 or more.")
     wanted = min(max(round(RANKING_SHARE * n_map), SMALLEST_RANKING), LARGEST_RANKING)
     return min(wanted, n_map)
 
 
-#: Distances of this module, or any others.
+#: Exact distances of this module, or distances in floating point.
 Distances = Floats | NDArray[np.int64]
 
-#: Conditional variance below which a candidate duplicates a member of the selection.
+#: Conditional variance below which a candidate is a duplicate of a selected member.
 DUPLICATE = 1e-9
 
 
@@ -319,17 +332,17 @@ class DiversityParameters:
     """The scales of Eq. (3), relative to the ranking."""
 
     sigma: float = 1.0  #: multiple of the median distance within the ranking
-    omega: float = 4.0  #: multiple of the span from its nearest to its farthest
+    omega: float = 4.0  #: multiple of the range of distances to the query in the ranking
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """C of Sec. III-D, in the order of the ranking.
+    """The selection C of Sec. III-D, in the order of the ranking.
 
     Parameters
     ----------
     indices : (k,) ascending positions in the ranking; the first is always 0
-    gains : (k,) variance given the earlier selected, in (0, 1]: the diversity that each adds
+    gains : (k,) added diversity: conditional variance given the members selected before, in (0, 1]
     """
 
     indices: NDArray[np.intp]
@@ -343,7 +356,7 @@ def kernel_matrix(to_query: Distances, among: Distances, sigma: float, omega: fl
     ----------
     to_query : (R,) distances to the query
     among : (R, R) distances within the ranking
-    sigma, omega : positive, in units of distance
+    sigma, omega : positive scales, in units of distance
 
     Returns
     -------
@@ -351,7 +364,7 @@ def kernel_matrix(to_query: Distances, among: Distances, sigma: float, omega: fl
 
     Notes
     -----
-    Reading R6 (docs/paper.md): kappa scales every determinant of size k alike; it is 1.
+    Reading R6 (docs/paper.md): kappa scales all determinants of size k by one factor; it is 1.
     """
     rho = np.exp(-0.5 * to_query / omega)
     kernel: Floats = rho[:, None] * rho[None, :] * np.exp(-among / sigma)  # Eq. (3)
@@ -361,21 +374,21 @@ def kernel_matrix(to_query: Distances, among: Distances, sigma: float, omega: fl
 def diversify(
     to_query: Distances, among: Distances, k: int, p: DiversityParameters | None = None
 ) -> Selection:
-    """Select up to `k` of a ranking by greedy maximisation of det L_C: Sec. III-D.
+    """Select up to `k` members of a ranking by greedy maximisation of det L_C: Sec. III-D.
 
     Parameters
     ----------
-    to_query : (R,) distances to the query, rising: the ranking
+    to_query : (R,) distances to the query, in the ascending order of the ranking
     among : (R, R) distances within the ranking
     k : maximum size of the selection
 
     Returns
     -------
-    selection : in the order of the ranking; fewer than `k` if the rest are duplicates
+    selection : selected members; fewer than `k` if all remaining members are duplicates
 
     Raises
     ------
-    ValueError : the shapes disagree, the ranking is not rising, a distance is not finite, or k is
+    ValueError : If the shapes disagree, the distances are not ascending or not finite, or k is
         below 1
     """
     p = p or DiversityParameters()
@@ -385,8 +398,8 @@ def diversify(
     shapes = to_query.shape == (n,) and among.shape == (n, n)
     if not (shapes and finite and k >= 1) or (np.diff(to_query) < 0).any():
         raise ValueError(
-            f"cannot select {k} by distances {to_query.shape} and {among.shape}: they must be "
-            "finite, (R,) rising and (R, R), and k at least 1"
+            f"Cannot select {k} members by distances of shapes {to_query.shape} and {among.shape}. "
+            "Pass finite distances, (R,) in ascending order and (R, R), and k of at least 1."
         )
     if n == 0:
         return Selection(np.empty(0, np.intp), np.empty(0))
@@ -401,7 +414,7 @@ def diversify(
 def remaining_gains(
     among: Distances, selected: NDArray[np.intp], p: DiversityParameters | None = None
 ) -> Floats:
-    """Return the diversity that each of a ranking would add to a selection of it.
+    """Return the diversity that each member of a ranking would add to a selection.
 
     Parameters
     ----------
@@ -411,7 +424,7 @@ def remaining_gains(
 
     Returns
     -------
-    gains : (R,) variance given the selection, in [0, 1]; 0 for its members
+    gains : (R,) conditional variance given the selection, in [0, 1]; 0 for selected members
     """
     among = np.asarray(among, np.float64)
     similarity = similarity_kernel(among, _sigma(among, p or DiversityParameters()))
@@ -428,17 +441,17 @@ def _sigma(among: Floats, p: DiversityParameters) -> float:
 
 
 def _log_quality(to_query: Floats, omega: float) -> Floats:
-    """Return log rho^2 up to a constant, which affects no choice."""
-    if omega <= 0:  # all equally near, or quality disabled: only diversity decides
+    """Return log rho^2 up to a constant, which does not affect the selection."""
+    if omega <= 0:  # distances are equal or quality is disabled, so only diversity decides
         return np.zeros(len(to_query))
     quality: Floats = (to_query[0] - to_query) / omega
     return quality
 
 
 def similarity_kernel(distances: Floats, sigma: float) -> Floats:
-    """Return the kernel of Eq. (3) without its quality: exp(-d / sigma).
+    """Return the kernel of Eq. (3) without the quality factors: exp(-d / sigma).
 
-    sigma is 0 if half of all pairs are duplicates; other pairs then have similarity 0.
+    sigma is 0 if half of all pairs are duplicates; other pairs then have the similarity 0.
     """
     likeness: Floats = np.exp(-distances / sigma) if sigma > 0 else (distances <= 0).astype(float)
     return likeness
@@ -449,20 +462,20 @@ def select_greedily(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Maximise det L_C greedily: Sec. III-D.
 
-    The Cholesky factor of the similarities grows by one row per selected item, so only their rows
-    are requested.
+    The Cholesky factor of the similarities grows by one row per selected item, so only the rows of
+    selected items are computed.
 
     Parameters
     ----------
     log_quality : (n,) log rho^2, up to a constant
-    similarity_of : returns the similarities (n,) of an index to all
+    similarity_of : function that returns the similarities (n,) of an index to all indices
     k : number of items to select, at most n
 
     Returns
     -------
-    chosen : (up to k,) indices in the order of selection, ties by index; fewer if the rest are
-        duplicates
-    gains : see Selection; in the same order
+    chosen : (m,) indices in the order of selection, ties by index; m is below k if all remaining
+        items are duplicates
+    gains : (m,) gains in the order of selection; see Selection
     """
     n = len(log_quality)
     factor = np.zeros((k, n))

@@ -1,1 +1,1 @@
-"""Convert surfaces to patches, pairs of patches and signatures."""
+"""Conversion of surfaces to patches, pairs of patches and signatures."""

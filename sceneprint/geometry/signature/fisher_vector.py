@@ -1,15 +1,15 @@
-"""Encode statistics of features as a Fisher vector and a stored signature (Sec. III-B).
+"""Fisher vectors of features, and stored signatures (Sec. III-B).
 
     PairCounts, PairTable   --statistics_of_counts-->   LevelStatistics
     features (M, 12)        --statistics_of_features--> LevelStatistics   (exact, the oracle)
     LevelStatistics  --fisher_vector-->  phi (25 G)
-    H of them   --signature-->      psi (25 G H)   --quantise-->  uint8
+    phi of H levels  --signature-->  psi (25 G H)  --quantise-->  uint8
     psi (n, D)  --fit_whitening-->  Whitening      psi  --whiten-->  (d,) uint8
 
-The stored signature is psi centred, projected on its widest axes, whitened and quantised. A Fisher
-vector has few strong axes, which all rooms share, and many weak ones, which distinguish rooms;
-whitening lets the weak ones count. docs/model.md has the measurements, docs/paper.md the
-differences from the paper.
+For the stored signature, psi is centred, projected on the axes of its largest variances, whitened
+and quantised. A Fisher vector has few strong axes, which all rooms share, and many weak axes, which
+distinguish rooms; whitening increases the influence of the weak axes. docs/model.md gives the
+measurements, and docs/paper.md the differences from the paper.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ ZERO = 128
 
 @dataclass(frozen=True, eq=False)
 class LevelStatistics:
-    """Sums over all pairs of one level for Eq. (2).
+    """The sums of Eq. (2) over all pairs of one level.
 
     Parameters
     ----------
-    zeroth : (G,) sum of weight times posterior
-    first, second : (G, 12) sums of weight times posterior times feature, and squared feature
+    zeroth : (G,) sums of weight times posterior
+    first, second : (G, 12) sums of weight times posterior times feature, or squared feature
     n_pairs : number of ordered pairs
-    total : sum of their weights; `n_pairs` if all weigh 1
+    total : sum of the weights of all pairs; `n_pairs` if all weights are 1
     """
 
     zeroth: Floats
@@ -55,7 +55,7 @@ class LevelStatistics:
     total: float
 
 
-#: Rows by which the prefetch of the table runs ahead, to hide the latency of the memory.
+#: Number of rows by which the prefetch of the table is ahead, to hide the latency of the memory.
 _AHEAD = 16
 
 
@@ -65,8 +65,8 @@ def _accumulate(
 ) -> None:
     """Add up sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line.
 
-    table, components: the packed table, and the same memory as int16. A quarter of the bins hold
-    pairs, and their rows are scattered over a table larger than any cache, so they are prefetched.
+    `components` is the memory of the packed table as int16. A quarter of the bins contain pairs.
+    Their rows are scattered over a table larger than any cache, so they are prefetched.
     """
     used, n = np.empty(len(counts), np.int32), 0
     for b in range(len(counts)):
@@ -93,7 +93,7 @@ def _accumulate(
 def statistics_of_counts(
     counts: PairCounts, table: PairTable, n_components: int
 ) -> LevelStatistics:
-    """Return the statistics of one level's pairs, counted in the 4-D table; `n_components` is G."""
+    """Return the statistics of one level from its counted pairs; `n_components` is G."""
     d, sums = FEATURE_DIMENSION, np.zeros((n_components, 32))
     _accumulate(counts.weights, table.packed, table.packed.view(np.int16), sums)
     return LevelStatistics(
@@ -102,7 +102,7 @@ def statistics_of_counts(
 
 
 def statistics_of_features(features: Floats, weights: Floats, mixture: Mixture) -> LevelStatistics:
-    """Return the statistics of single pairs with all posteriors: the oracle of the table.
+    """Return the statistics of pairs with all posteriors, against which tests compare the table.
 
     Parameters
     ----------
@@ -124,14 +124,13 @@ def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
 
     Returns
     -------
-    phi : (25 G,) for each component m0, m1 (12), m2 (12); neither rooted nor normalised
+    phi : (25 G,) m0, m1 (12), m2 (12) of each component, before square root and normalization
 
     Notes
     -----
-    Readings R2-R4, R9 (docs/paper.md): true posteriors; the weighted mean over all pairs; d^2 / var
-        - 1
-    in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed form of the inverse Fisher
-    information's factor.
+    Readings R2-R4, R9 (docs/paper.md): true posteriors; the weighted mean over all pairs;
+    d^2 / var - 1 in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed form of the
+    inverse Fisher information's factor.
     """
     p, nu, variance = mixture.weights, mixture.means, mixture.variances
     root = np.sqrt(p)[:, None]
@@ -147,10 +146,10 @@ def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
 def normalise(phi: Floats) -> Floats:
     """Return the signed square root of phi (n,), normalised to unit l2 norm (after Eq. 2).
 
-    Zeros, of a level without pairs, stay zeros.
+    The result for a level without pairs is zero.
     """
     rooted = np.sign(phi) * np.sqrt(np.abs(phi))
-    norm = float(np.sqrt(np.abs(phi).sum()))  # norm of the roots; BLAS sums depend on threads
+    norm = float(np.sqrt(np.abs(phi).sum()))  # sums in BLAS depend on threads
     result: Floats = rooted / norm if norm > 0 else rooted
     return result
 
@@ -163,8 +162,8 @@ def signature(levels: Sequence[Floats]) -> Floats:
 def quantise(psi: Floats, scale: float) -> Bytes:
     """Return one byte per component of psi (n,): round(psi / scale) + 128, clipped.
 
-    L1 distances of quantised signatures times `scale`, the model's step, are those of the
-    signatures up to rounding.
+    `scale` is the model's step. L1 distances of quantised signatures times `scale` equal the
+    distances of the signatures up to rounding.
     """
     result: Bytes = np.clip(np.rint(psi / scale) + ZERO, 0, 255).astype(np.uint8)
     return result
@@ -174,10 +173,10 @@ Ints8 = NDArray[np.int8]
 Ints16 = NDArray[np.int16]
 Ints32 = NDArray[np.int32]
 
-#: Units of a component of psi, which lies in [-1, 1]. By Cauchy-Schwarz the product with a row of
-#: the basis fits in 32 bits for up to 16 levels of 25,000 components.
+#: Integer value of 1 in psi. By the Cauchy-Schwarz inequality, the product with a row of the basis
+#: fits in 32 bits for up to 16 levels of 25,000 components.
 UNITS = 1 << 14
-#: Units of a stored component of root mean square size; few components reach the limit of 127.
+#: Root mean square of the stored components; few components reach the limit of 127.
 GAIN = 26.0
 
 
@@ -185,23 +184,23 @@ GAIN = 26.0
 class WhiteningParameters:
     """Parameters of the stored signature."""
 
-    dimension: int = 448  #: d, bytes of a stored signature
+    dimension: int = 448  #: d, number of bytes of a stored signature
     exponent: float = 1.0  #: exponent of the standard deviation that divides an axis
 
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """An affine map from psi to the stored signature, learnt once per model.
+    """An affine map from psi to the stored signature, fitted once per model.
 
     Basis and psi are integers, so their products are exact and independent of the order of sums.
 
     Parameters
     ----------
-    levels : (h,) ascending indices of the levels in psi, 0 is the finest
-    basis : (d, D) int8, axes of psi, the widest first
-    scales : (d,) float64, one unit of each axis's product, whitened
-    offsets : (d,) float64, each axis's product with the mean psi
-    unrelated_distance : d0, the median squared distance of signatures of unrelated frames
+    levels : (h,) ascending indices of the levels in psi; 0 is the finest level
+    basis : (d, D) int8, axes of psi, by descending variance
+    scales : (d,) float64, factors that whiten the products of the axes with psi
+    offsets : (d,) float64, products of the axes with the mean psi
+    unrelated_distance : d0, median squared distance between signatures of unrelated frames
     """
 
     levels: tuple[int, ...]
@@ -212,17 +211,17 @@ class Whitening:
 
     @property
     def dimension(self) -> int:
-        """Return d, the bytes of a stored signature."""
+        """Return d, the number of bytes of a stored signature."""
         return len(self.basis)
 
     @property
     def gain(self) -> float:
-        """Return the units of a component of a unit vector."""
+        """Return the factor between a unit vector and the stored components."""
         return GAIN * math.sqrt(self.dimension)
 
 
 def psi_units(psi: Floats) -> Ints16:
-    """Return psi (..., D), components in [-1, 1], in integer units."""
+    """Return psi (..., D), with components in [-1, 1], as integers in steps of 1 / UNITS."""
     units: Ints16 = np.rint(np.asarray(psi) * UNITS).astype(np.int16)
     return units
 
@@ -242,59 +241,62 @@ def whiten(psi: Floats, whitening: Whitening) -> Bytes:
 
     Parameters
     ----------
-    psi : (D,) Fisher vectors of the levels of the whitening
+    psi : (D,) Fisher vectors of the levels in `whitening.levels`
 
     Returns
     -------
-    (d,) uint8 : components of a unit vector, times the gain, rounded and clipped, plus 128
+    (d,) uint8 : components of a unit vector, multiplied by the gain, rounded, clipped, plus 128
 
     Raises
     ------
-    ValueError : psi has another length
+    ValueError : If the length of psi does not fit the basis
     """
     if psi.shape != whitening.basis.shape[1:]:
-        raise ValueError(f"psi {psi.shape} does not fit the basis {whitening.basis.shape}")
+        raise ValueError(
+            f"psi has shape {psi.shape}, but the basis has shape {whitening.basis.shape}. "
+            "Pass the levels of the whitening only."
+        )
     products = np.empty(whitening.dimension, np.int32)
     _products(whitening.basis, psi_units(psi), products)
     z = whitening.scales * (products - whitening.offsets)
     length = float(np.sqrt((z * z).sum()))
-    unit = z / length if length > 0 else z  # psi equals the mean
+    unit = z / length if length > 0 else z  # the length is 0 if psi equals the mean
     stored: Bytes = (np.clip(np.rint(whitening.gain * unit), -127, 127) + ZERO).astype(np.uint8)
     return stored
 
 
 def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) -> Whitening:
-    """Fit principal axes of psi and their spread from the Gram matrix of the frames.
+    """Fit the principal axes of psi and their variances by the Gram matrix of the frames.
 
-    There are fewer frames than components, so the Gram matrix is the smaller one.
+    There are fewer frames than components, so the Gram matrix is smaller than the covariance.
 
     Parameters
     ----------
-    psi : (n, D) units of training frames; see `psi_units`
+    psi : (n, D) results of `psi_units` for training frames
     levels : levels in psi
 
     Returns
     -------
-    whitening : its unrelated distance is 1, until it is measured
+    whitening : whitening with an unrelated distance of 1, which must be measured
 
     Raises
     ------
-    ValueError : the frames are fewer than the axes, or span fewer dimensions
+    ValueError : If the frames are fewer than the axes, or span fewer dimensions than the axes
     """
     n, d = len(psi), p.dimension
     if not 1 <= d < n:
-        raise ValueError(f"{n} frames cannot determine {d} axes")
+        raise ValueError(f"{n} frames cannot determine {d} axes. Train on more frames.")
     mean = psi.mean(axis=0, dtype=np.float64)
     centred = psi - mean
-    variances, vectors = np.linalg.eigh(centred @ centred.T / n)  # rising
+    variances, vectors = np.linalg.eigh(centred @ centred.T / n)  # in ascending order
     variances, vectors = variances[::-1][:d], vectors.T[::-1][:d]
     if variances[-1] <= 1e-9 * variances[0]:
-        raise ValueError(f"{n} frames span fewer than {d} axes")
+        raise ValueError(f"{n} frames span fewer than {d} axes. Train on more frames.")
     axes = (vectors @ centred) / np.sqrt(n * variances)[:, None]
-    signs = np.sign(axes[np.arange(d), np.abs(axes).argmax(axis=1)])  # eigenvectors have none
+    signs = np.sign(axes[np.arange(d), np.abs(axes).argmax(axis=1)])  # eigh leaves signs undefined
     axes *= signs[:, None]
     units = np.abs(axes).max(axis=1) / 127
     basis: Ints8 = np.rint(axes / units[:, None]).astype(np.int8)
-    # single precision drops the last bits, in which LAPACK differs between processors
+    # single precision drops the last bits, which differ between processors
     scales = (units * variances ** (-p.exponent / 2)).astype(np.float32).astype(np.float64)
     return Whitening(levels, basis, scales, basis @ mean, 1.0)

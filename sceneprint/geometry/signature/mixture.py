@@ -1,4 +1,4 @@
-"""Fit and evaluate a Gaussian mixture with diagonal covariances (Sec. III-B, generative model)."""
+"""A Gaussian mixture with diagonal covariances (Sec. III-B, generative model)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Mixture:
 
     Parameters
     ----------
-    weights : (G,) float64, p_g; positive, of sum 1
+    weights : (G,) float64, p_g; positive, with sum 1
     means : (G, 12) float64, nu_g
     variances : (G, 12) float64, the diagonals of Lambda_g; positive
     """
@@ -35,17 +35,15 @@ class MixtureParameters:
     """Parameters of the fit."""
 
     n_components: int = 1250  #: G
-    iterations: int = 8  #: iterations of expectation maximisation
-    variance_floor: float = 0.02  #: added to every variance; features have variance 1
-    prior_variance: float = 0.02  #: prior of the variances of components
+    iterations: int = 8  #: number of iterations of expectation maximisation
+    variance_floor: float = 0.02  #: constant added to every variance; features have variance 1
+    prior_variance: float = 0.02  #: prior of the components' variances
     prior_count: float = 5.0  #: weight of the prior, in samples
-    minimum_weight: float = 1e-6  #: least p_g
+    minimum_weight: float = 1e-6  #: minimum p_g
 
 
 def log_densities(features: Floats, mixture: Mixture) -> Floats:
-    """Return the joint log density of features (M, 12) and components, (M, G) float64:
-    log p_g + log N(f; nu_g, Lambda_g).
-    """
+    """Return log p_g + log N(f; nu_g, Lambda_g) of features (M, 12), (M, G) float64."""
     precision = 1.0 / mixture.variances
     constant = np.log(mixture.weights) - 0.5 * (
         np.log(2 * np.pi * mixture.variances) + mixture.means**2 * precision
@@ -60,11 +58,11 @@ def posteriors(features: Floats, mixture: Mixture) -> Floats:
 
     Returns
     -------
-    pi : (M, G) float64, rows of sum 1
+    pi : (M, G) float64, rows with sum 1
 
     Notes
     -----
-    Reading R2 (docs/paper.md): the print omits p_g and |Lambda_g|; this is the posterior.
+    Reading R2 (docs/paper.md): the printed formula omits p_g and |Lambda_g|; this is the posterior.
     """
     joint = log_densities(features, mixture)
     joint -= joint.max(axis=1, keepdims=True)
@@ -74,10 +72,10 @@ def posteriors(features: Floats, mixture: Mixture) -> Floats:
 
 
 def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[Mixture]:
-    """Learn a mixture by expectation maximisation from a K-Means++ start (Sec. III-F).
+    """Fit a mixture by expectation maximisation from a K-Means++ start (Sec. III-F).
 
-    Yields the start and the mixture after every iteration, to show progress; the last is the
-    result.
+    The function yields the start and the mixture after every iteration, to show progress. The last
+    mixture is the result.
 
     Parameters
     ----------
@@ -86,12 +84,12 @@ def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[M
 
     Raises
     ------
-    TrainingError : there are fewer than ten features per component
+    TrainingError : If there are fewer than ten features per component
     """
     if len(features) < 10 * p.n_components:
         raise TrainingError(
             f"{len(features)} training pairs are too few for {p.n_components} components. "
-            "Train on more frames, or select a smaller preset."
+            "Train on more frames or select a smaller preset."
         )
     mixture = _k_means_start(features, p, seed)
     yield mixture
@@ -103,7 +101,7 @@ def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[M
 def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture:
     """Return the mixture after one iteration of expectation maximisation.
 
-    Features (M, 12) are processed in blocks, since posteriors of all would take gigabytes.
+    Features (M, 12) are processed in blocks, since all posteriors together would fill gigabytes.
     """
     zeroth, first, second = moments(features, mixture)
     count = np.maximum(zeroth, 1e-9)[:, None]
@@ -120,7 +118,7 @@ def moments(
     Parameters
     ----------
     features : (M, 12)
-    weights : (M,), or None if all are 1
+    weights : (M,); None if all weights are 1
     block : number of features per block
     """
     g, dimension = mixture.means.shape

@@ -1,4 +1,4 @@
-"""Compute the 13-D properties of patch pairs, and count pairs in a table (Sec. III-A).
+"""The 13-D properties of patch pairs, and counts of pairs in a table (Sec. III-A).
 
     Patches (P), pairs (M, 2)  --invariants-->  (M, 4)  --properties-->  f' (M, 13)
     f' (M, 13)  --project-->  f (M, 12)
@@ -8,10 +8,10 @@
 Symbols follow the paper: mu is the reference patch, alpha its neighbour, r the vector from mu to
 alpha, <u, v, w> the Gram-Schmidt basis of (r, n_mu) with w = u x v.
 
-A pair of oriented points has four degrees of freedom under rigid motion: the length of r, the
-angles of both normals to it, and the dihedral angle between the normals about it. All thirteen
-properties are functions of these. So pairs are counted in the bins of a grid over the four, and a
-table holds projection and posteriors once per bin.
+A pair of oriented points has four invariants under rigid motion: the length of r, the angles of
+both normals to r, and the dihedral angle between the normals about r. All thirteen properties are
+functions of these. Therefore pairs are counted in the bins of a grid over the invariants, and a
+table contains projection and posteriors once per bin.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class PropertyParameters:
 
     radius: float = 3.0  #: radius of a patch's neighbourhood, metres
     angular_tolerance: float = math.radians(10.0)  #: e_theta of the robust sign, rad
-    colinearity: float = 0.9995  #: |n_mu . u| beyond which (r, n_mu) span no basis
+    colinearity: float = 0.9995  #: |n_mu . u| above which (r, n_mu) span no basis
 
 
 def neighbour_pairs(patches: Patches, p: PropertyParameters) -> NDArray[np.int64]:
-    """Return all ordered pairs of patches within reach that span a basis: N_mu of Sec. III-A.
+    """Return all ordered pairs of patches within `radius` that span a basis: N_mu of Sec. III-A.
 
     Returns
     -------
@@ -61,13 +61,13 @@ def invariants(patches: Patches, pairs: NDArray[np.int64]) -> Floats:
 
     Parameters
     ----------
-    patches : means in metres, normals of unit length
-    pairs : (M, 2) indices (mu, alpha) whose r and n_mu are not parallel
+    patches : patches with means in metres and unit normals
+    pairs : (M, 2) indices (mu, alpha) of patches whose r and n_mu are not parallel
 
     Returns
     -------
-    (M, 4) : ||r|| in metres; the angles of n_mu and of n_alpha to u in [0, pi]; the dihedral angle
-        from n_mu to n_alpha about u in [-pi, pi]; rad
+    (M, 4) : ||r|| in metres; angles of n_mu and of n_alpha to u, in [0, pi]; dihedral angle from
+        n_mu to n_alpha about u, in [-pi, pi]
     """
     mu, alpha = pairs.T
     r = patches.means[alpha] - patches.means[mu]
@@ -97,9 +97,8 @@ def properties(invariant: Floats, p: PropertyParameters) -> Floats:
 
     Notes
     -----
-    Reading R1 (docs/paper.md): the printed interval of sgn_e is empty; the sign is 0 within e_theta
-        of
-    perpendicular, |cos| <= sin(e_theta).
+    Reading R1 (docs/paper.md): the printed interval of sgn_e is empty; here the sign is 0 within
+    e_theta of perpendicular, |cos| <= sin(e_theta).
     """
     d, theta_mu, theta_alpha, phi = invariant.T
     m_u, m_v = np.cos(theta_mu), np.sin(theta_mu)  # n_mu = m_u u + m_v v
@@ -136,7 +135,7 @@ FEATURE_DIMENSION = 12  #: d_F, length of f
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """The learnt subspace: f = matrix (f' - mean).
+    """The fitted subspace: f = matrix (f' - mean).
 
     Parameters
     ----------
@@ -149,11 +148,11 @@ class Projection:
 
 
 def project(properties: Floats, projection: Projection) -> Floats:
-    """Return the features of properties (M, 13) in the learnt subspace (Sec. III-A).
+    """Return the features of properties (M, 13) in the fitted subspace (Sec. III-A).
 
     Features (M, 12) have unit variance and are uncorrelated over the training pairs.
     """
-    # einsum, because the order of BLAS's sums depends on its threads, and tables must be equal
+    # einsum, because the order of sums in BLAS depends on threads, and tables must be equal
     features: Floats = np.einsum("md,fd->mf", properties - projection.mean, projection.matrix)
     return features
 
@@ -161,22 +160,22 @@ def project(properties: Floats, projection: Projection) -> Floats:
 def fit_projection(
     properties: Floats, method: Literal["pca", "ica"] = "pca", seed: int = 0
 ) -> Projection:
-    """Learn the subspace from the properties of training pairs.
+    """Fit the subspace to the properties of training pairs.
 
     Parameters
     ----------
     properties : (M, 13)
     method : "pca" whitens the standardised properties; "ica" also makes the components independent
         (FastICA, log cosh)
-    seed : seed of FastICA's starting matrix
+    seed : seed of FastICA's initial matrix
 
     Returns
     -------
-    projection : each row's largest weight is positive, since neither method fixes signs
+    projection : projection with positive largest weights, since neither method defines signs
 
     Raises
     ------
-    TrainingError : a property does not vary, or FastICA does not converge
+    TrainingError : If a property does not vary, or FastICA does not converge
 
     Notes
     -----
@@ -226,15 +225,15 @@ def fit_projection(
 class TableLayout:
     """The grid over the four invariants of a pair.
 
-    Angular bins are centred on right angles (dihedral ones also on 0 and 180 degrees), because
+    Angular bins are centred on right angles (dihedral bins also on 0 and 180 degrees), because
     these are frequent in buildings and must not fall on an edge. With 27 bins the tolerance of 10
-    degrees in Eq. (1) is an edge, so no bin straddles the jump of the robust sign: a finer grid
-    would need three times as many bins.
+    degrees in Eq. (1) is an edge, so no bin contains the jump of the robust sign. A finer grid with
+    this property needs three times as many bins.
     """
 
     distance_bins: int = 20
-    angle_bins: int = 27  #: bins of each normal's angle to r; odd, so one is centred on 90 degrees
-    dihedral_bins: int = 20  #: a multiple of 4, offset by half a bin
+    angle_bins: int = 27  #: odd number of bins of an angle to r: one is centred on 90 degrees
+    dihedral_bins: int = 20  #: multiple of 4; the bins are offset by half a bin
     distance_exponent: float = 1.3  #: distance edges are radius * (i / bins)^exponent
 
     @property
@@ -244,7 +243,7 @@ class TableLayout:
 
 
 def bin_centres(layout: TableLayout, first: int, last: int, p: PropertyParameters) -> Floats:
-    """Return the invariants at the centres of bins `first` to `last` - 1, as `invariants` does."""
+    """Return the invariants (n, 4) at the centres of bins `first` to `last` - 1."""
     shape = (layout.distance_bins, layout.angle_bins, layout.angle_bins, layout.dihedral_bins)
     i, j, k, m = np.unravel_index(np.arange(first, last), shape)
     d = p.radius * ((i + 0.5) / layout.distance_bins) ** layout.distance_exponent
@@ -254,7 +253,7 @@ def bin_centres(layout: TableLayout, first: int, last: int, p: PropertyParameter
 
 
 def _diamond(x: Floats, y: Floats) -> Floats:
-    """Return the diamond angle in [0, 4): monotone in atan2(y, x), but cheaper."""
+    """Return the diamond angle in [0, 4), which increases with atan2(y, x) but is faster."""
     t = y / (np.abs(x) + np.abs(y))
     diamond: Floats = np.where(x < 0, 2.0 - t, np.where(y < 0, 4.0 + t, t))
     return diamond
@@ -266,8 +265,8 @@ def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Float
     Returns
     -------
     distance : (distance_bins,) metres
-    angle : (angle_bins,) minus the cosine of the angle, rising from -1; the last is infinite
-    dihedral : (dihedral_bins + 1,) diamond angle in [0, 4]; the last bin is half of the first
+    angle : (angle_bins,) negative cosines of the angle, ascending from -1; the last is infinite
+    dihedral : (dihedral_bins + 1,) diamond angles in [0, 4]; the last edge ends the first bin
     """
     distance = p.radius * (np.arange(1, layout.distance_bins + 1) / layout.distance_bins) ** (
         layout.distance_exponent
@@ -280,49 +279,49 @@ def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Float
 
 
 def search_starts(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
-    """Return the first bin of each of `n` equal cells, where the search for a bin starts.
+    """Return the first bin of each of `n` equal cells, at which the search for a bin starts.
 
     Parameters
     ----------
-    edges : upper edges of the bins
-    origin, extent : range of the coordinate
-    n : number of cells; each must be narrower than any bin
+    edges : (m,) upper edges of the bins
+    origin, extent : start and length of the range of the coordinate
+    n : number of cells, which must be narrower than all bins
 
     Raises
     ------
-    ValueError : a bin is narrower than a cell
+    ValueError : If a bin is narrower than a cell
     """
     if n * np.diff(edges, prepend=origin).min() <= extent:
-        raise ValueError("bins are narrower than the cells of the search: use fewer bins")
+        raise ValueError("Bins are narrower than the cells of the search. Use fewer bins.")
     starts = origin + extent * np.arange(n) / n
     return np.minimum(np.searchsorted(edges, starts, side="right"), len(edges) - 1).astype(np.int32)
 
 
-LEADING = 8  #: number of posteriors per bin, normalised to sum 1
+LEADING = 8  #: number of posteriors per bin, with sum 1
 LEAST_POSTERIOR = 1e-3  #: smaller posteriors are 0
-#: Floats of a bin: feature, posteriors, and the components as pairs of int16.
+#: Number of floats of a bin: feature, posteriors, and components as pairs of int16.
 WIDTH = FEATURE_DIMENSION + LEADING + LEADING // 2
 
 
 @dataclass(frozen=True, eq=False)
 class PairTable:
-    """The contribution of a pair to Eq. (2) by bin, 96 bytes each: two cache lines per look-up.
+    """The contribution of a pair to Eq. (2) by bin, 96 bytes (two cache lines) each.
 
     Parameters
     ----------
-    packed : (B, 24) float32, C-contiguous; its columns are the properties below
+    packed : (B, 24) float32, C-contiguous; columns of features, posteriors and components
     """
 
     packed: Floats32
 
     @property
     def features(self) -> Floats32:
-        """Return the features f of the bins' centres, (B, 12) float32."""
+        """Return the features f at the centres of the bins, (B, 12) float32."""
         return self.packed[:, :FEATURE_DIMENSION]
 
     @property
     def posteriors(self) -> Floats32:
-        """Return the leading posteriors, (B, 8) float32, falling, of sum 1, or 0."""
+        """Return the largest posteriors, (B, 8) float32, in descending order, with sum 1."""
         return self.packed[:, FEATURE_DIMENSION : FEATURE_DIMENSION + LEADING]
 
     @property
@@ -334,7 +333,7 @@ class PairTable:
 def pack_table(
     features: Floats32, posteriors: Floats32, components: NDArray[np.int16]
 ) -> PairTable:
-    """Pack features (B, 12), posteriors (B, 8) and components (B, 8) to a table."""
+    """Pack features (B, 12), posteriors (B, 8) and components (B, 8) into a table."""
     packed = np.empty((len(features), WIDTH), np.float32)
     table = PairTable(packed)
     table.features[:], table.posteriors[:], table.components[:] = features, posteriors, components
@@ -346,7 +345,7 @@ def _select_leading(
     features: Floats32, constants: Floats32, means: Floats32, precisions: Floats32,
     components: NDArray[np.int16], posteriors: Floats32,
 ) -> None:  # fmt: skip
-    """Write the largest posteriors of each feature. means, precisions: (12, G)."""
+    """Write the largest posteriors of each feature; means and precisions are (12, G)."""
     n, dimension = features.shape
     n_components, n_leading = len(constants), components.shape[1]
     logits = np.empty(n_components, np.float32)
@@ -403,16 +402,16 @@ def compute_bins(
 
 
 # The kernels count all ordered pairs, because signatures of samples would differ (docs/paper.md,
-# R11). Their inner loops run over all later patches, so the compiler can vectorize them.
+# R11). Their inner loops cover all later patches, so the compiler can vectorize them.
 
 
 @disjoint_kernel
 def _invariants(
     points: Floats, normals: Floats, i: int, d: Floats, i_u: Floats, j_u: Floats, turn: Floats
 ) -> None:
-    """Write the distance of patch i to each later one, n_i . u and n_j . u, and the dihedral angle.
+    """Write the distance, n_i . u, n_j . u and dihedral angle of patch i with each later patch j.
 
-    u points from i to j; the angle about u from n_i to n_j is a diamond angle, as in `_diamond`.
+    u points from i to j. The dihedral angle from n_i to n_j about u is a diamond angle.
     """
     x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
     ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
@@ -433,7 +432,7 @@ def _invariants(
 
 @disjoint_kernel
 def _bin(value: float, edges: Floats, hints: Ints32, origin: float, per_unit: float) -> int:
-    """Return the index of the first edge above a value. Cells of `hints` are narrower than bins."""
+    """Return the index of the first edge above a value; cells of `hints` are narrower than bins."""
     cell = min(max((value - origin) * per_unit, 0.0), len(hints) - 1.0)
     b = hints[np.uint64(np.int32(cell))]
     found: int = b + 1 if value >= edges[np.uint64(b)] else b
@@ -446,7 +445,7 @@ def _pair_bins(
     distance: Floats, angle: Floats, dihedral: Floats, of_distance: Ints32, of_angle: Ints32,
     of_dihedral: Ints32, n_angles: int, n_dihedrals: int, there: Ints32, back: Ints32,
 ) -> None:  # fmt: skip
-    """Write the bins of the pairs (i, j) and (j, i); -1 if a pair does not count."""
+    """Write the bins of the pairs (i, j) and (j, i); -1 for pairs that do not count."""
     per_metre, per_cosine = len(of_distance) / radius, len(of_angle) / 2.0
     per_turn = len(of_dihedral) / 4.0
     for j in range(i + 1, len(d)):
@@ -469,7 +468,7 @@ def _pair_bins(
 def _add(
     there: Ints32, back: Ints32, i: int, weights: Floats32, counts: Floats32, total: float
 ) -> tuple[int, float]:
-    """Add the weights of pairs to their bins; return the pairs, and `total` plus their weights."""
+    """Add the weights of pairs to their bins; return the number of pairs, and the new `total`."""
     found, own = 0, weights[i]
     for j in range(i + 1, len(there)):
         weight = own * weights[j]
@@ -490,7 +489,7 @@ def _count(
     distance: Floats, angle: Floats, dihedral: Floats,
     hints: Ints32, n_angles: int, n_dihedrals: int, weights: Floats32, counts: Floats32,
 ) -> tuple[int, float]:  # fmt: skip
-    """Add the weights of both orders of every pair; return the number and weight of all."""
+    """Add the weights of both orders of every pair; return number and total weight of the pairs."""
     n = points.shape[1]
     d, i_u, j_u, turn = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     there, back = np.empty(n, np.int32), np.empty(n, np.int32)
@@ -508,13 +507,13 @@ def _count(
 
 @dataclass(frozen=True, eq=False)
 class PairCounts:
-    """All ordered pairs of one level, by bin.
+    """The ordered pairs of one level, counted by bin.
 
     Parameters
     ----------
     weights : (B,) float32, sum of the weights of the pairs in each bin
-    n_pairs : number of pairs
-    total : sum of all their weights
+    n_pairs : total number of pairs
+    total : sum of the weights of all pairs
     """
 
     weights: Floats32
@@ -524,7 +523,9 @@ class PairCounts:
 
 @lru_cache(maxsize=8)
 def _look_up(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats, Floats, Ints32]:
-    """Return the edges of `bin_edges`, and their search starts (3, n), shared and read-only."""
+    """Return the results of `bin_edges` and their search starts (3, n), which callers must not
+    modify.
+    """
     distance, angle, dihedral = bin_edges(layout, p)
     starts = np.stack(
         [
@@ -541,11 +542,11 @@ def _look_up(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats
 def count_pairs(
     means: Floats, normals: Floats, weights: Floats, layout: TableLayout, p: PropertyParameters
 ) -> PairCounts:
-    """Count all ordered pairs of patches by bin, each with the product of its weights.
+    """Count all ordered pairs of patches by bin, weighted by the product of the patches' weights.
 
     Parameters
     ----------
-    means, normals : (P, 3) float64, metres and unit length
+    means, normals : (P, 3) float64, metres and unit vectors
     weights : (P,) weights of the patches
     """
     distance, angle, dihedral, starts = _look_up(layout, p)
@@ -559,5 +560,5 @@ def count_pairs(
 
 
 def machine_code_folder() -> tuple[str, bool]:
-    """Return the folder of the pair kernel's machine code, and whether it holds code."""
+    """Return the folder of the pair kernel's machine code, and whether it contains code."""
     return code_folder(_count)

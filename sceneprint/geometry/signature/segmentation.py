@@ -1,19 +1,19 @@
-"""Segment a surface into smooth, compact patches, and cluster patches to a hierarchy (Sec. III-F).
+"""Segmentation of a surface into smooth, compact patches, and their hierarchy (Sec. III-F).
 
     Surface (h, w)  --segment-->      labels (h, w)  --extract_patches-->  Patches (P)
     Voxels (V)      --supervoxels-->  labels (1, V)  --extract_patches-->  Patches (P)
     Surface, labels (h, w)  --hierarchy-->  Hierarchy (H levels)
     Patches (P)  --patch_weights-->  (P,)
 
-Images: SLIC over position and normal, started from a grid. It has no pixel term, so patches end at
-creases and depth edges alike.
+Images are segmented by SLIC over position and normal, which starts from a grid. The distance has no
+pixel term, so patches end at both creases and depth edges.
 
-Clouds: VCCS (Papon 2013), seeds on a grid that grow over touching voxels by position and normal. A
-patch ends at creases and never crosses a gap. Unlike in VCCS, the distance is that of k-means, and
-centres follow their patches.
+Clouds are segmented by VCCS (Papon 2013): seeds on a grid grow over touching voxels by position and
+normal. A patch ends at creases and does not cross gaps. Unlike in VCCS, the distance is that of
+k-means, and centres move with their patches.
 
-Hierarchy: agglomerative K-Means over the finest patches in position and normal, weighted by area,
-seeded near-uniformly over the surface by farthest-point sampling.
+The hierarchy is an agglomerative K-Means over the positions and normals of the finest patches,
+weighted by area. Farthest-point sampling distributes its seeds evenly over the surface.
 """
 
 from __future__ import annotations
@@ -39,16 +39,14 @@ class SegmentationParameters:
     iterations: int = 5  #: rounds of assignment and update
     normal_weight: float = 6.0  #: weight of 1 - cos(normals), relative to squared seed spacings
     minimum_size: float = 0.15  #: patches below this share of a grid cell are dropped
-    minimum_pixels: int = 4  #: and those below so many pixels
+    minimum_pixels: int = 4  #: patches with fewer pixels are dropped
 
 
 @kernel
 def _spread_centres(
     centres: Floats32, row: int, shift: int, cells: Ints32, columns: int, out: Floats32
 ) -> None:
-    """Write the centre `shift` cells beside each pixel, in a row of cells, to (7, w), or a dead
-    one.
-    """
+    """Write the centre `shift` cells beside each pixel of a row of cells to (7, w); 0 outside."""
     for x in range(len(cells)):
         column = cells[x] + shift
         if row < 0 or row * columns >= len(centres) or column < 0 or column >= columns:
@@ -63,23 +61,23 @@ def _assign_row(
     pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, k: np.int32,
     cells: Ints32, labels: Ints32, nearest: Floats32,
 ) -> None:  # fmt: skip
-    """Assign pixels of a row, of (6, h, w), to the centre beside each, of (7, w), if it is nearer.
+    """Assign the pixels of a row to the centres (7, w) beside them if these are nearer.
 
-    Dead centres get no pixels. k: centre beside a pixel of the first cell.
+    Unused centres get no pixels. `k` is the centre beside a pixel of the first cell.
     """
     px, py, pz = pixels[0, y], pixels[1, y], pixels[2, y]
     nx, ny, nz = pixels[3, y], pixels[4, y], pixels[5, y]
     cx, cy, cz, mx, my, mz = (
         centres[0], centres[1], centres[2], centres[3], centres[4], centres[5]
     )  # fmt: skip
-    scale = centres[6]  # (1 / metric seed spacing)^2; 0 for a dead centre
+    scale = centres[6]  # (1 / metric seed spacing)^2; 0 for an unused centre
     for x in range(len(labels)):
         dx, dy, dz = px[x] - cx[x], py[x] - cy[x], pz[x] - cz[x]
         cosine = nx[x] * mx[x] + ny[x] * my[x] + nz[x] * mz[x]
-        found = (dx * dx + dy * dy + dz * dz) * scale[x] + normal_weight * (
+        distance = (dx * dx + dy * dy + dz * dz) * scale[x] + normal_weight * (
             np.float32(1.0) - cosine
         )
-        distance = found if scale[x] > 0 else np.float32(np.inf)
+        distance = distance if scale[x] > 0 else np.float32(np.inf)
         labels[x] = k + cells[x] if distance < nearest[x] else labels[x]
         nearest[x] = min(distance, nearest[x])
 
@@ -89,17 +87,17 @@ def _assign(
     pixels: Floats32, valid: NDArray[np.bool_], centres: Floats32, spacing: float,
     normal_weight: np.float32, columns: int, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Assign every pixel, of (6, h, w), to the nearest centre of the nine cells around it.
+    """Assign every pixel of (6, h, w) to the nearest centre of the nine cells around it.
 
-    A row of pixels is compared with one centre each at a time, which vectorizes. Centres are spread
-    over the pixels once per row of cells.
+    The pixels of a row are compared with one centre each at a time, so the loop can be vectorized.
+    Centres are copied to the pixels once per row of cells.
     """
     height, width = valid.shape
     rows = len(centres) // columns
     cells = np.empty(width, np.int32)
     for x in range(width):
         cells[x] = min(int(x / spacing), columns - 1)
-    around = np.zeros((3, 3, 7, width), np.float32)  # of three rows of cells, by row modulo 3
+    around = np.zeros((3, 3, 7, width), np.float32)  # three rows of cells, by row modulo 3
     nearest = np.empty(width, np.float32)
     cell, spread = -1, -2
     for y in range(height):
@@ -125,7 +123,7 @@ def _assign(
 def _sums(
     points: Floats32, normals: Floats32, weights: Floats32, labels: Ints32, n: int
 ) -> NDArray[np.float64]:
-    """Return sums per label: weight, weighted point (3), weighted normal (3), pixels."""
+    """Return sums per label: weight, weighted point (3), weighted normal (3), number of pixels."""
     height, width = labels.shape
     sums = np.zeros((n, 8))
     for y in range(height):
@@ -144,7 +142,7 @@ def _sums(
 
 @kernel
 def _centres(sums: Floats, spacing: float, focal_length: float, centres: Floats32) -> None:
-    """Write mean point and normal of labels, (n, 7), and (1 / metric seed spacing)^2, 0 if dead."""
+    """Write mean point, mean normal and (1 / metric seed spacing)^2 of labels, (n, 7)."""
     for k in range(len(sums)):
         alive = sums[k, 0] > 0
         weight = sums[k, 0] if alive else 1.0
@@ -175,8 +173,8 @@ def _seed_grid(height: int, width: int, n_patches: int) -> tuple[Ints32, float, 
 def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     """Assign every valid pixel to a patch.
 
-    Patches below either limit of the parameters are dropped: their normals would be noise, and in
-    an image of a thousand patches they cover less than one per cent of the surface.
+    Patches below either size limit are dropped: their normals would be noise, and in an image of a
+    thousand patches they cover less than 1 % of the surface.
 
     Parameters
     ----------
@@ -184,7 +182,7 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
 
     Returns
     -------
-    labels : (h, w) int32, 0 to P - 1 in the order of the image; -1 for none
+    labels : (h, w) int32, 0 to P - 1 in the order of the image; -1 for pixels without a patch
     """
     height, width = surface.valid.shape
     assert isinstance(surface.camera, Intrinsics)
@@ -207,19 +205,19 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
 
 
 def compact_labels(labels: Ints32, keep: NDArray[np.bool_]) -> Ints32:
-    """Renumber labels (h, w) without gaps; labels that the mask `keep` (n,) drops become -1."""
+    """Renumber the labels (h, w) in the mask `keep` (n,) without gaps; others become -1."""
     renumbered = np.where(keep, np.cumsum(keep) - 1, -1).astype(np.int32)
     result: Ints32 = np.where(labels >= 0, renumbered[labels], -1).astype(np.int32)
     return result
 
 
 def extract_patches(surface: Surface, labels: Ints32) -> Patches:
-    """Return means, normals and areas of labelled pixels, weighted by their surface areas.
+    """Return the patches of labelled pixels, with means weighted by surface area.
 
     Parameters
     ----------
-    surface : (h, w)
-    labels : (h, w) int32, 0 to P - 1; -1 for none
+    surface : (h, w) points and normals
+    labels : (h, w) int32, 0 to P - 1; -1 for pixels without a patch
 
     Returns
     -------
@@ -243,13 +241,13 @@ def extract_patches(surface: Surface, labels: Ints32) -> Patches:
 class HierarchyParameters:
     """Parameters of the hierarchy."""
 
-    n_levels: int = 4  #: H
+    n_levels: int = 4  #: number of levels, H
     factor: float = 2.0**0.5  #: ratio of the numbers of patches of successive levels
-    iterations: int = 4  #: iterations of K-Means
+    iterations: int = 4  #: number of iterations of K-Means
     normal_weight: float = 3.0  #: weight of 1 - cos(normals), relative to squared patch diameters
 
 
-#: Number of consecutive patches that are compared with a centre, or skipped, together.
+#: Number of consecutive patches that are compared with a centre or skipped together.
 _BLOCK = 8
 
 
@@ -258,7 +256,7 @@ def _move_nearer(
     patches: Floats, centre: Floats, scale: float, weight: float, c: int, first: int, last: int,
     nearest: Floats, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Move patches to cluster `c` if they are nearer to its centre than to their own."""
+    """Move patches to cluster `c` if its centre is nearer than their present centre."""
     x, y, z, nx, ny, nz = (
         patches[0], patches[1], patches[2], patches[3], patches[4], patches[5]
     )  # fmt: skip
@@ -272,7 +270,9 @@ def _move_nearer(
 
 @kernel
 def _boxes(patches: Floats, boxes: Floats) -> float:
-    """Write the corners (6, n) of the boxes of blocks of patches; return the longest normal."""
+    """Write the bounding boxes (6, n) of blocks of patches; return the length of the longest
+    normal.
+    """
     longest = 0.0
     boxes[:3], boxes[3:] = np.inf, -np.inf
     for k in range(patches.shape[1]):
@@ -289,7 +289,7 @@ def _boxes(patches: Floats, boxes: Floats) -> float:
 def _least_distances(
     boxes: Floats, centre: Floats, scale: float, weight: float, longest: float, least: Floats
 ) -> None:
-    """Write lower bounds of the distances of blocks of patches from a centre, rounding included."""
+    """Write lower bounds, including rounding errors, of the distances of blocks from a centre."""
     cosine = longest * np.sqrt(centre[3] ** 2 + centre[4] ** 2 + centre[5] ** 2)
     of_normals = weight * (1.0 - cosine) - 1e-9 * abs(weight) * (1.0 + cosine)
     shrunk = scale * (1.0 - 1e-9)
@@ -326,7 +326,7 @@ def _seed(
                 first, last = b * _BLOCK, min((b + 1) * _BLOCK, n)
                 _move_nearer(patches, centres[c], scale, weight, c, first, last, nearest, labels)
                 farthest[b] = _maximum(nearest, first, last)
-        worst = int(np.argmax(farthest))  # the first of equals
+        worst = int(np.argmax(farthest))
         chosen, last = worst * _BLOCK, min((worst + 1) * _BLOCK, n)
         while chosen < last - 1 and nearest[chosen] != farthest[worst]:
             chosen += 1
@@ -337,10 +337,10 @@ def _reassign(
     patches: Floats, boxes: Floats, longest: float, scale: float, weight: float, centres: Floats,
     labels: Ints32,
 ) -> None:  # fmt: skip
-    """Assign every patch to the nearest centre, the first of equals.
+    """Assign every patch to the nearest centre, or the first of several equally near centres.
 
-    The distance to the present centre is an upper bound, so a block of patches is compared only
-    with centres whose lower bound does not exceed it.
+    The distance to the present centre is an upper bound. A block of patches is therefore compared
+    only with centres whose lower bound does not exceed it.
     """
     n, n_blocks = len(labels), boxes.shape[1]
     nearest, farthest, least = np.empty(n), np.empty(n_blocks), np.empty(n_blocks)
@@ -364,9 +364,9 @@ def _reassign(
 def _k_means(
     patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
 ) -> Ints32:
-    """Return the labels of (6, P) positions and normals; empty clusters keep their numbers.
+    """Return the labels of (6, P) positions and normals; numbers of empty clusters stay unused.
 
-    Bounds of blocks of neighbours leave a twentieth of the distances to compute.
+    The bounds for blocks of neighbours exclude 95 % of the distances.
     """
     n = patches.shape[1]
     centres, labels = np.empty((n_clusters, 6)), np.zeros(n, np.int32)
@@ -391,7 +391,7 @@ def _k_means(
 
 
 def _cluster(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints32:
-    """Return each patch's parent among at most `n_clusters`, numbered without gaps."""
+    """Return the parent of each patch: one of at most `n_clusters`, numbered without gaps."""
     scale = n_clusters / float(patches.areas.sum())
     columns = np.ascontiguousarray(np.concatenate([patches.means, patches.normals], axis=1).T)
     labels = _k_means(columns, patches.areas, n_clusters, scale, p.normal_weight, p.iterations)
@@ -401,7 +401,7 @@ def _cluster(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints3
 
 
 def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hierarchy:
-    """Return the levels {X_h}, each clustered from the finest patches.
+    """Return the levels {X_h}, which are all clustered from the finest patches.
 
     Parameters
     ----------
@@ -410,8 +410,8 @@ def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hiera
 
     Returns
     -------
-    hierarchy : `n_levels` levels, finest first; each has 1 / factor of the patches of the level
-        before, at least one
+    hierarchy : `n_levels` levels, finest first; each level has 1 / factor of the patches of the
+        previous level, and at least one patch
     """
     levels, labels = [extract_patches(surface, finest)], [finest]
     for h in range(1, p.n_levels):
@@ -425,29 +425,29 @@ def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hiera
 
 @dataclass(frozen=True)
 class WeightParameters:
-    """Parameters of patch weights; both 0 give the paper's equal pairs.
+    """Parameters of patch weights; zeros give all pairs the same weight, as in the paper.
 
     The paper counts every pair once, so the weight of a surface depends on its segmentation, and a
-    patch bent round a chair's leg counts like a square of floor. Weighting by size makes the
-    statistics depend on the surface; weighting by coherence discounts means of unlike normals.
+    patch around a chair's leg counts as much as a patch of floor. Weights by size make the
+    statistics depend on the surface; weights by coherence reduce the influence of curved patches.
     """
 
-    size_exponent: float = 0.5  #: exponent of the share of the image that a patch covers
-    coherence_exponent: float = 20.0  #: exponent of the length of its mean normal
+    size_exponent: float = 0.5  #: exponent of a patch's share of the image
+    coherence_exponent: float = 20.0  #: exponent of the length of a patch's mean normal
 
 
 def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
-    """Return the weights of patches, (P,) positive, of mean 1; pairs weigh their product."""
+    """Return the weights of patches, (P,), positive with mean 1; a pair weighs their product."""
     weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
     result: Floats = weights / weights.mean()
     return result
 
 
-#: Ratio of depth to width of a seed's cell, so that slanted surfaces stay in one cell.
+#: Ratio of depth to width of a seed's cell; above 1, so that slanted surfaces stay in one cell.
 _DEPTH = 4.0
-#: Least size of a patch, as a share of its seed's cell: ends the search for a spacing.
+#: Minimum size of a patch, as a share of its seed's cell, so that the search for a spacing ends.
 _LEAST = 1e-3
-#: Rounds of growth, by a voxel each, between updates of the centres.
+#: Number of growth rounds, by a voxel each, between updates of the centres.
 _GROWTH = 2
 
 
@@ -455,7 +455,7 @@ _GROWTH = 2
 def _seed_cells(
     points: Floats32, axes: Floats, centre: Floats, unit: float, spacing: float, cells: Ints64
 ) -> None:
-    """Write the cell of each point: by direction and range in `unit`, or by position if 0."""
+    """Write the cell of each point, by direction and range in `unit`, or by position if it is 0."""
     for i in range(len(points)):
         px, py, pz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = axes[0, 0] * px + axes[0, 1] * py + axes[0, 2] * pz
@@ -474,9 +474,9 @@ def _voxel_centres(
     points: Floats32, normals: Floats32, sides: Floats32, labels: Ints32, spacing: float,
     sums: Floats,
 ) -> None:  # fmt: skip
-    """Write per label: mean point (3), unit mean normal (3), 1 / spacing^2 in metres; 0 if dead.
+    """Write mean point (3), unit mean normal (3) and 1 / spacing^2 per label; 0 if it is unused.
 
-    spacing: in sides of a voxel.
+    The argument `spacing` is in sides of a voxel, the result in metres.
     """
     sums[:] = 0.0
     for i in range(len(labels)):
@@ -504,7 +504,7 @@ def _grow(
     points: Floats32, normals: Floats32, offsets: Ints64, indices: Ints32, centres: Floats,
     normal_weight: float, labels: Ints32, out: Ints32,
 ) -> None:  # fmt: skip
-    """Assign every voxel to the nearest centre among its own and those of the voxels it touches."""
+    """Assign every voxel to the nearest of its own centre and the centres of touching voxels."""
     for i in range(len(labels)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -527,7 +527,9 @@ def _grow(
 
 @kernel
 def _components(offsets: Ints64, indices: Ints32, labels: Ints32, parts: Ints32) -> int:
-    """Number the connected parts of each label, in the order of their first voxels."""
+    """Number the connected parts of all labels in the order of their first voxels; return the
+    number of parts.
+    """
     stack = np.empty(len(labels), np.int32)
     parts[:] = -1
     n = 0
@@ -555,13 +557,13 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
     Parameters
     ----------
     seen : V voxels
-    spacing : distance of the seeds, in sides of a voxel
-    most : maximum number of patches; more of them widen the spacing
-    p : parameters of iterations, weight of normals and limits of size
+    spacing : distance between the seeds, in sides of a voxel
+    most : maximum number of patches; the spacing grows until it holds
+    p : parameters of the segmentation
 
     Returns
     -------
-    labels : (1, V) int32, 0 to P - 1; -1 for voxels in patches below either limit of size
+    labels : (1, V) int32, 0 to P - 1; -1 for voxels in patches below either size limit
     """
     if not len(seen.sides):
         return np.empty((1, 0), np.int32)
@@ -573,11 +575,13 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
             labels, n = _grow_patches(seen, seeds, spacing, least, p)
             if n <= most:
                 return labels[None]
-        spacing *= 1.03 * (n / most) ** 0.85  # above a square root: patches at a slant are long
+        spacing *= (
+            1.03 * (n / most) ** 0.85
+        )  # above the square root, since slanted patches are long
 
 
 def _seeds(seen: Voxels, spacing: float) -> Ints32:
-    """Return the seed of each voxel (V,): the index of its cell in a grid."""
+    """Return the seed of each voxel (V,), the index of its cell in a grid."""
     side, unit = float(np.median(seen.sides)), 0.0
     if seen.cloud.has_viewpoint:
         at = seen.points[0] - seen.centre
@@ -592,7 +596,7 @@ def _seeds(seen: Voxels, spacing: float) -> Ints32:
 def _grow_patches(
     seen: Voxels, labels: Ints32, spacing: float, least: float, p: SegmentationParameters
 ) -> tuple[Ints32, int]:
-    """Return the labels (V,) of the patches grown from seeds so far apart, and their number."""
+    """Return the labels (V,) of patches that grow from seeds at a spacing, and their number."""
     points, normals, links = seen.points[0], seen.normals[0], seen.links
     centres = np.zeros((int(labels.max(initial=-1)) + 1, 8))
     grown = labels.copy()

@@ -1,15 +1,15 @@
-"""Project points into a camera, and rectify depth images from its lens to a pinhole.
+"""Projection of points into a camera, and rectification of depth images to a pinhole camera.
 
     camera  --camera_of-->  array        array, point  --project-->  column, line, depth
     points (6, N)  --move_all, project_all, select_inside, gather_pixels-->  pixels, by block
     range (H, W)  --ray_to_axis-->  z (H, W)  --undistort-->  z (H, W) of a pinhole
 
-Kernels support a pinhole and a sphere about a viewpoint. "Depth" is depth along the axis of a
-pinhole, and range on a sphere: noise and gates depend on it. An empty pixel has the point (0, 0, 0)
+Kernels support a pinhole and a sphere about a viewpoint. "Depth" means depth along the axis of a
+pinhole, and range on a sphere; noise and gates depend on it. An empty pixel has the point (0, 0, 0)
 and depth 0.
 
 `ray_to_axis` works on the distorted image, before `undistort`: the ray of a sample passes through
-its distorted pixel. In rectification (x, y) is a direction as x/z, y/z.
+its distorted pixel. In rectification (x, y) denotes the direction (x/z, y/z).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32
 
 TURN = 2.0 * math.pi
-#: Points per block of a kernel: their coordinates stay in the first level of the cache.
+#: Points per block of a kernel. The coordinates of a block fit the first level of the cache.
 BLOCK = 256
 
 
@@ -49,19 +49,22 @@ def _project_sphere(camera: Floats, x: float, y: float, z: float) -> tuple[float
         a, b, c = z, x, y
     elif camera[5] == 0:
         a, b, c = y, z, x
-    # atan2, because asin is inaccurate near the pole
+    # asin would be inaccurate near the pole
     elevation = np.arctan2(c, np.sqrt(a * a + b * b))
     turn = TURN / camera[2]
     column = (np.arctan2(b, a) - camera[3]) / camera[2] + 0.5
     column -= np.floor(column / turn) * turn
-    if column >= camera[6] > 0:  # rounding at the seam between the last column and the first
+    if column >= camera[6] > 0:  # rounding errors at the seam can exceed the last column
         column = 0.0
     return column, (camera[4] - elevation) / camera[2] + 0.5, depth
 
 
 @kernel
 def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return column and line, whose integer part is the pixel, and depth; -1 if too near."""
+    """Return column, line and depth of a point; -1 if it is too near.
+
+    The integer parts of column and line are the pixel.
+    """
     if camera[0] == 0:
         if not z > camera[1]:
             return -1.0, -1.0, z
@@ -71,7 +74,7 @@ def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float,
 
 @kernel
 def transpose_points(source: Floats32, step: int) -> Floats32:
-    """Return every `step`-th of points (N, 6), transposed to (6, n)."""
+    """Return every `step`-th row of points (N, 6), transposed to (6, n)."""
     chosen = np.empty((6, (len(source) + step - 1) // step), np.float32)
     for a in range(6):
         for i in range(chosen.shape[1]):
@@ -81,7 +84,7 @@ def transpose_points(source: Floats32, step: int) -> Floats32:
 
 @disjoint_kernel
 def move_all(points: Floats32, T: Floats, first: int, count: int, out: Floats) -> None:
-    """Write `count` transformed points of (6, N), from index `first` on, to `out` (3, n)."""
+    """Write `count` points of (6, N), transformed by T, from index `first`, to `out` (3, n)."""
     for a in range(3):
         x, y, z, own = points[0], points[1], points[2], out[a]
         xx, xy, xz, shift = T[a, 0], T[a, 1], T[a, 2], T[a, 3]
@@ -103,7 +106,7 @@ def select_inside(
     projected: Floats, count: int, left: float, right: float, top: float, bottom: float,
     places: Ints32,
 ) -> int:  # fmt: skip
-    """Write indices of points with a column in [left, right) and a line in [top, bottom) to
+    """Write the indices of the points with column in [left, right) and line in [top, bottom) to
     `places`; return their number.
     """
     column, line, found = projected[0], projected[1], 0
@@ -143,7 +146,7 @@ def depth_at(camera: Floats, points: Floats32, line: int, column: int) -> float:
 def growth_at(depth: float, reference: float, power: float) -> float:
     """Return the growth of lengths at a depth: (depth / reference)^power, at least 1.
 
-    `power` is 0, 1 or 2.
+    The power is 0, 1 or 2.
     """
     ratio = depth / reference
     if power == 2:
@@ -151,35 +154,35 @@ def growth_at(depth: float, reference: float, power: float) -> float:
     return max(1.0, ratio) if power == 1 else 1.0
 
 
-_BLOCK = 2**18  #: samples per block; bounds the memory for a 16-megapixel image
-_STEPS = 20  #: maximum number of Newton steps; real lenses need four
-_TOLERANCE = 1e-7  #: residual of the inverse in x/z, about 1e-4 pixels
+_BLOCK = 2**18  #: samples per block, a limit of the memory for a 16-megapixel image
+_STEPS = 20  #: maximum number of Newton steps; real lenses need 4
+_TOLERANCE = 1e-7  #: maximum residual of the inverse in x/z, about 1e-4 pixels
 
 
 def undistort(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
-    """Return the depth image of a pinhole without the lens's distortion.
+    """Return the depth image of a pinhole camera, without lens distortion.
 
     Each pixel takes the nearest sample: interpolation would invent points between an edge and its
-    background. Pixels are 0 beyond the field of view, and where the distortion polynomial folds
-    back on itself, since it describes no lens there.
+    background. Pixels outside the field of view are 0, and so are pixels at which the distortion
+    polynomial folds back on itself, since it describes no lens there.
 
     Parameters
     ----------
-    depth : (H, W) one value per sample, 0 if missing
+    depth : (H, W), 0 if missing
     intrinsics : intrinsics of the image, with its distortion
 
     Returns
     -------
-    depth : (H, W) the values for `intrinsics.without_distortion()`
+    depth : (H, W) depth image for `intrinsics.without_distortion()`
 
     Raises
     ------
-    ValueError : the sizes of image and intrinsics differ
+    ValueError : If the sizes of image and intrinsics differ
     """
     _check_size(depth, intrinsics)
     if not any(intrinsics.distortion):
         return np.array(depth, dtype=np.float32)
-    # index -1 means "outside" and selects the appended zero
+    # index -1 means no sample and selects the appended zero
     samples = np.append(depth.astype(np.float32, copy=False).ravel(), np.float32(0.0))
     return samples[_sources(intrinsics)].reshape(depth.shape)
 
@@ -194,11 +197,11 @@ def ray_to_axis(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
 
     Returns
     -------
-    depth : (H, W) metres along the axis, 0 if missing or if the lens has no ray there
+    depth : (H, W) metres along the axis, 0 if missing or if the pixel has no ray
 
     Raises
     ------
-    ValueError : the sizes of image and intrinsics differ
+    ValueError : If the sizes of image and intrinsics differ
     """
     _check_size(depth, intrinsics)
     return depth.astype(np.float32, copy=False) * _cosines(intrinsics)
@@ -206,7 +209,7 @@ def ray_to_axis(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
 
 @lru_cache(maxsize=2)
 def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
-    """Return the index of each pixel's sample, (H * W,); -1 if there is none."""
+    """Return the index of each pixel's sample, (H * W,); -1 for pixels without a sample."""
     c, k = intrinsics, _coefficients(intrinsics)
     sources = np.full(c.width * c.height, -1, dtype=np.int32)
     for block, x, y in _directions(c):
@@ -224,7 +227,7 @@ def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
 
 @lru_cache(maxsize=2)
 def _cosines(intrinsics: Intrinsics) -> Floats32:
-    """Return the cosine between each pixel's ray and the axis, (H, W); 0 without a ray."""
+    """Return the cosines (H, W) between the pixels' rays and the axis; 0 if there is no ray."""
     c, k = intrinsics, _coefficients(intrinsics)
     cosines = np.zeros(c.width * c.height, dtype=np.float32)
     for block, x, y in _directions(c):
@@ -245,7 +248,7 @@ def _check_size(depth: Floats32, intrinsics: Intrinsics) -> None:
 
 
 def _coefficients(intrinsics: Intrinsics) -> tuple[float, ...]:
-    """Return k1, k2, p1, p2, k3, with 0 for missing ones."""
+    """Return k1, k2, p1, p2, k3; missing coefficients are 0."""
     return (*intrinsics.distortion, *(0.0,) * (5 - len(intrinsics.distortion)))
 
 
@@ -259,7 +262,7 @@ def _directions(c: Intrinsics) -> Iterator[tuple[slice, Floats, Floats]]:
 
 
 def _distort(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats]:
-    """Distort the direction (x, y) by the Brown-Conrady model, coefficients in OpenCV's order."""
+    """Distort directions by the Brown-Conrady model; `k` has OpenCV's order."""
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -270,7 +273,7 @@ def _distort(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats
 
 
 def _jacobian(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats, Floats]:
-    """Return the derivatives xx, xy and yy of `_distort`; its Jacobian is symmetric."""
+    """Return the elements xx, xy and yy of the symmetric Jacobian of `_distort`."""
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -287,12 +290,12 @@ def _unfolded(x: Floats, y: Floats, k: tuple[float, ...]) -> NDArray[np.bool_]:
     unfolded = x * x + y * y < _first_fold(k) ** 2
     for fraction in np.linspace(0.125, 1.0, 8):  # tangential terms move the fold
         xx, xy, yy = _jacobian(fraction * x, fraction * y, k)
-        unfolded &= xx * yy - xy * xy > 0.0  # False for NaN as well
+        unfolded &= xx * yy - xy * xy > 0.0  # this is false for NaN too
     return unfolded
 
 
 def _first_fold(k: tuple[float, ...]) -> float:
-    """Return the least r = tan(angle to the axis) at which the radial polynomial stops growing."""
+    """Return the minimum tan(angle to the axis) at which the radial polynomial stops growing."""
     k1, k2, _, _, k3 = k
     r = np.tan(np.linspace(0.0, math.radians(89.9), 4096))
     r2 = r * r
@@ -303,7 +306,7 @@ def _first_fold(k: tuple[float, ...]) -> float:
 def _invert(
     x_seen: Floats, y_seen: Floats, k: tuple[float, ...]
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Undistort (x_seen, y_seen) by Newton's method; return directions and a mask of the valid."""
+    """Undistort (x_seen, y_seen) by Newton's method; return directions and a validity mask."""
     x, y = x_seen, y_seen
     for _ in range(_STEPS):
         x_off, y_off = (a - b for a, b in zip(_distort(x, y, k), (x_seen, y_seen), strict=True))

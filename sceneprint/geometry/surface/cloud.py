@@ -1,10 +1,10 @@
-"""Select a cloud's points by range, compute its axes, and average points by cell (Sec. III).
+"""Selection of a cloud's points by range, its principal axes, and averages by cell (Sec. III).
 
     points (N, 3)  --select_in_range-->  points within a model's range
     points (N, 3)  --principal_axes-->  axes (3, 3) that rotate with the cloud
     points (N, 3), axes  --average_cells-->  means (V, 4), side of a cell
 
-Sums over points are sums of integers, so they do not depend on the order of the points.
+Sums over points are sums of integers, which do not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -20,50 +20,50 @@ from sceneprint.errors import UselessFrame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 
-#: Steps of a coordinate in sums of squares and cubes: sums of 5 million points stay below 2^63.
+#: Integer steps of a coordinate in sums of powers, so that sums of 5 million points are below 2^63.
 _SQUARED = 2.0**20
 _CUBED = 2.0**13
 
 
 @dataclass(frozen=True)
 class CloudParameters:
-    """Parameters for clouds; the defaults are for indoor depth sensors.
+    """Parameters for clouds; the defaults suit indoor depth sensors.
 
-    Never change a default: models whose file lacks these parameters depend on it.
+    Do not change a default: models whose file lacks these parameters depend on it.
     """
 
-    minimum_range: float = 0.3  #: least range of a point, metres
-    maximum_range: float = 10.0  #: greatest range of a point, metres
-    minimum_points: int = 64  #: least number of points, voxels or pixels of a usable frame
+    minimum_range: float = 0.3  #: minimum range of a point, metres
+    maximum_range: float = 10.0  #: maximum range of a point, metres
+    minimum_points: int = 64  #: minimum number of points, voxels or pixels of a usable frame
     voxel_angle: float = 1.0 / 146.0  #: side of a voxel seen from the viewpoint, rad
     voxel_size: float = 0.02  #: side of a voxel without a viewpoint, metres
     seed_px: float = 5.2  #: distance between patches, voxels
     validation_seed_px: float = 8.2  #: distance between patches for validation, voxels
-    maximum_patches: int = 1200  #: patches grow until there are no more
-    maximum_validation_patches: int = 600  #: and those for validation
-    maximum_pixels: int = 160 * 120 * 4  #: voxels and pixels grow until there are no more
-    same_surface: float = 0.03  #: points of a pixel within this share of range are averaged
+    maximum_patches: int = 1200  #: patches grow until at most this many exist
+    maximum_validation_patches: int = 600  #: the same for validation
+    maximum_pixels: int = 160 * 120 * 4  #: voxels and pixels grow until at most this many exist
+    same_surface: float = 0.03  #: points of a pixel within this share of the range are averaged
     radius_px: int = 3  #: radius of the neighbourhood of a normal, voxels
-    range_gate: float = 0.05  #: first pass: greatest difference of neighbours, share of 1/range
-    plane_gate: float = 0.006  #: second pass: greatest distance to the plane, share of 1/range
-    noise_gate: float = 0.006  #: second pass: constant term of that distance, 1/metres
-    minimum_samples: int = 9  #: least number of neighbours of a plane
-    minimum_spread: float = 0.3  #: determinant of their 2 x 2 covariance, pixel^4
-    minimum_cosine: float = 0.12  #: of the angle of incidence; more grazing is rejected
+    range_gate: float = 0.05  #: maximum difference of neighbours in pass 1, share of 1/range
+    plane_gate: float = 0.006  #: maximum distance from the plane in pass 2, share of 1/range
+    noise_gate: float = 0.006  #: constant term of the maximum distance in pass 2, 1/metres
+    minimum_samples: int = 9  #: minimum number of neighbours of a plane
+    minimum_spread: float = 0.3  #: minimum determinant of their 2 x 2 covariance, pixel^4
+    minimum_cosine: float = 0.12  #: minimum cosine of the angle of incidence
     image_angle: float = 1.0 / 146.0  #: side of a pixel of the range image, rad
     image_radius_px: int = 3  #: radius of the window of a normal of the range image, pixels
-    gap_px: int = 6  #: longest gap of a range image that is closed, pixels
-    gap_cosine: float = 0.95  #: least cosine between the normals of its two sides
+    gap_px: int = 6  #: maximum length of a gap in a range image that is closed, pixels
+    gap_cosine: float = 0.95  #: minimum cosine between the normals of its two sides
 
 
 def select_in_range(cloud: Cloud, p: CloudParameters) -> Floats32:
     """Return the points within the model's range, (M, 3) float32, C-contiguous.
 
-    Without a viewpoint all points are returned.
+    The result contains all points if the cloud has no viewpoint.
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_points` points remain
+    UselessFrame : If fewer than `minimum_points` points remain
     """
     points = np.ascontiguousarray(cloud.points, np.float32)
     if cloud.has_viewpoint:
@@ -94,12 +94,13 @@ def _why_useless(cloud: Cloud, within: int, p: CloudParameters) -> str:
     ranges = np.linalg.norm(cloud.points.astype(float), axis=1)
     span = f"the model's range of {p.minimum_range:g} to {p.maximum_range:g} m"
     middle = float(np.median(ranges))
-    advice = "use a model made for this range (such as lidar), or give another viewpoint"
+    advice = "use a model for this range (such as lidar), or specify another viewpoint"
     if middle > 100 * p.minimum_range:
-        advice = f"if the coordinates are millimetres, say 1000 units per metre; or {advice}"
+        advice = f"if the coordinates are millimetres, set 1000 units per metre; or {advice}"
     return (
-        f"{name}{within} of its {count} points lie within {span}, {p.minimum_points} are needed; "
-        f"their median is {middle:.3g} m from the viewpoint. Check units and viewpoint: {advice}."
+        f"{name}{within} of its {count} points lie within {span}, but {p.minimum_points} are "
+        f"required; the median distance from the viewpoint is {middle:.3g} m. Check units and "
+        f"viewpoint: {advice}."
     )
 
 
@@ -129,10 +130,11 @@ def _skews(points: Floats32, scale: float, axes: Floats, third: np.ndarray) -> N
 
 
 def principal_axes(points: Floats32) -> Floats:
-    """Return the principal axes of a cloud, rows of a rotation (3, 3), by falling second moment.
+    """Return the principal axes of a cloud as the rows of a rotation (3, 3).
 
-    The first two point to positive third moments; the third completes a right-handed frame. Axes
-    with equal moments, as of a sphere, are arbitrary. `points @ axes.T` are coordinates along them.
+    They are sorted by descending second moment. The first two point to positive third moments; the
+    third completes a right-handed frame. Axes with equal moments, as of a sphere, are arbitrary.
+    `points @ axes.T` are coordinates along the axes.
 
     Parameters
     ----------
@@ -154,11 +156,11 @@ def principal_axes(points: Floats32) -> Floats:
     return axes
 
 
-#: Steps of a number from 0 to 1 in sums: sums of 5 million points stay below 2^63.
+#: Integer steps of a number from 0 to 1 in sums, so that sums of 5 million points are below 2^63.
 _STEPS = 2.0**38
-#: Cells per half axis without a viewpoint: three coordinates fit one key.
+#: Maximum number of cells per half axis without a viewpoint: three coordinates must fit one key.
 _REACH = 1 << 20
-#: Cells that are counted before they are enlarged, as a multiple of their maximum number.
+#: Number of cells at which they are enlarged, as a multiple of their maximum number.
 _ROOM = 4
 
 Ints64 = NDArray[np.int64]
@@ -166,7 +168,7 @@ Ints64 = NDArray[np.int64]
 
 @kernel
 def direction_cell(x: float, y: float, z: float, angle: float) -> int:
-    """Return the cell of a direction on a cube whose sides are divided into equal angles."""
+    """Return the cell of a direction on a cube, whose sides are divided into equal angles."""
     n = int(np.ceil(np.pi / 2 / angle))
     ax, ay, az = abs(x), abs(y), abs(z)
     if az >= ax and az >= ay:
@@ -196,7 +198,7 @@ def metric_cell(x: float, y: float, z: float, size: float) -> int:
 def hash_key(key: int, secret: int) -> int:
     """Return the slot of a key in a hash table whose size is a power of two.
 
-    The secret prevents crafted clouds whose cells share a slot. Results must not depend on it.
+    The secret prevents attacks by clouds whose cells share a slot. Results must not depend on it.
     """
     h = (key ^ secret) * 0x9E3779B97F4A7C1
     h ^= h >> 31
@@ -209,9 +211,9 @@ def _gather(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, side: float, step: float,
     unit: float, secret: int, keys: Ints64, bins: Ints64, sums: Ints64,
 ) -> int:  # fmt: skip
-    """Sum the points of each occupied cell; return the number of cells, or -1 for too many.
+    """Sum the points of each occupied cell; return the number of cells, or -1 if it is too large.
 
-    Sums are count, unit / r and direction if `seen`, else count, 0 and coordinates in units.
+    The sums are count, unit / r and direction if `seen`, else count, 0 and coordinates in units.
     """
     size = 16
     while size < 2 * len(keys):
@@ -279,7 +281,16 @@ def centroid(points: Floats32) -> Floats:
 def average_cells(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, unit: float, p: CloudParameters
 ) -> tuple[Floats, float]:
-    """Return the means of the occupied cells (V, 4), and the side of a cell."""
+    """Return the means (V, 4) of the occupied cells, and the side of a cell.
+
+    Parameters
+    ----------
+    points : (N, 3) float32
+    axes : (3, 3) axes of the grid, rows
+    centre : (3,) origin of the grid
+    seen : whether `centre` is a viewpoint, about which cells are directions with a range
+    unit : side of a cell, radians if `seen`, else metres
+    """
     side = p.voxel_angle if seen else p.voxel_size
     room = min(_ROOM * p.maximum_pixels, len(points))
     keys, bins = np.empty(room, np.int64), np.empty(room, np.int64)

@@ -1,6 +1,6 @@
-"""Measure the surface and volume that several views of a place observe (the paper's last figure).
+"""Surface and volume that several views of a place observe (the paper's last figure).
 
-A view is a frame whose pose is T_query_view. All lengths are metres in the query's frame.
+A view is a frame with the pose T_query_view. All lengths are metres in the query's frame.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32
 
-#: Tolerance within which a view's depth agrees with a point's: metres plus a share of the depth.
+#: Tolerance within which a view's depth agrees with a point: metres plus a share of the depth.
 AGREES_M, AGREES_SHARE = 0.05, 0.03
-#: Least edge of the cells of a volume, metres, and the maximum number of cells.
+#: Minimum edge of the cells of a volume, metres, and maximum number of cells.
 CELL_M, MOST_CELLS = 0.05, 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A surface of triangles.
+    """A triangulated surface.
 
     Parameters
     ----------
@@ -36,23 +36,28 @@ class TriangleMesh:
     triangles: Ints32
 
     def areas(self) -> Floats:
-        """Return the areas of the triangles, (M,) square metres."""
+        """Return the areas of the triangles, (M,), square metres."""
         a, b, c = (self.points[self.triangles[:, i]] for i in range(3))
         areas: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
         return areas
 
 
 def camera_of(view: DepthFrame) -> Floats:
-    """Return a view for kernels, (16,): rotation, translation of T_view_query, fx, fy, cx, cy."""
+    """Return the camera of a view for kernels, (16,): T_view_query (R, t), fx, fy, cx, cy.
+
+    Raises
+    ------
+    ValueError : If the view has no pose
+    """
     if view.pose is None:
-        raise ValueError(f"view {view.name!r} has no pose")
+        raise ValueError(f"The view {view.name!r} has no pose. Pass views with T_query_view.")
     T, k = inverse(view.pose), view.intrinsics
     return np.concatenate([T[:3, :3].ravel(), T[:3, 3], (k.fx, k.fy, k.cx, k.cy)])
 
 
 @kernel
 def _depth_error(point: Floats, camera: Floats, depth: Floats32) -> tuple[float, float]:
-    """Return a point's distance behind the view's surface, and its depth; inf if unobserved."""
+    """Return a point's distance behind the view's surface, inf if unobserved, and its depth."""
     x = camera[0] * point[0] + camera[1] * point[1] + camera[2] * point[2] + camera[9]
     y = camera[3] * point[0] + camera[4] * point[1] + camera[5] * point[2] + camera[10]
     z = camera[6] * point[0] + camera[7] * point[1] + camera[8] * point[2] + camera[11]
@@ -92,13 +97,13 @@ def first_seen(
     Parameters
     ----------
     points : (N, 3)
-    views : views in order
+    views : views in their order
     metres, share : tolerance of the depth; see AGREES_M
 
     Returns
     -------
     first : (N,) index of the view, -1 if no view sees the point
-    nearest : (N,) index of the view whose surface is nearest along its ray; 0 if there is none
+    nearest : (N,) index of the view whose surface is nearest along its ray; 0 by default
     """
     first, nearest = np.full(len(points), -1, np.int32), np.zeros(len(points), np.int32)
     error = np.full(len(points), np.inf)
@@ -109,7 +114,7 @@ def first_seen(
 
 
 def share_seen(points: Floats, views: Sequence[DepthFrame]) -> float:
-    """Return the share of points that at least one view sees; 0 without points."""
+    """Return the share of points that at least one view sees; 0 if there are no points."""
     first, _ = first_seen(points, views)
     return float((first >= 0).mean()) if len(points) else 0.0
 
@@ -119,16 +124,16 @@ def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: floa
 
     Parameters
     ----------
-    views : views in order
-    tolerance : greatest distance of the fused surface from a view's depth, metres
+    views : views in their order
+    tolerance : maximum distance of the fused surface from a view's depth, metres
     """
     first, nearest = first_seen(mesh.points, views, tolerance, 0.0)
-    # between two pixels, or at an edge, a point of the mesh may agree with no pixel
+    # a point between two pixels or at an edge may agree with no pixel
     return np.where(first >= 0, first, nearest).astype(np.int32)
 
 
 def added_areas(mesh: TriangleMesh, first: Ints32, views: int) -> Floats:
-    """Return the area that each view adds to that of the views before, (V,) square metres.
+    """Return the area that each view adds to the area of the preceding views, (V,), square metres.
 
     A triangle counts for the first view that sees one of its corners; the sum is the mesh's area.
 
@@ -164,13 +169,13 @@ def _mark(
 
 
 def observed_volume(views: Sequence[DepthFrame]) -> tuple[float, float]:
-    """Return the volume between the cameras and the observed surfaces, in cubic metres.
+    """Return the volume between the cameras and the observed surfaces, and the edge of its cells.
 
-    Also returns the edge of the cells in which it was counted, metres; distant views enlarge it.
+    The volume is in cubic metres and the edge in metres. Distant views enlarge the edge.
 
     Parameters
     ----------
-    views : views with depth 0 where unknown
+    views : views; unknown depth is 0
     """
     corners = [
         transform_points(view.pose, _outline(view)) for view in views if view.pose is not None
@@ -187,7 +192,7 @@ def observed_volume(views: Sequence[DepthFrame]) -> tuple[float, float]:
 
 
 def _outline(view: DepthFrame) -> Floats:
-    """Return the camera and the corners of its view cone at the greatest depth, (5, 3)."""
+    """Return the camera centre and the corners of the view cone at the maximum depth, (5, 3)."""
     k, far = view.intrinsics, float(view.depth.max(initial=0.0))
     if not far > 0:
         return np.zeros((0, 3))

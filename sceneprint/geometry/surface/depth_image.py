@@ -1,10 +1,10 @@
-"""Reduce a depth image to inverse depth, points and unit normals (Sec. III).
+"""Reduction of a depth image to inverse depth, points and unit normals (Sec. III).
 
     depth (H, W)  --inverse_depth-->  1/z (h, w), with the intrinsics of the reduced map
     1/z (h, w)  --fit_surface-->  points, normals (h, w, 3)
 
 The inverse depth of a plane is linear in the image, 1/z = q + a dx + b dy, and the noise of a
-structured-light sensor is uniform there. A least-squares fit of (q, a, b) over a window gives the
+structured-light sensor is uniform in it. A least-squares fit of (q, a, b) over a window gives the
 normal and the denoised point. The first pass selects samples by depth, the second by distance to
 the plane.
 """
@@ -25,13 +25,13 @@ from sceneprint.types import DepthFrame, Floats32, Intrinsics, Surface
 class DepthParameters:
     """Parameters of the reduction."""
 
-    minimum_depth: float = 0.3  #: nearer samples are missing, metres
-    maximum_depth: float = 9.0  #: the sensor's range; farther samples are missing, metres
-    same_surface: float = 0.03  #: samples within this share of the nearest are averaged
-    focal_length_px: float = 146.0  #: the image is halved until f is nearest to this
-    maximum_pixels: int = 160 * 120 * 4  #: and until the map has at most so many pixels
-    minimum_valid: int = 64  #: least number of valid pixels of a usable frame
-    minimum_side: int = 8  #: least number of rows and columns of a usable image
+    minimum_depth: float = 0.3  #: nearer samples count as missing, metres
+    maximum_depth: float = 9.0  #: farther samples count as missing, metres
+    same_surface: float = 0.03  #: samples within this share of the nearest depth are averaged
+    focal_length_px: float = 146.0  #: the image is halved until f is nearest to this value
+    maximum_pixels: int = 160 * 120 * 4  #: and until it has at most this many pixels
+    minimum_valid: int = 64  #: minimum number of valid pixels of a usable frame
+    minimum_side: int = 8  #: minimum number of rows and columns of a usable image
 
 
 @kernel
@@ -41,7 +41,7 @@ def _in_range(depth: Floats32, minimum: float, maximum: float) -> Floats32:
     for y in range(height):
         for x in range(width):
             z = depth[y, x]
-            if z >= minimum and z <= maximum:  # NaN compares false
+            if z >= minimum and z <= maximum:  # this is false for NaN
                 q[y, x] = np.float32(1.0) / z
     return q
 
@@ -62,13 +62,16 @@ def _halve(q: Floats32, same_surface: float) -> Floats32:
             wb = one if b >= least else zero
             wc = one if c >= least else zero
             wd = one if d >= least else zero
-            # if all four are missing, least = 0 and the mean is 0: missing
+            # if all four samples are missing, the mean is 0, which means missing
             half[y, x] = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
     return half
 
 
 def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
-    """Return the camera of an image reduced 2 x 2 (pixel centres at integers, odd edges cut)."""
+    """Return the camera of an image at half its size, whose pixel centres are at integers.
+
+    An odd last row or column is cut off.
+    """
     return replace(
         intrinsics,
         width=intrinsics.width // 2,
@@ -81,7 +84,7 @@ def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
-    """Return the number of halvings after which pixels of all sensors cover similar angles."""
+    """Return the number of halvings after which a pixel covers the model's angle."""
     times, camera = 0, intrinsics
     while min(camera.width, camera.height) >= 4 and (
         camera.fx > p.focal_length_px * 2**0.5 or camera.width * camera.height > p.maximum_pixels
@@ -93,8 +96,8 @@ def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
 def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intrinsics]:
     """Mask, reduce and invert a depth image.
 
-    Each halving averages those of 2 x 2 samples that lie on the nearest surface, so it invents no
-    point between an edge and its background.
+    Each halving averages only the samples of a 2 x 2 block that lie on the nearest surface, so it
+    invents no point between an edge and its background.
 
     Parameters
     ----------
@@ -107,13 +110,16 @@ def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intr
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_valid` pixels lie within the range, or the image has
+    UselessFrame : If fewer than `minimum_valid` pixels lie within the range, or the image has
         fewer than `minimum_side` rows or columns
-    ValueError : the sizes of depth and intrinsics differ
+    ValueError : If the sizes of depth and intrinsics differ
     """
     camera = frame.intrinsics
     if frame.depth.shape != (camera.height, camera.width):
-        raise ValueError(f"depth {frame.depth.shape} is not {camera.height, camera.width}")
+        raise ValueError(
+            f"depth has shape {frame.depth.shape}, but the intrinsics are for "
+            f"({camera.height}, {camera.width}). Pass the intrinsics of this image."
+        )
     if min(frame.depth.shape) < p.minimum_side:
         raise UselessFrame(
             f"{frame.name or 'The frame'}: {camera.width} x {camera.height} samples show no "
@@ -139,15 +145,15 @@ def _why_useless(frame: DepthFrame, p: DepthParameters) -> str:
     if within.mean() > 0.5:
         return (
             f"{name}only {counted} {span}, too few for a surface at this focal length. "
-            "Check fx and fy, or send a frame that sees more of the scene."
+            "Check fx and fy, or send a frame that shows more of the scene."
         )
     return (
         f"{name}{counted} {span}; their median is {np.median(samples):.3g} m. "
-        "Check the depth scale (stored units per metre), or use a model made for this range."
+        "Check the depth scale (stored units per metre), or use a model for this range."
     )
 
 
-#: Samples within this share of the nearest lie on one surface, for `double_resolution`.
+#: Maximum difference of samples on one surface in `double_resolution`, share of the nearest depth.
 SAME_SURFACE = 0.05
 
 
@@ -180,7 +186,7 @@ def _double(depth: Floats32, same_surface: float) -> Floats32:
 def double_resolution(frame: DepthFrame) -> DepthFrame:
     """Return the frame at twice the width and height, interpolated within surfaces.
 
-    Consumers that read the nearest pixel then see slopes instead of steps.
+    Code that reads the nearest pixel then gets slopes instead of steps.
     """
     k = frame.intrinsics
     camera = replace(
@@ -196,18 +202,20 @@ class NormalParameters:
     """Parameters of the plane fit."""
 
     radius_px: int = 3  #: half the window's side, pixels of the reduced map
-    depth_gate: float = 0.05  #: first pass: greatest difference, share of the centre's 1/z
-    plane_gate: float = 0.006  #: second pass: samples within gate (1 + 1/z) of the plane, 1/m
-    minimum_samples: int = 9  #: least number of samples of a plane
-    minimum_spread: float = 0.3  #: determinant of the samples' 2 x 2 covariance, pixel^4
-    minimum_cosine: float = 0.12  #: least cosine of the angle of incidence
+    depth_gate: float = 0.05  #: maximum difference in the first pass, share of the centre's 1/z
+    plane_gate: float = 0.006  #: second pass: samples within gate * (1 + 1/z) of the plane, 1/m
+    minimum_samples: int = 9  #: minimum number of samples of a plane
+    minimum_spread: float = 0.3  #: minimum determinant of the samples' covariance (2, 2), pixel^4
+    minimum_cosine: float = 0.12  #: minimum cosine of the angle of incidence
 
 
 @kernel
 def _weigh(
     row: Floats32, centre: Floats32, expected: Floats32, gate: Floats32, w: Floats32, wr: Floats32
 ) -> None:
-    """Write the weights (0 or 1) of a row of samples, and their differences to the centre."""
+    """Write the weights (0 or 1) of a row of samples and their weighted differences from the
+    centre.
+    """
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(len(w)):
         near = abs(row[x] - centre[x] - expected[x]) < gate[x]
@@ -229,15 +237,15 @@ def _fit(
 ) -> None:  # fmt: skip
     """Fit 1/z - centre = c + a dx + b dy around every pixel: out[:, y, x] = c, a, b, n, det.
 
-    A sample counts if |1/z - centre - plane| < constant + relative * centre. Rows are accumulated
-    offset by offset, and every inner loop writes one array, so the compiler can vectorize it.
+    A sample counts if |1/z - centre - plane| < constant + relative * centre. Rows are summed for
+    one offset after the other, so that every inner loop writes one array and can be vectorized.
     """
     height, width = q.shape
     one = np.float32(1.0)
     padded = np.zeros((height + 2 * radius, width + 2 * radius), np.float32)
     padded[radius : radius + height, radius : radius + width] = q
-    line = np.zeros((5, width), np.float32)  # of one dy: n, x, xx, r, xr
-    sums = np.zeros((9, width), np.float32)  # n, x, y, xx, xy, yy, r, xr, yr
+    line = np.zeros((5, width), np.float32)  # sums of n, x, xx, r, xr for one dy
+    sums = np.zeros((9, width), np.float32)  # sums of n, x, y, xx, xy, yy, r, xr, yr
     w, wr = np.zeros(width, np.float32), np.zeros(width, np.float32)
     expected, gate = np.zeros(width, np.float32), np.zeros(width, np.float32)
     for y in range(height):
@@ -316,7 +324,7 @@ def _lift(
             normals[y, x, 0] = -alpha / length
             normals[y, x, 1] = -beta / length
             normals[y, x, 2] = -gamma / length
-            # solid angle 1 / (fx fy ray^3), times squared range (z ray)^2, over the cosine
+            # the solid angle 1 / (fx fy ray^3) times the squared range (z ray)^2 over the cosine
             areas[y, x] = z * z / (fx * fy * ray * cosine)
             valid[y, x] = True
 
@@ -324,7 +332,7 @@ def _lift(
 def fit_surface(q: Floats32, intrinsics: Intrinsics, p: NormalParameters) -> Surface:
     """Return points and unit normals of least-squares planes in inverse depth around each pixel.
 
-    Pixels whose window determines no plane, or with grazing incidence, are not valid.
+    A pixel is invalid if its window determines no plane or the incidence is grazing.
 
     Parameters
     ----------

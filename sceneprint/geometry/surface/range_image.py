@@ -1,4 +1,4 @@
-"""Render a cloud from its viewpoint as a range image, and fit a plane in each pixel.
+"""Range images of clouds from their viewpoints, with a plane fitted in each pixel.
 
     points (N, 3)  --range_image-->  Surface (h, w) with camera Sphere
 
@@ -21,9 +21,9 @@ from sceneprint.geometry.surface.cloud import CloudParameters, select_in_range
 from sceneprint.geometry.surface.voxels import solve
 from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface
 
-#: Cosine of the angle to an axis within which a point is near its poles.
+#: Minimum cosine of the angle between an axis and a point near its poles.
 _NEAR_POLE = math.cos(math.radians(30.0))
-#: Greatest width of an empty wedge that does not end the image, pixels.
+#: Maximum width of an empty wedge that does not end the image, pixels.
 _WEDGE_PX = 8
 
 
@@ -41,7 +41,7 @@ def directions(camera: Sphere) -> Floats:
 
 @kernel
 def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> None:
-    """Count the points near each axis, by the cosine of their angle to it."""
+    """Add the number of points near each axis to `near`."""
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         limit = least * np.sqrt(x * x + y * y + z * z)
@@ -51,7 +51,7 @@ def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> 
 
 
 def pole_of(points: Floats32) -> int:
-    """Return the axis with the fewest points near it; of equals z, then y, then x."""
+    """Return the axis with the fewest points near it; ties prefer z, then y."""
     near = np.zeros(3, np.int64)
     _near_axes(points, np.float32(_NEAR_POLE), near)
     return min((2, 1, 0), key=lambda axis: int(near[axis]))
@@ -71,7 +71,7 @@ def to_angles(points: Floats32, pole: int, out: Floats) -> None:
 
 
 def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
-    """Return the camera that shows all points, with steps that keep it within `maximum_pixels`."""
+    """Return the camera that shows all points in at most `maximum_pixels` pixels."""
     low, high = float(angles[:, 1].min()), float(angles[:, 1].max())
     step = p.image_angle
     while True:
@@ -94,22 +94,22 @@ def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
         step *= max(math.sqrt(width * height / p.maximum_pixels), 1.01)
 
 
-#: Ratio of the resolutions of `spread_points` and of the range image.
+#: Ratio of the resolution of `spread_points` to that of the range image.
 FINER = 2
 #: Maximum number of stored points of a scan; docs/clouds.md gives the measurements.
 SPREAD_POINTS = 8192
 
-#: Steps of a number from 0 to 1 in sums: sums of 5 million points stay below 2^63.
+#: Integer steps of a number from 0 to 1 in sums, so that sums of 5 million points are below 2^63.
 _STEPS = 2.0**38
-#: Greatest ratio of a window's width to its height.
+#: Maximum ratio of a window's width to its height.
 _WIDEST = 8.0
 
 
 def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
-    """Return the nearest surfaces around the viewpoint of a cloud as a map of points and normals.
+    """Return the nearest surfaces around a cloud's viewpoint as an image of points and normals.
 
-    Small gaps, as between the rings of a spinning sensor, are closed if both sides lie on one
-    plane. The camera is a Sphere cropped to the points; `pole_of` selects its pole.
+    Small gaps, such as those between the rings of a spinning sensor, are closed if both sides lie
+    on one plane. The camera is a Sphere cropped to the points; `pole_of` selects its pole.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_points` points are within range, or fewer pixels show one
+    UselessFrame : If fewer than `minimum_points` points are within range, or fewer pixels show one
     """
     pole, angles = _angles_of(cloud, p.minimum_range, p.maximum_range, p.minimum_points)
     camera = fit_camera(angles, pole, p)
@@ -126,7 +126,7 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
         raise UselessFrame(
             f"{cloud.name or 'The cloud'}: {np.count_nonzero(q)} pixels of "
             f"{math.degrees(camera.step):.2g} degrees show all its points, too few for a "
-            "surface. Send a cloud that sees more of the scene, or check its viewpoint."
+            "surface. Send a cloud that shows more of the scene, or check its viewpoint."
         )
     gates = np.array([p.range_gate, p.noise_gate, p.plane_gate])
     limits = np.array([p.minimum_samples, p.minimum_spread * camera.step**4])
@@ -143,7 +143,7 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
 
 @cached_per_frame
 def _angles_of(cloud: Cloud, nearest: float, farthest: float, least: int) -> tuple[int, Floats]:
-    """Return the pole of a cloud, and the angles and range of each point, for both its images."""
+    """Return the pole of a cloud and the azimuth, elevation and range of each point, (N, 3)."""
     limits = CloudParameters(
         minimum_range=nearest, maximum_range=farthest, minimum_points=least
     )  # fmt: skip
@@ -157,17 +157,17 @@ def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
     """Return unordered points of a scan, finer than its range image, for fine refinement.
 
     A pixel of the range image covers .9 degrees: half a metre of wall at 30 m, and several metres
-    of ground. If finer pixels determine no plane, as between distant rings, the image's own points
-    serve.
+    of ground. If finer pixels determine no plane, as between distant rings, the points of the range
+    image are used.
 
     Parameters
     ----------
-    cloud, p : arguments of the image
+    cloud, p : arguments of `range_image`
     image : result of `range_image`
 
     Returns
     -------
-    surface : (1, N) without a camera, finer pixels first
+    surface : (1, N) without a camera; points of the finer pixels come first
     """
     finer = replace(
         p,
@@ -193,7 +193,7 @@ def _nearest(angles: Floats, frame: Floats, pixel: NDArray[np.int64], nearest: F
         if turn < 0:
             turn += around
         x = int(turn)
-        if x >= width:  # rounding: just after the last column, or just before the first
+        if x >= width:  # rounding errors at the seam can exceed either side
             x = 0 if turn > (width + around) / 2 else width - 1
         y = min(max(int((top - angles[i, 1]) / step + 0.5), 0), height - 1)
         pixel[i] = y * width + x
@@ -205,7 +205,7 @@ def _sum(
     angles: Floats, pixel: NDArray[np.int64], nearest: Floats, frame: Floats, share: float,
     pole: int, sums: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Sum the points on the nearest surface of each pixel: count, inverse ranges and directions."""
+    """Sum count, inverse range and direction of the points on each pixel's nearest surface."""
     first, second = (pole + 1) % 3, (pole + 2) % 3
     least, steps = frame[3], frame[4]
     for i in range(len(angles)):
@@ -223,7 +223,7 @@ def _sum(
 
 @kernel
 def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None:
-    """Write the means of the sums of `_sum`: inverse range (n,) and direction (n, 3)."""
+    """Write the mean inverse range (n,) and direction (n, 3) from the sums of `_sum`."""
     for k in range(len(sums)):
         count = float(max(sums[k, 0], 1))
         q[k] = float(sums[k, 1]) / count / _STEPS / least
@@ -232,10 +232,10 @@ def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None
 
 
 def _average_pixels(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Floats, Floats]:
-    """Return the inverse range (h, w) of the nearest surface in each pixel, 0 if empty, and the
-    mean direction (h, w, 3) of its points.
+    """Return the mean inverse range (h, w) and direction (h, w, 3) of each pixel's nearest surface.
 
-    On a plane 1/r = a . u the means satisfy the same equation.
+    The inverse range of an empty pixel is 0. On a plane 1/r = a . u, the means satisfy the same
+    equation.
     """
     shape = (camera.height, camera.width)
     least = max(p.minimum_range, 1e-9)
@@ -260,10 +260,10 @@ def _fit(
     limits: Floats,
     planes: Floats,
 ) -> None:
-    """Write a of 1/r = a . u around every pixel with a point; 0 if its window determines no plane.
+    """Write a of 1/r = a . u for every pixel with a point; 0 if its window determines no plane.
 
-    The first pass selects by range, the second by distance to the plane. flat: cosine of each row's
-    elevation; narrow pixels towards the poles get wider windows.
+    The first pass selects by range, the second by distance to the plane. `flat` is the cosine of
+    each row's elevation: pixels are narrower towards the poles, so their windows are wider.
     """
     height, width = q.shape
     b, a = np.zeros(3), np.zeros(3)
@@ -315,9 +315,10 @@ def _close(
     planes: Floats, out: Floats, rays: Floats, q: Floats, longest: int, gates: Floats,
     cosine: float,
 ) -> None:  # fmt: skip
-    """Fill gaps of each column between planes that agree across the gap.
+    """Fill gaps in each column between planes that agree across the gap.
 
-    A gap with another surface in it, as a wire before a wall, stays: nothing was seen behind it.
+    A gap that contains another surface, such as a wire before a wall, is not filled, because
+    nothing was observed behind it.
     """
     height, width = planes.shape[0], planes.shape[1]
     for x in range(width):
@@ -352,7 +353,7 @@ def _lift(
     planes: Floats, rays: Floats, flat: Floats, numbers: Floats,
     points: Floats32, normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Intersect rays and planes. numbers: least cosine, least and greatest range, squared step."""
+    """Intersect rays and planes; `numbers` are minimum cosine, range limits and squared step."""
     for y in range(len(planes)):
         for x in range(planes.shape[1]):
             a, ray = planes[y, x], rays[y, x]
@@ -360,7 +361,7 @@ def _lift(
             length = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
             if not length > 0 or not inverse / length >= numbers[0]:
                 continue
-            # between half the sensor's least range and twice its greatest
+            # accept ranges from half the sensor's minimum to twice its maximum
             if not (inverse * numbers[2] * 2 > 1 and inverse * numbers[1] < 2):
                 continue
             for d in range(3):

@@ -1,7 +1,7 @@
-"""Estimate the up direction and the units of an imported surface.
+"""Estimation of the up direction and the units of an imported surface.
 
-A floor is the largest level plane of a place, and a place is lower than wide. Furniture shows which
-end is the lower: the place is fuller there.
+The floor is the largest level plane of a place, and a place is wider than high. Furniture shows
+which end is the lower one, because more surface is near it.
 """
 
 from __future__ import annotations
@@ -16,34 +16,36 @@ from sceneprint.types import Floats, Floats32, Ints32
 
 Integers = NDArray[np.integer]
 
-#: Maximum number of points and triangles, evenly sampled from the surface.
+#: Maximum number of points and of triangles that are evenly sampled from the surface.
 _MOST_POINTS, _MOST_TRIANGLES = 1_000_000, 1_000_000
-#: Edges of the cells of plane fits, shares of the extent; the finest with this mean number of
-#: points per cell is used.
+#: Edges of the cells in which planes are fitted, as shares of the extent, and the minimum mean
+#: number of points per cell: the finest edge that reaches it is used.
 _EDGES, _CELL_POINTS = (1 / 256, 1 / 128, 1 / 64, 1 / 32, 1 / 16), 12.0
-#: Conditions of a plane: least number of points, least ratio of its second to its first variance,
-#: and greatest ratio of the third to the second.
+#: Conditions of a plane: minimum number of points, minimum ratio of its second variance to its
+#: first, and maximum ratio of the third variance to the second.
 _FEWEST, _NO_LINE, _FLAT = 6, 0.05, 0.1
-#: Directions of the hemisphere and pieces that vote on them; cosines to a direction of the pieces
-#: that vote for it, and of the pieces that cannot vote for another.
+#: Number of directions on the hemisphere, and of pieces that vote for them.
 _DIRECTIONS, _VOTERS = 1500, 6000
+#: Minimum cosines to a direction at which a piece votes for it, and at which it votes for no other.
 _NEAR, _EXCLUSIVE = math.cos(math.radians(12.0)), math.cos(math.radians(25.0))
-#: Maximum number of dominant directions, and the least share of the votes of each.
+#: Maximum number of dominant directions, and minimum share of the votes for each.
 _MOST_PEAKS, _LEAST_SHARE = 5, 0.03
-#: Cosines within which an estimate snaps to the usual axis, or to another axis of the file: ground
-#: may slope.
+#: Minimum cosines at which an estimate snaps to the usual axis, or to another axis of the file.
+#: The tolerance allows for sloping ground.
 _SNAP_USUAL, _SNAP = math.cos(math.radians(7.0)), math.cos(math.radians(3.0))
-#: Thickness of a floor, share of the extent.
+#: Thickness of a floor, as a share of the extent.
 _LAYER = 0.02
-#: Quantiles of the extent: a few stray points are no walls.
+#: Quantiles that bound the extent, so that stray points do not widen it.
 _LOW, _HIGH = 0.01, 0.99
-#: Weights of the usual axis over any other, and of its usual end over the other end.
+#: Weights of the usual axis relative to other axes, and of its usual end relative to its other end.
 _USUAL, _USUAL_SIGN = 1.8, 0.6
-#: Weights of an uneven mass along a direction: for the direction, and for its fuller end.
+#: Weights of an uneven distribution of mass along a direction: for the direction and for its end
+#: with more mass.
 _LEAN_GAIN, _LEAN_WEIGHT = 8.0, 3.0
-#: Cosines to up: least of level surfaces, greatest of walls; the ends of a place, shares of height.
+#: Minimum cosine to up of level surfaces, maximum cosine of walls, and share of the height that
+#: counts as an end of a place.
 _LEVEL, _UPRIGHT, _END = 0.97, 0.3, 0.08
-#: Least evidence for an end, and least ratio of scores, of a clear answer.
+#: Minimum evidence for an end, and minimum ratio of scores, for a clear answer.
 _CLEAR_SIGN, _CLEAR = 0.4, 1.3
 
 
@@ -53,9 +55,9 @@ class Pieces:
 
     Parameters
     ----------
-    centres, normals : (n, 3)
+    centres, normals : (n, 3) centres and unit normals
     areas : (n,) in any unit
-    oriented : whether normals point to the observed side
+    oriented : whether the normals point to the observed side
     """
 
     centres: Floats
@@ -66,12 +68,12 @@ class Pieces:
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """Return value of `estimate_up`.
+    """The estimated up direction of a surface.
 
     Parameters
     ----------
     up : (3,) unit vector
-    is_clear : whether no other direction is nearly as likely
+    is_clear : whether all other directions are much less likely
     """
 
     up: Floats
@@ -84,8 +86,8 @@ def estimate_up(points: Floats32, triangles: Ints32 | None, usual: Floats) -> Up
     Parameters
     ----------
     points : (N, 3), finite, N >= 1, any unit
-    triangles : (M, 3) indices into them; None for a cloud
-    usual : (3,) unit vector, the up direction of most files of this format; it decides for
+    triangles : (M, 3) indices of points; None for a cloud
+    usual : (3,) unit vector, the up direction of most files of this format, which is selected for
         symmetric surfaces such as an empty cube
     """
     pieces = flat_pieces(points, triangles)
@@ -117,21 +119,21 @@ def estimate_up(points: Floats32, triangles: Ints32 | None, usual: Floats) -> Up
     return Upright(sign * candidates[best], bool(clear))
 
 
-#: Greatest height of a place in metres, and its number in centimetres; greatest ratio of extent to
-#: height of a place in centimetres: maps of hills in metres are flatter.
+#: Maximum height of a place in metres, minimum and maximum number of units for centimetres, and
+#: maximum ratio of extent to height for centimetres: maps of hills in metres are flatter.
 _TALLEST_M, _TALLEST_CM, _FLATTEST = 150.0, 1000.0, 12.0
-#: Greatest extent of a place, metres.
+#: Maximum extent of a place, metres.
 _WIDEST_M = 20_000.0
 
 
 def estimate_units(points: Floats32, up: Floats) -> float:
     """Return the number of units of a surface per metre: 1, 100 or 1000.
 
-    Millimetres and centimetres are returned only if the place would be too high in metres.
+    The result is 1 unless the place would be too high in metres.
 
     Parameters
     ----------
-    points : (N, 3), finite, N >= 1, in the units
+    points : (N, 3), finite, N >= 1, in the unknown unit
     up : (3,) unit vector
     """
     low, high = _ends(points, up)
@@ -147,7 +149,7 @@ def estimate_units(points: Floats32, up: Floats) -> float:
 
 
 def _snap(direction: Floats, usual: Floats) -> Floats:
-    """Return the axis of the file near the direction, or the direction itself."""
+    """Return the axis of the file that is near the direction, otherwise the direction."""
     if abs(float(direction @ usual)) > _SNAP_USUAL:
         return usual
     k = int(np.abs(direction).argmax())
@@ -159,14 +161,14 @@ def _snap(direction: Floats, usual: Floats) -> Floats:
 
 
 def _ends(points: Floats32, direction: Floats) -> tuple[float, float]:
-    """Return the ends of the surface along a direction, without its outer hundredths."""
+    """Return the ends of the surface along a direction, without 1 % of the points at each end."""
     step = -(-len(points) // _MOST_POINTS)
     low, high = np.quantile(points[::step] @ direction, (_LOW, _HIGH))
     return float(low), float(high)
 
 
 def _mass(points: Floats32, pieces: Pieces) -> tuple[Floats, Floats]:
-    """Return points of the surface and their weights."""
+    """Return points that represent the surface, and their weights."""
     if pieces.oriented and len(pieces.areas):
         return pieces.centres, pieces.areas
     sample = points[:: -(-len(points) // _MOST_POINTS)].astype(np.float64)
@@ -174,8 +176,8 @@ def _mass(points: Floats32, pieces: Pieces) -> tuple[Floats, Floats]:
 
 
 def _layers(pieces: Pieces, direction: Floats, thickness: float) -> float:
-    """Return the share of the surface in the two fullest layers across a direction, half of the
-    second.
+    """Return the share of the surface in the largest layer across a direction, plus half of the
+    share of the second-largest layer.
     """
     across = np.abs(pieces.normals @ direction) > _NEAR
     if not across.any():
@@ -192,8 +194,8 @@ def _layers(pieces: Pieces, direction: Floats, thickness: float) -> float:
 def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> float:
     """Return the excess of furniture in the lower half, [-1.75, 1.75].
 
-    Pieces that are no wall count, level pieces one half more, and floor and ceiling a little:
-    furniture hides more of the floor, and cameras look down.
+    Walls do not count. Level pieces have an additional weight of one half, and floor and ceiling
+    a small weight: furniture hides more of the floor, and cameras look down.
     """
     places = (pieces.centres @ direction - low) / height
     cosines = np.abs(pieces.normals @ direction)
@@ -207,7 +209,7 @@ def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> 
 
 
 def _balance(areas: Floats, chosen: NDArray[np.bool_], places: Floats) -> float:
-    """Return the area of the lower half minus the upper's, as a share of both."""
+    """Return the area of the lower half minus that of the upper half, as a share of both."""
     lower = float(areas[chosen & (places < 0.5)].sum())
     upper = float(areas[chosen & (places >= 0.5)].sum())
     return (lower - upper) / (lower + upper + 0.005 * float(areas.sum()) or 1.0)
@@ -243,7 +245,7 @@ def flat_pieces(points: Floats32, triangles: Ints32 | None) -> Pieces:
 
 
 def _fit_planes(inside: Floats, sample: Floats, cells: Integers, counts: Integers) -> Pieces:
-    """Fit a plane to each cell whose points lie in one."""
+    """Return the planes of all cells whose points lie in a plane."""
     n = len(counts)
 
     def mean(values: Floats) -> Floats:
@@ -263,14 +265,15 @@ def _fit_planes(inside: Floats, sample: Floats, cells: Integers, counts: Integer
 
 
 def dominant_directions(pieces: Pieces) -> Floats:
-    """Return the directions (k, 3) that most pieces face, either way, at least 25 degrees apart,
-    strongest first.
+    """Return the directions (k, 3) that most pieces face with either side, strongest first.
+
+    The directions differ by at least 25 degrees.
     """
     normals, areas = pieces.normals, pieces.areas
     total = float(areas.sum())
     if total <= 0:
         return np.empty((0, 3))
-    # evenly spaced in the cumulative area: a deterministic sample weighted by area
+    # even steps in the cumulative area give a deterministic sample that is weighted by area
     ranks = np.searchsorted(np.cumsum(areas), (np.arange(_VOTERS) + 0.5) * total / _VOTERS)
     voters = normals[np.minimum(ranks, len(areas) - 1)]
     directions = _hemisphere(_DIRECTIONS)

@@ -1,13 +1,14 @@
-"""Average a cloud's points to voxels, each with the plane through its neighbours (Sec. III).
+"""Voxels of a cloud, each with the plane through its neighbours (Sec. III).
 
     Cloud (N)  --voxels-->  Voxels (V), a Surface (1, V)
     inverse ranges (N), directions (N, 3), Links  --fit_inverse_planes-->  planes
     places (N, 3), Links                          --fit_planes-->          normals, feet
     places (N, 3), heights (N)                    --link_points-->         Links
 
-About a viewpoint voxels grow with range, as in VCCS for a cloud of one camera (Papon 2013): a cell
-is a bin of direction, on the cube, and of the logarithm of range. Without a viewpoint all cells
-have one size. The grid lies in the cloud's own axes, so it rotates with the cloud.
+Around a viewpoint, voxels grow with range, as in VCCS for a cloud of one camera (Papon 2013): a
+cell is a bin of direction, on a cube, and of the logarithm of range. Without a viewpoint all cells
+have the same size. The grid is aligned with the cloud's principal axes, so it rotates with the
+cloud.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ Ints64 = NDArray[np.int64]
 def solve(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, b: Floats, out: Floats
 ) -> float:
-    """Solve A x = b, A symmetric 3 x 3; return det A. `out` is x if the determinant is > 0."""
+    """Solve A x = b for a symmetric A (3, 3); return det A. Write x to `out` if det A > 0."""
     cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     det = xx * cxx + xy * cxy + xz * cxz
     if det > 0:
@@ -54,7 +55,7 @@ def fit_inverse_planes(
     q: Floats, u: Floats, offsets: Ints64, indices: Ints32, gates: Floats, limits: Floats,
     planes: Floats,
 ) -> None:  # fmt: skip
-    """Write a of 1/r = a . u among the neighbours of each point; 0 if they determine no plane.
+    """Write a of 1/r = a . u for the neighbours of each point; 0 if they determine no plane.
 
     The first pass selects by range, the second by distance to the plane.
     """
@@ -93,10 +94,9 @@ def fit_inverse_planes(
 
 @kernel
 def least_axis(m: Floats, values: Floats, axis: Floats) -> None:
-    """Write the eigenvalues of a symmetric 3 x 3 matrix, and the eigenvector of the least, by
-    Jacobi.
+    """Write the eigenvalues of a symmetric matrix, and the eigenvector of the smallest, by Jacobi.
 
-    `m` is overwritten.
+    The matrix `m` (3, 3) is overwritten.
     """
     v = np.eye(3)
     for _ in range(8):
@@ -133,10 +133,11 @@ def fit_planes(
     places: Floats, offsets: Ints64, indices: Ints32, gate: float, limits: Floats,
     normals: Floats, at: Floats,
 ) -> None:  # fmt: skip
-    """Write the normals of planes through the neighbours of each point, towards the origin.
+    """Write the normals of the planes through the neighbours of each point, towards the origin.
 
-    `at` becomes the point's foot on the plane. The first pass uses all neighbours, the second those
-    near the plane. Normals are 0 if the neighbours determine no plane.
+    The projection of each point onto its plane is written to `at`. The first pass uses all
+    neighbours, the second only neighbours near the plane. Normals are 0 if the neighbours determine
+    no plane.
     """
     m, values, axis, mean = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3)
     for i in range(len(places)):
@@ -152,7 +153,7 @@ def fit_planes(
                     if not abs(off) < gate:
                         continue
                 n += 1
-                for d in range(3):  # relative to the point, for precision far from the origin
+                for d in range(3):  # relative coordinates are precise far from the origin
                     first[d] += places[j, d] - places[i, d]
                     for e in range(3):
                         second[d, e] += (places[j, d] - places[i, d]) * (
@@ -185,7 +186,7 @@ _REACH = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Neighbours of N points: those of i are `indices[offsets[i] : offsets[i + 1]]`, without i.
+    """Neighbours of N points: point i has the neighbours `indices[offsets[i] : offsets[i + 1]]`.
 
     Parameters
     ----------
@@ -197,7 +198,7 @@ class Links:
     indices: Ints32
 
     def select(self, keep: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Links:
-        """Return the links of the mask `linked` (M,) between the points `keep` (N,), renumbered."""
+        """Return the links of a mask (M,) between the points of a mask (N,), renumbered."""
         number = np.cumsum(keep) - 1
         sources = np.repeat(keep, np.diff(self.offsets))
         selected = linked & sources & keep[self.indices]
@@ -209,14 +210,14 @@ class Links:
     def touching(
         self, places: Floats, reach: float, at: Floats, normals: Floats, gaps: Floats
     ) -> NDArray[np.bool_]:
-        """Return a mask (M,) of the links that are short and join one surface.
+        """Return a mask (M,) of the short links within one surface.
 
         Parameters
         ----------
-        places : (N, 3) arguments of `link_points`
-        reach : greatest length, in their units
+        places : (N, 3) argument of `link_points`
+        reach : maximum length of a link, in the units of `places`
         at, normals : (N, 3) points and normals of the planes
-        gaps : (N,) least distance from both planes that makes a gap, metres
+        gaps : (N,) distance from both planes at which a gap separates two points, metres
         """
         keep = np.empty(len(self.indices), np.bool_)
         _touch(places, reach * reach, at, normals, gaps, self.offsets, self.indices, keep)
@@ -298,12 +299,12 @@ def _reorder(indices: Ints32, begins: Ints64, offsets: Ints64, out: Ints32) -> N
 
 
 def link_points(places: Floats, heights: Floats) -> Links:
-    """Return all pairs of points closer than 1 in place and in height.
+    """Return all pairs of points whose distance and difference of heights are below 1.
 
     Parameters
     ----------
-    places : (N, 3), in units of the reach, within 2^19 of the origin
-    heights : (N,), in units of its gate
+    places : (N, 3) positions in units of the reach, within 2^19 of the origin
+    heights : (N,) heights in units of the gate
     """
     n = len(places)
     cell = np.clip(np.floor(places), -_REACH + 1, _REACH - 2).astype(np.int64) + _REACH
@@ -326,7 +327,7 @@ def _touch(
     places: Floats, square: float, at: Floats, normals: Floats, gaps: Floats, offsets: Ints64,
     indices: Ints32, keep: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Write whether two points are close, and one of them lies on the plane of the other."""
+    """Write whether two points are close and one of them lies on the plane of the other point."""
     for i in range(len(at)):
         for k in range(offsets[i], offsets[i + 1]):
             j = indices[k]
@@ -344,25 +345,25 @@ def _touch(
             keep[k] = min(one, other) <= max(gaps[i], gaps[j])
 
 
-#: Side of the square with the area of the neighbourhood's disc, in radii.
+#: Side of a square with the area of the neighbourhood's disc, in radii.
 _SQUARE = math.sqrt(math.pi)
-#: Greatest distance of voxels that touch, in sides: means in adjacent cells.
+#: Maximum distance of voxels that touch, in sides: bound of the means of adjacent cells.
 _TOUCHING = 2.0
-#: Greatest distance of points on one surface, in sides of a voxel.
+#: Maximum distance of points on one surface from its plane, in sides of a voxel.
 _GAP = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Voxels(Surface):
-    """The surface of a cloud as V voxels, independent of the order of its points; camera None.
+    """The surface of a cloud as V voxels, independent of the order of its points.
 
     Parameters
     ----------
-    cloud : the cloud
+    cloud : source of the voxels
     axes : (3, 3) principal axes, rows
-    centre : (3,) metres: the viewpoint, or the centroid without one
+    centre : (3,) viewpoint of the cloud, or its centroid if it has no viewpoint, metres
     sides : (V,) float32, widths of the voxels, metres
-    links : links of voxels that touch, with no gap between their surfaces
+    links : links between voxels that touch, with no gap between their surfaces
     """
 
     cloud: Cloud
@@ -373,20 +374,20 @@ class Voxels(Surface):
 
     @property
     def plain(self) -> Surface:
-        """Return points and normals alone."""
+        """Return a surface of the points and normals only."""
         return Surface(self.points, self.normals, self.valid, self.areas, None)
 
 
 def voxels(cloud: Cloud, p: CloudParameters) -> Voxels:
-    """Return the voxels of a cloud, with normals of their planes towards the viewpoint.
+    """Return the voxels of a cloud, with normals that point to the viewpoint.
 
     Parameters
     ----------
-    cloud : points about the viewpoint, metres
+    cloud : cloud with points in metres
 
     Raises
     ------
-    UselessFrame : fewer than `minimum_points` points are within range, or fewer voxels hold one
+    UselessFrame : If fewer than `minimum_points` points are within range, or fewer voxels hold one
     """
     points = select_in_range(cloud, p)
     build = _angular_voxels if cloud.has_viewpoint else _metric_voxels
@@ -415,7 +416,7 @@ def _angular_voxels(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxel
     keep = (norm > 0) & within & (inverse >= p.minimum_cosine * norm)
     inverse, norm = np.where(keep, inverse, 1.0), np.where(keep, norm, 1.0)
     cosines = inverse / norm
-    # solid angle of a cell of the cube, from the tangents of its direction
+    # the tangents of a cell's direction give its solid angle
     a = np.sort(np.abs(rays @ axes.T), axis=1)
     tangents = (a[:, :2] / a[:, 2:]) ** 2
     solid = side * side * ((1 + tangents).prod(axis=1) / (1 + tangents.sum(axis=1)) ** 1.5)
@@ -444,7 +445,7 @@ def _metric_voxels(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels
     normals, feet = np.zeros_like(at), at.copy()
     fit_planes(at, near.offsets, near.indices, side, limits, normals, feet)
     keep = (normals != 0).any(axis=1)
-    # number of cells that a plane crosses, per square of their side
+    # number of cells that a plane crosses, per squared side
     crossed = np.where(keep, np.abs(normals @ axes.T).sum(axis=1), 1.0)
     return _build(
         cloud, axes, centre, keep, near, places, _TOUCHING * side / reach,
@@ -460,8 +461,8 @@ def _check_count(n: int, cloud: Cloud, p: CloudParameters) -> None:
     if n < p.minimum_points:
         name = f"{cloud.name}: " if cloud.name else ""
         raise UselessFrame(
-            f"{name}its {len(cloud.points)} points fill {n} voxels, and {p.minimum_points} are "
-            "needed to show a surface. Send a cloud that sees more of the scene."
+            f"{name}its {len(cloud.points)} points fill {n} voxels, but a surface requires "
+            f"{p.minimum_points}. Send a cloud that shows more of the scene."
         )
 
 

@@ -1,17 +1,17 @@
-"""Decide by evidence and rivals whether to accept a transform (Sec. III-E).
+"""The acceptance of a transform by its evidence and its rivals (Sec. III-E).
 
     Evidence  --objection-->  reason to refuse     Evidence, ambiguity  --belief-->  strength
-    Evidence, deviation  --sparse_evidence_suffices-->  whether little is enough
+    Evidence, deviation  --sparse_evidence_suffices-->  whether sparse evidence is enough
     T, hypotheses, planes  --best_alternative-->  Rival
 
-A box looks the same from its four sides, a corridor the same at every door. Two frames of such a
-place agree perfectly under a wrong transform; only other transforms that are not refuted either
-reveal it. So rivals are searched: the other hypotheses of correspondences, and the transform
-itself, rotated by quarter turns about the normals of the main planes or shifted along them, since
-rooms and furniture repeat that way.
+A box looks the same from its four sides, and a corridor the same at every door. Two frames of such
+a place agree perfectly under a wrong transform, which only equally good transforms reveal.
+Therefore rivals are searched among the other hypotheses of correspondences, and among versions of
+the transform that are rotated by quarter turns about the normals of the main planes or shifted
+along these planes, since rooms and furniture repeat in these ways.
 
-The agreement of a rival counts by planes (`overlap.py`). If up is known in both frames, a transform
-that tilts is no rival.
+The agreement of a rival is weighted by planes (`overlap.py`). If up is known in both frames, a
+transform that tilts is not a rival.
 """
 
 from __future__ import annotations
@@ -42,41 +42,41 @@ Mode = Literal["full", "paper"]
 class AcceptanceParameters:
     """Parameters of acceptance; docs/evaluation.md describes how they were tuned.
 
-    "blind" limits hold if free space is unknown, "sparse" limits if the frames share little or only
-    one search found the transform, "apart" limits if its refinements then differ by more than
-    `residual_m`.
+    "blind" limits apply if free space is unknown, "sparse" limits if the frames share little
+    surface or only one search found the transform, and "apart" limits if the refinements of such a
+    transform differ by more than `residual_m`.
     """
 
-    residual_m: float = 0.08  #: greatest residual of the composed directions: epsilon_val, metres
-    residual_rad: float = math.radians(5.0)  #: and radians
-    violation_weight: float = 5.0  #: evidence = overlap - this x violations
-    evidence: float = 0.2  #: least evidence
-    plane_overlap: float = 0.15  #: least plane overlap
-    net_weight: float = 3.0  #: net plane overlap = plane overlap - this x violations
-    net: float = 0.1  #: least net plane overlap
+    residual_m: float = 0.08  #: maximum residual of the composed directions: epsilon_val, metres
+    residual_rad: float = math.radians(5.0)  #: the same, radians
+    violation_weight: float = 5.0  #: evidence = overlap - violation_weight * violations
+    evidence: float = 0.2  #: minimum evidence
+    plane_overlap: float = 0.15  #: minimum plane overlap
+    net_weight: float = 3.0  #: net plane overlap = plane overlap - net_weight * violations
+    net: float = 0.1  #: minimum net plane overlap
     net_strong: float = 0.1  #: net plane overlap below which an accepted match is weak
-    planes: float = 0.0  #: least number of distinct planes that agree
-    plane_violations: float = 1.0  #: greatest share of violations by planes
-    worst_violations: float = 0.05  #: greatest share of violations in either direction
+    planes: float = 0.0  #: minimum number of distinct planes that agree
+    plane_violations: float = 1.0  #: maximum share of violations by planes
+    worst_violations: float = 0.05  #: maximum share of violations in either direction
     strong: float = 0.3  #: evidence below which an accepted match is weak
     weak: float = 0.05  #: ambiguity from which an accepted match is weak
-    ambiguous: float = 0.14  #: ambiguity from which nothing is accepted
+    ambiguous: float = 0.14  #: ambiguity from which no match is accepted
     ambiguous_share: float = 0.5  #: the same as a share of `plane_overlap`
-    stiffness: float = 1e-5  #: least ratio of the eigenvalues of the information
-    blind_evidence: float = 0.4  #: least evidence
-    blind_plane_overlap: float = 0.3  #: least plane overlap
-    blind_ambiguous_share: float = 0.75  #: replaces both limits of ambiguity: fewer rivals fall
-    sparse_evidence: float = 0.1  #: least evidence
-    sparse_plane_overlap: float = 0.1  #: least plane overlap
-    sparse_planes: float = 5.0  #: least number of distinct planes
+    stiffness: float = 1e-5  #: minimum ratio of the eigenvalues of the information
+    blind_evidence: float = 0.4  #: minimum evidence
+    blind_plane_overlap: float = 0.3  #: minimum plane overlap
+    blind_ambiguous_share: float = 0.75  #: limit in place of both, as fewer rivals are refuted
+    sparse_evidence: float = 0.1  #: minimum evidence
+    sparse_plane_overlap: float = 0.1  #: minimum plane overlap
+    sparse_planes: float = 5.0  #: minimum number of distinct planes
     alone_planes: float = 6.0  #: the same if only one search found the transform
-    sparse_plane_violations: float = 0.06  #: greatest `plane_violations`
-    sparse_worst_violations: float = 0.03  #: greatest `worst_violations`
-    sparse_deviation_m: float = 0.045  #: greatest deviation of the translation, metres
-    apart_m: float = 0.2  #: greatest residual of the two refinements, metres
-    apart_rad: float = math.radians(4.0)  #: and radians
-    apart_planes: float = 12.0  #: least number of distinct planes
-    apart_plane_overlap: float = 0.2  #: least plane overlap
+    sparse_plane_violations: float = 0.06  #: maximum `plane_violations`
+    sparse_worst_violations: float = 0.03  #: maximum `worst_violations`
+    sparse_deviation_m: float = 0.045  #: maximum deviation of the translation, metres
+    apart_m: float = 0.2  #: maximum residual of the two refinements, metres
+    apart_rad: float = math.radians(4.0)  #: the same, radians
+    apart_planes: float = 12.0  #: minimum number of distinct planes
+    apart_plane_overlap: float = 0.2  #: minimum plane overlap
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,12 @@ class Evidence:
     Parameters
     ----------
     residual_m, residual_rad, overlap, plane_overlap : see PairValidation
-    violations : see PairValidation; None without evidence of free space
-    stiffness : the lesser of both directions', see Alignment
+    violations : see PairValidation; None if free space is unknown
+    stiffness : smaller stiffness of the two directions; see Alignment
     one_sided : whether free space of one of the frames is unknown
-    planes : number of distinct planes that agree, the mean of both frames
-    plane_violations : share of free-space violations, all planes weighing the same
-    worst_violations : share of violations of the frame that violates more
+    planes : number of distinct planes that agree, averaged over both frames
+    plane_violations : share of free-space violations, with equal weights for all planes
+    worst_violations : share of violations of the frame with more violations
     """
 
     residual_m: float
@@ -106,18 +106,24 @@ class Evidence:
     worst_violations: float = 0.0
 
     def total(self, p: AcceptanceParameters) -> float:
-        """Return the overlap less the weighted violations."""
+        """Return the overlap minus the weighted violations."""
         return self.overlap - p.violation_weight * (self.violations or 0.0)
 
     def net(self, p: AcceptanceParameters) -> float:
-        """Return the plane overlap less the weighted violations."""
+        """Return the plane overlap minus the weighted violations."""
         return self.plane_overlap - p.net_weight * (self.violations or 0.0)
 
 
-def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
-    """Return the reason to refuse a transform, whatever its rivals, or None: Sec. III-E.
+_IN_FREE_SPACE = "of the points lie where the other frame saw free space"
 
-    Mode "paper" checks the residual alone.
+
+_IN_FREE_SPACE = "of the points lie where the other frame saw free space"
+
+
+def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
+    """Return the reason to refuse a transform, whatever its rivals; None without one: Sec. III-E.
+
+    Mode "paper" checks the residual only.
     """
     if e.residual_m > p.residual_m or e.residual_rad > p.residual_rad:
         if not math.isfinite(e.residual_m):
@@ -130,39 +136,40 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
     evidence = p.blind_evidence if blind else p.evidence
     if e.total(p) < evidence:
         if e.violations is None:
-            return "rejected", f"only {e.overlap:.0%} agrees, and free space is unknown"
+            agreeing = f"{e.overlap:.0%} of the surfaces"
+            return "rejected", f"only {agreeing} agree, and free space is unknown"
         if e.overlap < evidence:
             return "rejected", f"only {e.overlap:.0%} of the surfaces agree"
-        return "rejected", f"{e.violations:.1%} lies where the other frame saw through"
+        return "rejected", f"{e.violations:.1%} {_IN_FREE_SPACE}"
     if e.plane_overlap < (p.blind_plane_overlap if blind else p.plane_overlap):
-        return "rejected", f"what agrees is mostly one plane ({e.plane_overlap:.0%} by planes)"
+        return "rejected", f"mostly one plane agrees (plane overlap {e.plane_overlap:.0%})"
     if e.net(p) < p.net:
         return "rejected", (
-            f"{e.plane_overlap:.0%} agrees by planes, and {e.violations or 0.0:.1%} lies where the "
-            "other frame saw through"
+            f"the plane overlap is {e.plane_overlap:.0%}, but {e.violations or 0.0:.1%} "
+            f"{_IN_FREE_SPACE}"
         )
     if e.plane_violations > p.plane_violations or e.worst_violations > p.worst_violations:
         share = max(e.plane_violations, e.worst_violations)
-        return "rejected", f"{share:.1%} lies where the other frame saw through"
+        return "rejected", f"{share:.1%} {_IN_FREE_SPACE}"
     if e.planes < p.planes:
         return "ambiguous", (
             f"only {e.planes:.0f} distinct planes agree, too few to distinguish corridors"
         )
     if e.stiffness < p.stiffness:
-        return "ambiguous", "what the frames share leaves a direction free, as a plane does"
+        return "ambiguous", "the common surfaces do not constrain one direction"
     return None
 
 
 def sparse_evidence_suffices(
     e: Evidence, deviation_m: float, p: AcceptanceParameters, *, alone: bool = False
 ) -> bool:
-    """Return whether little evidence is enough, because all of it supports the transform.
+    """Return whether sparse evidence is enough, because all of it supports the transform.
 
-    Two frames that share a tenth of their surfaces cannot show the overlap that `objection`
-    requires, and one of the searches may miss the transform. Such a transform must be refined to
-    one place in both directions, several planes must agree, next to nothing may lie in free space
-    of either frame, and the surfaces must constrain it well. Distorted depth separates the two
-    refinements of a right transform by some centimetres; then many planes must agree.
+    Two frames that share a tenth of their surfaces cannot reach the overlap that `objection`
+    requires, and one of the searches may miss the transform. For such a transform, refinements in
+    both directions must agree, as must several planes, almost no points may lie in free space of
+    either frame, and the surfaces must constrain it well. Distorted depth separates the refinements
+    of a correct transform by a few centimetres; in this case many planes must agree.
 
     Parameters
     ----------
@@ -201,23 +208,23 @@ def belief(
 ) -> tuple[Status, Strength | None, str]:
     """Return status, strength and reason of a transform without objection, by its ambiguity."""
     most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
-    if e.violations is None:  # free space refutes no rival either
+    if e.violations is None:  # unknown free space refutes no rival
         most = p.blind_ambiguous_share * e.plane_overlap
     if ambiguity >= most:
-        return "ambiguous", None, "another transform explains the frames as well"
+        return "ambiguous", None, "another transform explains the frames equally well"
     if e.violations is None:
-        return "accepted", "weak", "surfaces agree, but free space is unknown"
+        return "accepted", "weak", "the surfaces agree, but free space is unknown"
     if ambiguity >= p.weak:
-        return "accepted", "weak", "another transform is not ruled out"
+        return "accepted", "weak", "another transform is possible too"
     if e.total(p) < p.strong or e.net(p) < p.net_strong:
         return "accepted", "weak", f"{e.overlap:.0%} of the surfaces agree"
-    if e.one_sided:  # surfaces that only one frame has may contradict it
-        return "accepted", "weak", "surfaces agree, but free space is known of one frame only"
-    return "accepted", "strong", "surfaces agree, and nothing speaks against it"
+    if e.one_sided:  # violations of the unknown free space are not detected
+        return "accepted", "weak", "the surfaces agree, but free space is known for one frame only"
+    return "accepted", "strong", "the surfaces agree, and there is no evidence against it"
 
 
 def _two_digits(value: float) -> str:
-    """Return a number with two digits and no exponent: 130, not 1.3e+02."""
+    """Format a number with two digits and without an exponent: 130, not 1.3e+02."""
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
@@ -226,29 +233,29 @@ class AmbiguityParameters:
     """Parameters of the search for rivals."""
 
     n_axes: int = 2  #: number of main directions of normals
-    n_planes: int = 3  #: number of planes across each, by area
-    same_direction: float = math.radians(12.0)  #: greatest angle of parallel normals
-    shift: float = 0.5  #: step along a corridor, metres, which refinement can bridge
-    n_shifts: int = 6  #: number of steps each way
-    least_crossing: float = 0.5  #: least sine of the angle between the main families of planes
-    n_proposed: int = 16  #: number of plans' hypotheses that are refined as rivals
+    n_planes: int = 3  #: number of largest planes per direction
+    same_direction: float = math.radians(12.0)  #: maximum angle of parallel normals
+    shift: float = 0.5  #: step along a corridor, small enough for refinement to converge, metres
+    n_shifts: int = 6  #: number of steps in each direction
+    least_crossing: float = 0.5  #: minimum sine of the angle between the main families of planes
+    n_proposed: int = 16  #: number of hypotheses of plans that are refined as rivals
     planes: PlaneParameters = field(default_factory=PlaneParameters)
     first: RefinementParameters = QUICK  #: refinement of all rivals
-    hopeful_share: float = 0.04  #: least share that a rival explains after it
-    hopeful_violations: float = 0.15  #: greatest share of its violations
-    then: RefinementParameters = COARSE  #: refinement of the rest
-    refuted: float = 0.02  #: violations that refute a rival, if the transform has fewer
-    rival_m: float = 0.25  #: least difference of a rival, metres
-    rival_rad: float = math.radians(15.0)  #: or radians
+    hopeful_share: float = 0.04  #: minimum share that a rival explains after the first refinement
+    hopeful_violations: float = 0.15  #: maximum share of its violations after this refinement
+    then: RefinementParameters = COARSE  #: refinement of the remaining rivals
+    refuted: float = 0.02  #: violations that refute a rival if the transform has fewer
+    rival_m: float = 0.25  #: minimum difference of a rival from the transform, metres
+    rival_rad: float = math.radians(15.0)  #: the same, radians; one of the two is enough
 
 
 @cached_per_frame
 def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
     """Return motions (n, 4, 4) that map the main planes of the patches onto themselves.
 
-    These are rotations by 90, 180 and 270 degrees about the middle of each plane, and shifts along
-    the intersection of the two main families of planes, as along a corridor. n is at most 3 n_axes
-    n_planes + 2 n_shifts.
+    These are rotations by 90, 180 and 270 degrees about the centre of each plane, and shifts along
+    the intersection of the two main families of planes, as along a corridor. n is at most
+    3 n_axes n_planes + 2 n_shifts.
     """
     motions = np.zeros((3 * p.n_axes * p.n_planes + 2 * p.n_shifts, 4, 4))
     means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
@@ -304,10 +311,10 @@ def _write_turns(
     means: Floats, areas: Floats, axis: Floats, n_planes: int, same_plane: float, mass: Floats,
     motions: Floats, found: int,
 ) -> int:  # fmt: skip
-    """Write quarter turns about the middles of the largest planes across an axis.
+    """Append quarter turns about the centres of the largest planes across an axis to `motions`.
 
-    Planes consist of patches with an area, which is set to 0. Returns the number of motions with
-    the `found` that are there.
+    Planes consist of patches with positive areas, which are set to 0. `found` is the previous
+    number of motions; the result is the new number.
     """
     x, y, z = axis[0], axis[1], axis[2]
     offsets, R = x * means[0] + y * means[1] + z * means[2], np.empty((3, 3))
@@ -340,9 +347,9 @@ def _write_turns(
 
 @disjoint_kernel
 def _sum_parallel(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
-    """Write for each patch the area of the patches parallel to it; normals (3, P).
+    """Write, for each patch, the total area of parallel patches; normals are (3, P).
 
-    The inner loop runs over the sums, not over the terms of one sum, so that it vectorizes.
+    The inner loop is over the sums, not over the terms of one sum, so that it is vectorized.
     """
     x, y, z = normals[0], normals[1], normals[2]
     mass[:] = 0.0
@@ -355,7 +362,7 @@ def _sum_parallel(normals: Floats, areas: Floats, cosine: float, mass: Floats) -
 
 @disjoint_kernel
 def _sum_level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
-    """Write for each patch the area of the patches with a near offset, as `_sum_parallel` does."""
+    """Write, for each patch, the total area of patches with a similar offset."""
     mass[:] = 0.0
     for j in range(len(areas)):
         offset, area = offsets[j], areas[j]
@@ -374,9 +381,10 @@ class Rival(NamedTuple):
 
     Parameters
     ----------
-    share : share of the frames that it explains, all planes weighing the same, 0 to 1; 0 if none
-    T : (4, 4) transform, or None
-    tilted : greatest share explained by a transform that only `up` refutes
+    share : share of the frames that it explains, with equal weights for all planes, 0 to 1; 0
+        without a rival
+    T : (4, 4) transform; None without a rival
+    tilted : maximum share that is explained by a transform that only `up` refutes
     """
 
     share: float
@@ -395,12 +403,12 @@ def best_alternative(
     ----------
     query, match : results of `plane_view`
     T : (4, 4) T_match_query
-    violations : violations of T by planes: free space refutes no rival that violates as little
-    voted : (n, 4, 4) other hypotheses, refined
-    proposed : (m, 4, 4) unrefined hypotheses, best first: the best that differ from T and from each
-        other as rivals do are refined
+    violations : violations of T by planes; a rival with as few violations is not refuted
+    voted : (n, 4, 4) other refined hypotheses
+    proposed : (m, 4, 4) unrefined hypotheses, best first; the best ones that are rivals of T and of
+        each other are refined
     ups : up vectors of query and match
-    most_tilt : greatest tilt of a rival, radians
+    most_tilt : maximum tilt of a rival, radians
     """
     moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
     near = select_rivals(T, refine_all(query.surface, match.surface, moved, p.first), p)

@@ -1,13 +1,13 @@
-"""Compute the confidence of a candidate pose: the probability that it is right.
+"""The confidence of a candidate pose: the probability that it is right.
 
-    PlaceEvidence of every candidate  --compute_confidences-->  P(right) of each, sum <= 1
-    PlaceEvidence  --weakest_evidence-->  sentence on the evidence that lowers it most
+    PlaceEvidence of all candidates  --compute_confidences-->  P(right) of each, sum <= 1
+    PlaceEvidence  --weakest_evidence-->  sentence on the evidence with the largest penalty
 
-At most one of the candidates is right. The log odds of each, against none, are those of a pose with
-the best evidence, less one penalty per kind of evidence. A penalty is a piecewise linear function
-that never rises with better evidence, so more support never lowers a confidence, and a better rival
-never raises one. `sceneprint_lab.confidence` learns the penalties on synthetic places;
-docs/trust.md shows the calibration on recordings.
+At most one of the candidates is right. The log odds of a candidate, relative to the case that all
+are wrong, are the log odds of a pose with the best evidence minus one penalty per kind of evidence.
+A penalty is a piecewise linear function that does not increase with better evidence, so more
+support cannot lower a confidence, and a better rival cannot raise it. `sceneprint_lab.confidence`
+fits the penalties to synthetic places; docs/trust.md shows the calibration on recordings.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ class PlaceEvidence:
 
     Parameters
     ----------
-    score : agreement with the map's frames, see ScoredPose; at most 1
-    share : share of the query's surface that the map shows there, all planes weighing the same
+    score : agreement with the map's frames, at most 1; see ScoredPose
+    share : share of the query's surface that the map shows at the pose, with equal weights for all
+        planes
     planes : number of distinct planes of the query that agree with the map
     frames : number of frames of the map that agree
-    viewpoints : number of their viewpoints
-    excess : share of free-space violations of both sides, less that of the map's own frames among
-        themselves
+    viewpoints : number of viewpoints of these frames
+    excess : share of free-space violations of both sides, minus the share among the map's frames
     weight : sum of the weights of votes for the pose, one per viewpoint: 1 for a strong match, less
-        for a weak or an ambiguous one
-    strong : number of viewpoints of strong matches that vote for it
-    accepted : number of viewpoints of accepted matches that lead to it, guided ones included
-    suggested : number of viewpoints of candidates that suggest it, accepted or not
-    similarity : similarity of the signatures of the query and the nearest of these candidates, 0 to
+        for a weak or ambiguous match
+    strong : number of viewpoints of strong matches that vote for the pose
+    accepted : number of viewpoints of accepted matches, including guided matches, that lead to it
+    suggested : number of viewpoints of candidates that suggest the pose, accepted or not
+    similarity : similarity between the query's signature and the nearest of these candidates, 0 to
         1
-    rival : score of the best other place relative to this one's; 0 if there is none
-    rival_weight : greatest weight of the votes for another place
-    rendered : whether most of these frames are views rendered from one surface
+    rival : score of the best other place relative to the score of this place; 0 if there is none
+    rival_weight : maximum weight of the votes for another place
+    rendered : whether most of the agreeing frames are views that were rendered from one surface
     """
 
     score: float
@@ -61,21 +61,21 @@ class PlaceEvidence:
 
     @property
     def acceptance(self) -> float:
-        """Return the accepted matches per frame that sees the place, of at most five: 0 to 1.
+        """Return the ratio of accepted matches to frames that see the place (at most 5), 0 to 1.
 
-        If many frames see the right place, most of their matches are accepted, and at most five are
-        tried; at a place that only looks alike few are accepted.
+        At most five matches are validated. At the right place, most of them are accepted if many
+        frames see it; at a place that only looks similar, few are accepted.
         """
         return min(self.accepted / max(min(self.frames, 5), 1), 1.0)
 
 
 @dataclass(frozen=True)
 class Penalty:
-    """The reduction of the log odds by one kind of evidence, at its knots; 0 at the best knot.
+    """The penalty of one kind of evidence at its knots; it is 0 at the best knot.
 
     Parameters
     ----------
-    worst, poor, fair : penalties at the first, second and third knot, in falling order
+    worst, poor, fair : penalties at the first, second and third knot, in descending order
     """
 
     worst: float = 0.0
@@ -88,7 +88,7 @@ class Penalty:
         return self.worst, self.poor, self.fair, 0.0
 
 
-#: Four values of each kind of evidence, worst first; its penalty is linear between them.
+#: The knots: four values of each kind of evidence, worst first. Penalties are linear between them.
 KNOTS: Mapping[str, tuple[float, float, float, float]] = {
     "score": (0.05, 0.15, 0.3, 0.6),
     "planes": (3.0, 6.0, 12.0, 24.0),
@@ -106,7 +106,7 @@ KNOTS: Mapping[str, tuple[float, float, float, float]] = {
 
 @dataclass(frozen=True)
 class ConfidenceParameters:
-    """Parameters of the confidence, learnt on synthetic places.
+    """Parameters of the confidence, fitted to synthetic places.
 
     Parameters
     ----------
@@ -133,25 +133,25 @@ class ConfidenceModel:
     """Parameters of the confidence, by the kind of map.
 
     Views of one surface agree perfectly with each other, even if the surface is wrong, and show no
-    violations among themselves. So a real frame's violations are weaker evidence there, and other
-    kinds count more.
+    violations among themselves. For such maps, violations of a real frame are therefore weaker
+    evidence, and other kinds of evidence have more weight.
 
     Parameters
     ----------
-    frames : for maps of a sensor's frames
-    views : for maps of views rendered from a surface
+    frames : parameters for maps of a sensor's frames
+    views : parameters for maps of views that were rendered from a surface
     """
 
     frames: ConfidenceParameters = field(default_factory=ConfidenceParameters)
     views: ConfidenceParameters = field(default_factory=ConfidenceParameters)
 
     def of(self, e: PlaceEvidence) -> ConfidenceParameters:
-        """Return the parameters for a pose."""
+        """Return the parameters for a pose with this evidence."""
         return self.views if e.rendered else self.frames
 
 
 def compute_penalties(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, float]:
-    """Return the reduction of the log odds by each kind of evidence, >= 0, by name."""
+    """Return the non-negative penalty of each kind of evidence, by name."""
     penalties = {}
     for name, knots in KNOTS.items():
         values = getattr(p, name).values
@@ -162,13 +162,13 @@ def compute_penalties(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, fl
 
 
 def compute_confidences(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -> list[float]:
-    """Return the probability that each candidate pose of a query is right, in the same order.
+    """Return the probabilities that the candidate poses of a query are right.
 
-    1 minus their sum is the probability that none is right.
+    1 minus their sum is the probability that all are wrong.
 
     Parameters
     ----------
-    evidence : evidence of all candidates of one query, each at another place
+    evidence : evidence for all candidates of one query, which are at different places
     """
     odds = [math.exp(p.of(e).best - sum(compute_penalties(e, p.of(e)).values())) for e in evidence]
     total = 1.0 + sum(odds)
@@ -176,20 +176,20 @@ def compute_confidences(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -
 
 
 def weakest_evidence(e: PlaceEvidence, p: ConfidenceModel) -> str:
-    """Return a sentence on the evidence that lowers the confidence of a pose most."""
+    """Return a sentence on the evidence that reduces the confidence of a pose most."""
     penalties = compute_penalties(e, p.of(e))
     name = max(penalties, key=penalties.__getitem__)
     return {
         "score": f"the map shows only {e.share:.0%} of the frame's surface",
-        "planes": f"only {e.planes:.0f} distinct planes agree, and a few planes fit in many places",
+        "planes": f"only {e.planes:.0f} distinct planes agree, and so few planes fit many places",
         "frames": "few frames of the map see this place",
-        "excess": f"a pose fits, but {max(e.excess, 0.0):.0%} of the surface in view there is "
-        "missing: another place may look like this one, or this one has changed",
+        "excess": f"a pose fits, but {max(e.excess, 0.0):.0%} of the expected surface is missing: "
+        "either another place looks similar, or this place has changed",
         "weight": "too few matches vote for the pose",
         "strong": "no strong match votes for the pose",
         "acceptance": f"few of the {e.frames} frames that see this place match the frame well",
-        "suggested": f"one view alone suggests this pose, of {e.viewpoints} that see the place",
-        "similarity": "the frame looks little like those of the map that suggest this pose",
-        "rival": "another pose explains the frame as well: the place repeats, or has a symmetry",
+        "suggested": f"only one of the {e.viewpoints} views of the place suggests this pose",
+        "similarity": "the frame is not similar to the frames of the map that suggest this pose",
+        "rival": "another pose explains the frame equally well: the place repeats or is symmetric",
         "rival_weight": "the matches disagree: some vote for another pose",
     }[name]

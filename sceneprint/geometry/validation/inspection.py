@@ -1,12 +1,12 @@
-"""Return the evidence of a validation point by point, for display (Sec. III-E).
+"""The evidence of a validation point by point, for display (Sec. III-E).
 
     Geometry, Geometry, T  --trace-->  Traces: corresponding patches, inliers, violations
     points, Surface, T  --point_verdicts-->  agreements and violations of free space
-    points, Surface, T  --residuals-->  distances of the points that agree from the surface
-    Surface, Surface, T  --overlay-->  points, normals, colours, in the target's frame
+    points, Surface, T  --residuals-->  distances of agreeing points from the surface
+    Surface, Surface, T  --overlay-->  points, normals, colours in the target's frame
     points, normals, Patches  --patches_at-->  (N,) indices
 
-`overlap.py` judges the points one at a time.
+The verdicts on points come from `overlap.py`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches,
 
 #: Verdicts: unobserved or beside the surface, on the surface, in free space.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
-#: Greatest residual, and codes for verdicts, as `sceneprint.formats.export` encodes them.
+#: Maximum residual, and codes of verdicts, as `sceneprint.formats.export` encodes them.
 TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254
 
 Verdicts = NDArray[np.uint8]
@@ -44,8 +44,8 @@ class Traces:
     Parameters
     ----------
     pairs : (M, 2) indices of coinciding patches of the query and of the match
-    distances : (M,) distances of their means, metres
-    query, match : (N, 6) points and normals of the evidence, each in its own frame
+    distances : (M,) distances between the means of these patches, metres
+    query, match : (N, 6) points and normals of the evidence, in the coordinates of the frame
     of_query, of_match : (N,) NEITHER, AGREES or VIOLATES
     """
 
@@ -76,7 +76,7 @@ def _judge(
 def point_verdicts(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """Return the verdicts on a source's points (N, 6): (N,) NEITHER, AGREES or VIOLATES."""
+    """Return the verdicts (N,), NEITHER, AGREES or VIOLATES, on a source's points (N, 6)."""
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
     _judge(
@@ -115,8 +115,7 @@ def _measure(
 def residuals(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """Return the distances of a source's points from the target's surface, as steps of the
-    tolerance.
+    """Return the distances of a source's points from the target's surface, in steps of tolerance.
 
     Parameters
     ----------
@@ -124,9 +123,9 @@ def residuals(
 
     Returns
     -------
-    (N,) the least k of 1 to TOLERANCE such that the point agrees within k / TOLERANCE of
+    (N,) the minimum k from 1 to TOLERANCE such that the point agrees within k / TOLERANCE of
         `surface_tolerance`, which grows with distance; VIOLATION if it violates free space; OUTSIDE
-        if no pixel sees it, or it lies beside or behind the surface
+        if no pixel sees it or it lies beside or behind the surface
     """
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
@@ -145,9 +144,9 @@ def trace(
     Parameters
     ----------
     query, match : geometry artifacts
-    T_match_query : (4, 4)
+    T_match_query : (4, 4) transform of the validation
     p : parameters of the validation
-    patches_p : limits of coinciding patches
+    patches_p : limits within which patches coincide
     """
     p = p or OverlapParameters()
     ours, theirs = (sample_points(frame.surface, p.stride) for frame in (query, match))
@@ -164,7 +163,7 @@ def trace(
 def _coincident_patches(
     query: Patches, match: Patches, T: Floats, p: ConsensusParameters
 ) -> tuple[Ints32, Floats]:
-    """Return patches that are each other's nearest with a similar normal, by distance."""
+    """Return pairs of mutually nearest patches with similar normals, and their distances."""
     if not len(query) or not len(match):
         return np.zeros((0, 2), np.int32), np.zeros(0)
     apart = np.linalg.norm(transform_points(T, query.means)[:, None] - match.means, axis=2)
@@ -181,10 +180,10 @@ def _coincident_patches(
 
 Colour = Literal["source", "normal", "residual"]
 
-#: Colours of the source's and of the target's points.
+#: Colours of the source's points and of the target's points.
 SOURCE, TARGET = (217, 119, 43), (43, 108, 176)
-#: Upper limits of residuals, and the colours of points within them, of points outside, and of
-#: violations.
+#: Upper limits of residuals; the colours of points within the limits, of points outside, and of
+#: violations follow.
 STEPS = (50, 100, TOLERANCE)
 STEP_COLOURS = np.array(
     [(38, 130, 60), (140, 190, 70), (240, 200, 60), (150, 155, 160), (200, 40, 40)], np.uint8
@@ -195,21 +194,21 @@ def overlay(
     source: Surface, target: Surface, T_target_source: Floats, colour: Colour = "source",
     p: OverlapParameters | None = None,
 ) -> tuple[Floats, Floats, Bytes]:  # fmt: skip
-    """Return both surfaces as one coloured cloud, the source's points first.
+    """Return both surfaces as one coloured cloud, which starts with the source's points.
 
     Parameters
     ----------
-    source, target : all valid pixels of both are shown
-    T_target_source : (4, 4)
+    source, target : surfaces, all of whose valid pixels are shown
+    T_target_source : (4, 4) transform that aligns the surfaces
     colour : "source" distinguishes the frames, "normal" shows normals (x, y, z in the target's
-        frame from -1 to 1 as red, green, blue from 0 to 255), "residual" the distances from the
-        other's surface (`STEPS`)
+        frame from -1 to 1 as red, green, blue from 0 to 255), "residual" shows the distances from
+        the other surface (`STEPS`)
     p : limits of agreement and of violations
 
     Returns
     -------
-    points, normals : (N, 3), in the target's frame
-    colours : (N, 3)
+    points, normals : (N, 3) in the target's frame
+    colours : (N, 3) uint8
     """
     T = T_target_source
     ours, theirs = sample_points(source, 1), sample_points(target, 1)
@@ -232,9 +231,9 @@ def overlay(
     return points, normals, STEP_COLOURS[steps]
 
 
-#: Least cosine between the normals of a point and of its patch.
+#: Minimum cosine between the normals of a point and of its patch.
 _COSINE = 0.5
-#: Greatest distance of a point from its patch's mean, in radii of a disc of the patch's area.
+#: Maximum distance of a point from its patch's mean, in radii of a disc with the patch's area.
 _RADII = 4.0
 
 
@@ -257,14 +256,14 @@ def _nearest(
 
 
 def patches_at(points: Floats32, patches: Patches) -> Ints32:
-    """Return the patch of each point, (N,): the nearest with a similar normal, or -1.
+    """Return the nearest patch with a similar normal for each point, (N,); -1 if there is none.
 
-    Artifacts do not store the labels of points; for patches of similar sizes this is nearly the
-    same.
+    Artifacts do not store the labels of points. For patches of similar sizes, the results nearly
+    equal the labels.
 
     Parameters
     ----------
-    points : (N, 6) float32 result of `sample_points`, points and normals
+    points : (N, 6) float32 result of `sample_points`
     patches : patches of the same surface
     """
     indices = np.full(len(points), -1, np.int32)

@@ -1,11 +1,11 @@
-"""Compare poses of a query on all frames of the map that would see its surfaces.
+"""Comparison of a query's poses on all frames of the map that would see its surfaces.
 
-    query, poses, MapViews  --compare_poses-->  ScoredPose, the best of each place first
+    query, poses, MapViews  --compare_poses-->  ScoredPose of each place, the best first
 
-Two frames can agree under a wrong transform: a cabinet looks alike from both sides. The frames
-around it distinguish the poses, because each predicts what the query would see. So a pose is scored
-on many views: a surface of the query may be visible in only some of them, and free space that most
-of them saw contradicts the pose.
+Two frames can agree under a wrong transform, since a cabinet can look the same from both sides. The
+frames around it distinguish the poses, because each pose predicts what the query observes.
+Therefore a pose is scored on many views: a surface of the query may be visible in only some of
+them, and free space in most of them contradicts the pose.
 """
 
 from __future__ import annotations
@@ -40,40 +40,40 @@ class MapParameters:
     """Parameters of verification in the map."""
 
     n_views: int = 10  #: maximum number of views that score a pose
-    look_ahead: float = 1.5  #: distance of a camera to the middle of its view, metres
-    reach: float = 3.5  #: greatest distance of the middles of views with common surfaces, metres
+    look_ahead: float = 1.5  #: distance from a camera to the centre of its view, metres
+    reach: float = 3.5  #: maximum distance of the centres of overlapping views, metres
     around_reach: float = 4.0  #: the same if a sensor may look in any direction, metres
-    same_surfaces: float = 8.0  #: greatest distance of two sensors with common surfaces, metres
+    same_surfaces: float = 8.0  #: maximum distance between sensors with common surfaces, metres
     near: float = 2.0  #: radius of the first search for frames of the map, metres
-    cell: float = 1.0  #: poses within this distance share a search, metres
-    start_shift: float = 0.5  #: greatest distance of a start from its prior, metres
-    least_agreeing: float = 0.03  #: least share of agreeing points of a view that counts
+    cell: float = 1.0  #: maximum distance between poses that share a search, metres
+    start_shift: float = 0.5  #: maximum distance between an initial pose and its prior, metres
+    least_agreeing: float = 0.03  #: minimum share of agreeing points of a view that counts
     violation_weight: float = 2.0  #: weight of the violations of either side in the score
     n_poses: int = 40  #: number of poses that are scored on the candidates
     n_places: int = 6  #: number of best places that are scored on all frames
-    hopeful: float = 0.2  #: least share of the best score of a place that is refined
-    n_refined: int = 3  #: number of places whose pose is refined
-    n_refining: int = 3  #: number of views for the refinement of a pose
-    n_noise: int = 4  #: number of map frames that measure noise by their own violations
+    hopeful: float = 0.2  #: minimum score of a refined place, as a share of the best score
+    n_refined: int = 3  #: number of places that are refined
+    n_refining: int = 3  #: number of views with which a pose is refined
+    n_noise: int = 4  #: number of map frames whose violations measure the noise
     least_noise: float = 0.02  #: violations of a pose above which noise is measured
-    same_m: float = 0.1  #: distance within which poses are equal, metres
-    same_rad: float = math.radians(6.0)  #: and radians
-    place_m: float = 0.25  #: distance within which poses are at one place, metres
-    place_rad: float = math.radians(15.0)  #: and radians
+    same_m: float = 0.1  #: maximum difference of equal poses, metres
+    same_rad: float = math.radians(6.0)  #: the same, radians
+    place_m: float = 0.25  #: maximum difference of poses at one place, metres
+    place_rad: float = math.radians(15.0)  #: the same, radians
     refinement: RefinementParameters = COARSE
     planes: PlaneParameters = field(default_factory=PlaneParameters)
 
 
 @dataclass(frozen=True, eq=False)
 class MapFrame:
-    """A frame with a pose, prepared for scoring other poses on it.
+    """A frame with a pose, on which poses of a query are scored.
 
     Parameters
     ----------
     geometry : geometry of the frame
-    target : its surface, prepared for look-ups
+    target : surface of the frame, prepared for look-ups
     T : (4, 4) T_parent_sensor; T_query_sensor for a frame of the query
-    weighing : limits of patches in one plane
+    weighing : limits within which patches lie in one plane
     """
 
     geometry: Geometry
@@ -83,7 +83,7 @@ class MapFrame:
 
     @cached_property
     def planes(self) -> PlaneView:
-        """Return its patches with their weights."""
+        """Return the patches of the frame with their weights."""
         return plane_view(self.geometry, self.weighing)
 
     @cached_property
@@ -100,13 +100,14 @@ class ScoredPose:
     ----------
     T : (4, 4) T_parent_query
     score : `share` reduced by violations; 1 if the map confirms the whole query
-    share : share of the query's surface that the map shows there, all planes weighing the same
+    share : share of the query's surface that the map shows at the pose, with equal weights for all
+        planes
     planes : mean number of distinct planes of a query frame that agree
     violations : violations as a share of agreements and violations, for the query's surface
     hidden : the same for the map's surfaces in the query's free space
-    noise : violations among the map's own frames at the pose; 0 if not measured
-    views : pairs of query frame and map frame that agree, most agreement first
-    starts : (4, 4) poses that were refined to this one, or to its place
+    noise : violations among the map's frames at the pose; 0 if unmeasured
+    views : pairs of query frame and map frame that agree, by descending agreement
+    starts : (4, 4) poses that were refined to this pose or to its place
     """
 
     T: Floats
@@ -120,27 +121,27 @@ class ScoredPose:
     starts: tuple[Floats, ...] = ()
 
     def is_of(self, T: Floats, p: MapParameters) -> bool:
-        """Return whether a pose (4, 4) is at this place, or at a place that was refined to it."""
+        """Return whether a pose (4, 4) is at this place or at a place that was refined to it."""
         return bool(at_place(np.stack([self.T, *self.starts]), T, p).any())
 
 
 class MapViews:
-    """The frames of one parent frame that may see the surfaces of a query, opened when needed."""
+    """The frames of one parent frame that may see the surfaces of a query; opened on demand."""
 
     def __init__(
         self, poses: Floats, open_geometry: Callable[[int], Geometry | None],
         p: MapParameters, overlap_p: OverlapParameters, candidates: Sequence[int] = (),
         ahead: Sequence[bool] | None = None, rendered: Sequence[bool] | None = None,
     ) -> None:  # fmt: skip
-        """Store frames by their poses.
+        """Store the poses of frames.
 
         Parameters
         ----------
         poses : (n, 4, 4) T_parent_sensor
-        open_geometry : opens the artifact of frame i; None if it is unreadable
-        candidates : indices of open frames for the first comparison; default: all frames
-        ahead : whether each sensor looks along z, as depth cameras do; default: all do
-        rendered : whether each frame is a view rendered from a surface; default: none is
+        open_geometry : function that returns the artifact of frame i; None if it is unreadable
+        candidates : indices of open frames for the first comparison; empty selects all frames
+        ahead : whether each sensor looks along z, as depth cameras do; None means that all do
+        rendered : whether each frame is a view rendered from a surface; None means that none is
         """
         self.poses, self._open, self._p, self._overlap = poses, open_geometry, p, overlap_p
         self.candidates = np.array(candidates, np.intp)
@@ -158,18 +159,18 @@ class MapViews:
         return self._frames[i]
 
     def mostly_rendered(self, frames: Sequence[int] | NDArray[np.intp]) -> bool:
-        """Return whether most of some frames, or of all, are views rendered from a surface."""
+        """Return whether most of the `frames`, or of all frames if empty, are rendered views."""
         among = self._rendered[list(frames)] if len(frames) else self._rendered
         return 2 * int(among.sum()) > len(among)
 
     def near(self, T: Floats, ahead: bool, among: NDArray[np.intp] | None = None) -> list[int]:
-        """Return the frames most likely to see the surfaces that a sensor at T sees, nearest first.
+        """Return the frames that most likely see the surfaces of a sensor at T, nearest first.
 
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
-        ahead : whether it looks along z; if both sensors do, directions count beside distance
-        among : indices of the frames to search; default: all
+        ahead : whether the sensor looks along z; if both sensors do, directions count too
+        among : indices of the frames to search; None searches all frames
         """
         p = self._p
         poses = self.poses if among is None else self.poses[among]
@@ -184,7 +185,7 @@ class MapViews:
 def map_frame(
     geometry: Geometry, T: Floats, p: MapParameters, overlap_p: OverlapParameters
 ) -> MapFrame:
-    """Return a frame prepared for comparison with others of its parent frame; T as in MapFrame."""
+    """Return a frame that is prepared for comparison with other frames; T is that of MapFrame."""
     target = overlap_target(geometry.surface, overlap_p)
     return MapFrame(geometry, target, T, p.planes)
 
@@ -192,7 +193,7 @@ def map_frame(
 def looks_ahead(geometry: Geometry) -> bool:
     """Return whether the sensor looks along z, as depth cameras do.
 
-    Clouds may have any axes, and many scanners see all around.
+    The axes of clouds are arbitrary, and many scanners see all around.
     """
     return isinstance(geometry.surface.camera, Intrinsics)
 
@@ -200,16 +201,16 @@ def looks_ahead(geometry: Geometry) -> bool:
 def view_separations(
     poses: Floats, look_ahead: NDArray[np.bool_], T: Floats, ahead: bool, p: MapParameters
 ) -> Floats:
-    """Return the separations of the views of sensors from that of a sensor at T, (n,).
+    """Return the separations (n,) between the views of sensors and the view of a sensor at T.
 
-    Views at 1 or more are too far apart to share surfaces.
+    Views with a separation of 1 or more are too distant to share surfaces.
 
     Parameters
     ----------
     poses : (n, 4, 4) T_parent_sensor
-    look_ahead : (n,) whether each looks along z
-    T, ahead : (4, 4) pose of the one sensor, and whether it looks along z; if both sensors do,
-        directions count beside distance
+    look_ahead : (n,) mask of the sensors that look along z
+    T, ahead : (4, 4) pose of the sensor, and whether it looks along z; if both sensors do,
+        directions count too
     """
     axes = poses[:, :3, 2]
     middles = poses[:, :3, 3] + np.where(look_ahead, p.look_ahead, 0.0)[:, None] * axes
@@ -228,11 +229,11 @@ def score_pose(
 
     Parameters
     ----------
-    frames : results of `map_frame` for the query: each with its T_query_sensor, the identity for
-        one
+    frames : results of `map_frame` for the query, with T_query_sensor (the identity for a single
+        frame)
     T : (4, 4) T_parent_query
     views : views of the same parent frame
-    among : indices of the frames that score it; default: all
+    among : indices of the frames on which the pose is scored; None selects all frames
     """
     limits = tolerances(overlap_p)
     total = agreeing = violating = seen = through = 0.0
@@ -272,7 +273,7 @@ def map_noise(
 ) -> float:
     """Return the median violations among the map's frames that agree with a pose.
 
-    Drifting poses and moved objects violate free space under right poses too.
+    Drift of poses and moved objects cause violations at correct poses too.
     """
     noises = []
     agreeing = np.unique([i for _, i in pose.views])
@@ -288,7 +289,7 @@ def map_noise(
 def refine_pose(
     frames: Sequence[MapFrame], pose: ScoredPose, views: MapViews, p: MapParameters
 ) -> Floats | None:
-    """Refine a pose on the views that share most with it, and average: (4, 4), or None."""
+    """Return the average (4, 4) of a pose's refinements on its best views; None if all fail."""
     refined = []
     for number, i in pose.views[: p.n_refining]:
         frame, view = frames[number], views[i]
@@ -302,13 +303,13 @@ def refine_pose(
 
 
 def prior_starts(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
-    """Return a pose and six around it, a deviation away along each axis, (7, 4, 4).
+    """Return a pose and six poses that are shifted by a standard deviation per axis, (7, 4, 4).
 
     Parameters
     ----------
     T : (4, 4) T_parent_sensor of the prior
-    covariance : (6, 6) of T, metres before radians
-    p : shifts are at most `p.start_shift`, because refinement bridges no more
+    covariance : (6, 6) covariance of T, metres before radians
+    p : parameters with the maximum shift, from which a refinement still converges
     """
     starts = np.tile(T, (7, 1, 1))
     deviations = np.minimum(np.sqrt(np.diag(covariance)[:3]), p.start_shift)
@@ -322,7 +323,7 @@ def refine_starts(
     frames: Sequence[MapFrame], starts: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Refine poses of a prior (n, 4, 4) on the map; return the successful, (m, 4, 4)."""
+    """Refine poses of a prior (n, 4, 4) on the map; return successful results, (m, 4, 4)."""
     refined = []
     for start in starts:
         T = refine_pose(frames, score_pose(frames, start, views, p, overlap_p), views, p)
@@ -337,15 +338,15 @@ def compare_poses(
 ) -> list[ScoredPose]:  # fmt: skip
     """Return the best pose of the query at each place, best first.
 
-    All poses are compared on the candidates first, and the best places on all frames that would see
-    them. The first few places are refined on the map before, because an error of a few centimetres
+    All poses are compared on the candidates, then the best places on all frames that would see
+    them. Before that, the best places are refined on the map, because an error of a few centimetres
     causes violations.
 
     Parameters
     ----------
-    frames : frames of the query, as in `score_pose`
-    poses : (n, 4, 4) T_parent_query, most plausible first; distinct ones beyond `n_poses` are
-        ignored
+    frames : frames of the query; see `score_pose`
+    poses : (n, 4, 4) T_parent_query, the most plausible first; at most `n_poses` distinct poses are
+        compared
     views : views of the same parent frame
     """
     first = -np.arange(len(poses), dtype=float)
@@ -365,10 +366,10 @@ def _refine_places(
     frames: Sequence[MapFrame], places: list[ScoredPose], views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> list[ScoredPose]:  # fmt: skip
-    """Refine places, best first, until `n_refined` different ones remain.
+    """Refine places, best first, until `n_refined` different places remain.
 
-    A pose that refines to a better one started in the same basin: it is no other place, and would
-    count as a rival of its result.
+    Poses that converge to one result were in the same basin of attraction. They are one place, and
+    must not count as rivals of that result.
     """
     hopeful = _select_hopeful(places, p)
     settled: list[ScoredPose] = []
@@ -391,7 +392,7 @@ def _refine_places(
 
 
 def _select_hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
-    """Return the places whose score may still approach that of the first, which is the best."""
+    """Return the places whose refined score may approach the score of the first (best) place."""
     return places[:1] + [pose for pose in places[1:] if pose.score >= p.hopeful * places[0].score]
 
 
@@ -415,6 +416,6 @@ def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
 
 
 def distinct_viewpoints(viewpoints: Floats, p: MapParameters) -> list[int]:
-    """Return the indices of the first of some views (n, 4, 4) from each viewpoint."""
+    """Return the index of the first view (n, 4, 4) from each viewpoint."""
     order = -np.arange(len(viewpoints), dtype=float)
     return select_distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))

@@ -1,17 +1,17 @@
-"""Align two frames by a rigid transform, and decide whether it is right (Sec. III-E).
+"""Alignment of two frames by a rigid transform, and the decision whether it is right (Sec. III-E).
 
     Geometry, Geometry, seed  --validate-->  PairValidation
     validations  --rank_accepted-->  C_vld
 
 The paper estimates the transform in both directions independently, and accepts it if they agree.
-That accepts too much, because both estimates may fall into the same wrong place. So the transform
-must also explain both frames: enough of both surfaces agrees, and next to nothing lies in free
-space of the other frame.
+This accepts too much, because both estimates may converge to the same wrong place. Therefore the
+transform must also explain both frames: enough of both surfaces must agree, and almost no points
+may lie in free space of the other frame.
 
-It also accepts too little, because one of two depth images that share a tenth of their surfaces may
-miss the transform that the other finds. Such a transform is refined in both directions, and little
-agreement is enough for a weak match if it includes several planes and nothing contradicts it. The
-result of the other search is then a rival like any other hypothesis.
+It also accepts too little: if two depth images share only a tenth of their surfaces, the search in
+one direction may miss the transform that the other direction finds. Such a transform is refined in
+both directions. Little agreement is enough for a weak match if several planes agree and nothing
+contradicts the transform. The result of the other direction is then one of the rivals.
 """
 
 from __future__ import annotations
@@ -81,20 +81,21 @@ Direction = Literal["query_to_match", "match_to_query"]
 THERE: Direction = "query_to_match"
 BACK: Direction = "match_to_query"
 _NONE = np.empty((0, 4, 4))
-#: Reason if a transform that `up` excludes may be right, because `up` may be wrong.
+#: Reason for the case that a transform excluded by `up` may be right, because `up` may be wrong.
 _MORE_TILTED = (
-    "a transform that tilts against `up` explains more: check the IMU and the axes of `up`"
+    "a transform that tilts against `up` explains the frames better. Check the IMU and the axes of "
+    "`up`"
 )
 
 
 @dataclass(frozen=True)
 class ValidationParameters:
-    """Parameters of every step."""
+    """Parameters of all steps of a validation."""
 
-    minimum_patches: int = 10  #: least number of patches of either frame
+    minimum_patches: int = 10  #: minimum number of patches of either frame
     n_hypotheses: int = 4  #: number of further hypotheses per direction, for verification in a map
-    guided_m: float = 0.15  #: greatest distance of a guided transform from its prediction, metres
-    guided_rad: float = math.radians(6.0)  #: and radians
+    guided_m: float = 0.15  #: maximum distance of a guided transform from its prediction, metres
+    guided_rad: float = math.radians(6.0)  #: the same, radians
     acceptance: AcceptanceParameters = field(default_factory=AcceptanceParameters)
     rivals: AmbiguityParameters = field(default_factory=AmbiguityParameters)
     alignment: AlignmentParameters = field(default_factory=AlignmentParameters)
@@ -108,41 +109,39 @@ class PairValidation:
 
     Parameters
     ----------
-    status : accepted, rejected, or ambiguous (a rival transform explains the frames as well, or a
-        direction is free)
-    strength : of an accepted match: strong, or weak if a rival is close, little agrees, or a frame
-        has no viewpoint; else None
-    reason : short sentence
-    T_match_query : (4, 4) query coordinates to the match's, x_match = T @ x_query: the best
-        transform whatever the status, halfway between the two directions or, if they disagree, the
-        one with more evidence; None without any hypothesis
-    residual_m, residual_rad : residual of the two directions composed, T_match_query T_query_match;
-        infinite without one. For an accepted match with `T_other`, or with one direction only, the
-        residual of its two refinements
+    status : accepted, rejected, or ambiguous if a rival transform explains the frames equally well
+        or a direction is unconstrained
+    strength : strong or, if a rival is close, little agrees, or a frame has no viewpoint, weak;
+        None unless the match is accepted
+    reason : short explanation of the status
+    T_match_query : (4, 4) best transform, whatever the status: halfway between the two directions
+        or, if they disagree, the direction with more evidence; None without any hypothesis
+    residual_m, residual_rad : residual of T_match_query T_query_match, the composition of both
+        directions; infinite if one is missing. For an accepted match with `T_other`, or with one
+        direction only, the residual of its two refinements
     overlap : share of both frames' points that agree under the transform, 0 to 1
-    plane_overlap : the same with all planes weighing the same, 0 to 1: low if only a floor or a
-        wall agrees
-    violations : free-space violations as a share of violations and their inliers, 0 to 1; None if
-        neither frame has a viewpoint
+    plane_overlap : overlap with equal weights for all planes, 0 to 1; low if only a floor or a wall
+        agrees
+    violations : free-space violations as a share of violations and inliers, 0 to 1; None if neither
+        frame has a viewpoint
     inliers : number of points of both frames that agree under the transform
-    ambiguity : share of both frames that agrees under the best rival that free space does not
-        refute, all planes weighing the same, 0 to 1; 0 if other evidence already decides against
-        the transform
-    T_rival : (4, 4) that rival, or None
+    ambiguity : agreeing share of both frames, with equal weights for all planes, under the best
+        rival that free space does not refute, 0 to 1; 0 if the transform is rejected anyway
+    T_rival : (4, 4) best rival, or None
     seed : seed of the random choices
-    covariance : (6, 6) of T_match_query if it is accepted, else None; see `icp.py`
+    covariance : (6, 6) covariance of an accepted T_match_query, else None; see `icp.py`
     around : whether both frames see all around their sensors, as spinning scanners do
-    planes : number of distinct planes that agree, the mean of both frames
-    plane_violations : `violations` with all planes weighing the same
+    planes : number of distinct planes that agree, averaged over both frames
+    plane_violations : `violations` with equal weights for all planes
     search : source of the transform: correspondences, plans of two scans, or the map's poses
-    directions : the directions of the search that found the transform
-    T_other : (4, 4) result of the other direction if the two disagree; else None
-    hypotheses : (n, 4, 4) T_match_query of the best that either direction refined, and of
+    directions : directions of the search that found the transform
+    T_other : (4, 4) result of the other direction if the directions disagree; else None
+    hypotheses : (n, 4, 4) T_match_query of the best refined hypotheses of both directions and of
         `T_rival`, for verification in a map
-    ups : (3,) up in the query's and in the match's coordinates, or None
-    tilt_rad : tilt of the transform against them; None if either is unknown
-    contradicts_up : whether the surfaces alone would be accepted, but the transform tilts too much
-    predicted : (4, 4) T_match_query predicted by the map's poses, if it is guided; else None
+    ups : (3,) up in the query's and in the match's coordinates; None if unknown
+    tilt_rad : tilt of the transform against `ups`; None if one of them is unknown
+    contradicts_up : whether the transform would be accepted by the surfaces, but tilts too much
+    predicted : (4, 4) T_match_query that the map's poses predict for a guided match; else None
     """
 
     status: Status
@@ -173,7 +172,9 @@ class PairValidation:
 
     @property
     def guided(self) -> bool:
-        """Return whether other matches predicted the transform: then it is no independent vote."""
+        """Return whether other matches predicted the transform, so that its vote is not
+        independent.
+        """
         return self.predicted is not None
 
 
@@ -188,14 +189,14 @@ def middle(a: Floats, b: Floats) -> Floats:
 def refine_transform(
     query: Geometry, match: Geometry, T_match_query: Floats, p: RefinementParameters | None = None
 ) -> Floats | None:
-    """Refine a transform in both directions, and return the middle of the two.
+    """Refine a transform in both directions, and return the transform halfway between the results.
 
-    If the initial transform is the truth, the change measures the errors of sensors and reference
+    If the initial transform is a reference, the change measures the errors of sensors and reference
     poses.
 
     Returns
     -------
-    (4, 4) T_match_query, or None if the frames do not overlap there
+    (4, 4) T_match_query; None if the frames do not overlap under the initial transform
     """
     p = p or FINE
     a, b = query.surface, match.surface
@@ -219,31 +220,33 @@ def validate(
     ups: Ups = NO_UPS,
     other_axes: bool = False,
 ) -> PairValidation:
-    """Align a query with a candidate both ways, and decide: Sec. III-E.
+    """Align a query with a candidate in both directions, and decide on acceptance: Sec. III-E.
 
     Parameters
     ----------
     query, match : geometry artifacts of one model
-    seed : seed of the random choices, 0 or more; equal seeds give equal results
-    mode : "full", or "paper": accept by the residual of the two directions alone
+    seed : non-negative seed of the random choices; equal seeds give equal results
+    mode : "full", or "paper", which accepts by the residual of the two directions only
     matching : method of matching
-    ups : (3,) unit vectors, up in the query's and in the match's coordinates, if known: with both,
-        transforms that tilt are impossible; for scans, one alone helps too
-    other_axes : whether scanners without `ups` may not have stood upright
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates, or None. If both are
+        known, transforms that tilt are excluded; for scans, one of them helps too
+    other_axes : whether to consider scanners that did not stand upright, if `ups` are unknown
 
     Raises
     ------
-    ValueError : the descriptors have different lengths, the mode or matching is unknown, or the
+    ValueError : If the descriptors have different lengths, the mode or matching is unknown, or the
         seed is negative
     """
     if mode not in ("full", "paper"):
-        raise ValueError(f"mode {mode!r} is neither 'full' nor 'paper'")
+        raise ValueError(f"The mode {mode!r} does not exist. Pass 'full' or 'paper'.")
     if matching not in ("histograms", "sequence"):
-        raise ValueError(f"matching {matching!r} is neither 'histograms' nor 'sequence'")
+        raise ValueError(
+            f"The matching {matching!r} does not exist. Pass 'histograms' or 'sequence'."
+        )
     p = p or ValidationParameters()
     fewest = min(len(query.patches), len(match.patches))
     if fewest < p.minimum_patches:
-        reason = f"a frame has {fewest} patches; validation needs {p.minimum_patches}"
+        reason = f"a frame has {fewest} patches, but validation requires {p.minimum_patches}"
         return _reject(reason, seed, query, match, ups)
     a, b = _samples(query, match, ups, p)
     numbers = p.alignment, p.agreement, matching
@@ -259,7 +262,7 @@ def validate(
             lambda: align(b, a, np.random.default_rng((seed, 1)), *numbers),
         )
     if there is None and back is None:
-        reason = "no correspondences agree on a transform that the surfaces confirm"
+        reason = "the correspondences yield no transform that the surfaces confirm"
         if tilt_of(np.eye(4), ups) is not None:
             reason += " without tilting against `up`"
         return _reject(reason, seed, query, match, ups)
@@ -285,18 +288,18 @@ def validate_guided(
 ) -> PairValidation | None:
     """Check a transform that other matches and the map's poses predict: Sec. III-E without search.
 
-    Both directions are refined from it and must meet, near it, with the evidence that `validate`
-    requires. Neither hypotheses nor rivals are searched, so an accepted transform makes a pose more
-    precise, but is no evidence for it.
+    The prediction is refined in both directions. The results must agree, be near the prediction,
+    and have the evidence that `validate` requires. The function searches for neither hypotheses nor
+    rivals, so an accepted transform improves the precision of a pose, but is not evidence for it.
 
     Parameters
     ----------
     query, match, seed, p, ups : arguments of `validate`
-    T_match_query : (4, 4) prediction
+    T_match_query : (4, 4) predicted transform
 
     Returns
     -------
-    validation : accepted; or None if the pair needs a search
+    validation : an accepted match; None if the pair requires a search
     """
     p = p or ValidationParameters()
     if min(len(query.patches), len(match.patches)) < p.minimum_patches:
@@ -314,7 +317,7 @@ def validate_guided(
     metres, radians = pose_difference(validation.T_match_query, T_match_query)
     if metres > p.guided_m or radians > p.guided_rad:
         return None
-    reason = "surfaces agree where other matches place the query"
+    reason = "the surfaces agree at the pose that other matches predict"
     return replace(validation, reason=reason, predicted=T_match_query)
 
 
@@ -325,19 +328,19 @@ def validate_without_up(
     p: ValidationParameters | None,
     ups: Ups,
 ) -> PairValidation | None:
-    """Validate by the surfaces alone, to check `up` if a query found nothing with it.
+    """Validate by the surfaces only, to check `up` if a query found no match with it.
 
-    An accepted transform that does not tilt counts as usual. A strong one that tilts indicates a
-    wrong `up` or a similar place: it is rejected, with that reason.
+    An accepted transform that does not tilt is a match. A strong transform that tilts indicates a
+    wrong `up` or a similar place; it is rejected, and the reason says so.
 
     Parameters
     ----------
     query, match, seed, p : arguments of `validate`
-    ups : known up vectors
+    ups : up vectors, both of which are known
 
     Returns
     -------
-    validation : or None if it adds no information
+    validation : the result; None if it adds no information
     """
     p = p or ValidationParameters()
     validation = validate(query, match, seed, p)
@@ -376,8 +379,8 @@ class _Proposal:
     Parameters
     ----------
     T : (4, 4) T_match_query
-    directions : directions of the search that found it
-    refined_by : the alignments whose middle it is, or its only one
+    directions : directions of the search that found T
+    refined_by : one alignment, or the two alignments halfway between which T lies
     evidence, inliers : see Evidence and PairValidation
     """
 
@@ -388,9 +391,9 @@ class _Proposal:
     inliers: int
 
     def covariance(self, p: ValidationParameters) -> Floats | None:
-        """Return the covariance (6, 6) of T, or None if it was not refined both ways.
+        """Return the covariance (6, 6) of T; None if it was not refined in both directions.
 
-        If the two refinements differ, their difference is part of the error.
+        The difference between the two refinements is part of the error.
         """
         refined = [alignment.refined for alignment in self.refined_by]
         if len(refined) < 2 or refined[0] is None or refined[1] is None:
@@ -409,7 +412,7 @@ class _Proposal:
 
 
 class _Verdict(NamedTuple):
-    """Status, strength and reason of a validation, and the best rival."""
+    """The status, strength and reason of a validation, and the best rival."""
 
     status: Status
     strength: Strength | None
@@ -450,7 +453,7 @@ def _verdict(
     query: FrameSamples, match: FrameSamples, one: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters, mode: Mode,
 ) -> _Verdict:  # fmt: skip
-    """Judge a transform by the agreement of both directions, the evidence and its rivals."""
+    """Return the verdict on a transform, by the directions' agreement, the evidence and rivals."""
     e = one.evidence
     against = objection(e, p.acceptance, mode) or _tilt_objection(
         tilt_of(one.T, (query.up, match.up)), p
@@ -473,7 +476,7 @@ def _rival(
     query: FrameSamples, match: FrameSamples, one: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters,
 ) -> Rival:  # fmt: skip
-    """Return the best rival of a transform, among all that either direction refined."""
+    """Return the best rival of a transform among the refined hypotheses of both directions."""
     voted = [_NONE]
     if there is not None:
         voted += [there.T[None], there.others]
@@ -490,14 +493,14 @@ def _sparse(
     query: FrameSamples, match: FrameSamples, one: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters,
 ) -> tuple[_Proposal, _Verdict] | None:  # fmt: skip
-    """Accept a transform of depth images as weak, if all of its little evidence supports it.
+    """Accept a transform of depth images as weak if its evidence is sparse but consistent.
 
-    A transform that only one search found is refined in both directions first; the result of the
+    A transform that only one search found is first refined in both directions; the result of the
     other search is then a rival.
 
     Returns
     -------
-    the transform and its verdict, or None if the rejection stands
+    the transform and its verdict; None if the rejection remains
     """
     if one.refined_by[0].search != "correspondences" or are_scans(query.geometry, match.geometry):
         return None
@@ -519,14 +522,14 @@ def _sparse(
         return None
     reason = f"{e.overlap:.0%} of the surfaces agree, in {e.planes:.0f} planes"
     if alone:
-        reason += ", but one direction alone found it"
+        reason += ", but only one direction found it"
     return one, _Verdict("accepted", "weak", reason, rival)
 
 
 def _refine_proposal(
     query: FrameSamples, match: FrameSamples, one: _Proposal, p: ValidationParameters
 ) -> _Proposal | None:
-    """Refine the transform of one search in both directions, if it explains enough."""
+    """Refine the transform of one search in both directions; return None if it explains little."""
     e = one.evidence
     half = p.acceptance.sparse_plane_overlap / 2
     if e.plane_overlap - e.plane_violations < half or e.plane_violations > 2 * half:
@@ -546,7 +549,7 @@ def _hypotheses(
     there: Alignment | None, back: Alignment | None, estimates: Sequence[Floats],
     T_rival: Floats | None, each: int,
 ) -> Floats:  # fmt: skip
-    """Return the estimates, the rival, and the next best of each direction, (n, 4, 4)."""
+    """Return the estimates, the rival, and the `each` next hypotheses per direction, (n, 4, 4)."""
     hypotheses = [*estimates] if T_rival is None else [*estimates, T_rival]
     if there is not None:
         hypotheses += [*there.others[:each]]
@@ -556,7 +559,7 @@ def _hypotheses(
 
 
 def _tilt_objection(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] | None:
-    """Reject a transform that the last refinement tilted more than the search allows."""
+    """Return a rejection if the last refinement tilted a transform more than the search allows."""
     if tilt is None or tilt <= p.alignment.gravity.refined_tilt:
         return None
     return "rejected", f"it tilts by {math.degrees(tilt):.0f} deg against `up`"
@@ -567,7 +570,7 @@ def _estimates(
 ) -> tuple[tuple[float, float], dict[tuple[Direction, ...], Floats]]:
     """Return the residual of the two directions, and T_match_query by the directions that found it.
 
-    If the directions agree, the transform is halfway between them; else each keeps its own.
+    If the directions agree, there is one transform halfway between them, otherwise one for each.
     """
     if there is not None and back is not None:
         composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
@@ -593,7 +596,7 @@ def _evidence(
     query: FrameSamples, match: FrameSamples, found_by: Sequence[Alignment], T: Floats,
     residual: tuple[float, float], by_planes: PlaneAgreement, k: int, p: ValidationParameters,
 ) -> tuple[Evidence, int]:  # fmt: skip
-    """Return the evidence for transform `k` of `by_planes`, and the number of points that agree."""
+    """Return the evidence for transform `k` of `by_planes`, and the number of agreeing points."""
     there = overlap_counts(query.points, match.geometry.surface, T, p.agreement)
     back = overlap_counts(match.points, query.geometry.surface, inverse(T), p.agreement)
     inliers = there.inliers + back.inliers
@@ -615,17 +618,17 @@ def _evidence(
     return e, inliers
 
 
-#: Error of a depth camera's transform per radian between the two views, metres: distortion and
-#: drift of reference poses, which the covariance of a refinement does not contain.
+#: Error of a depth camera's transform per radian between the two views, metres. It is caused by
+#: distortion and drift of reference poses, which the covariance of a refinement does not contain.
 _ERROR_PER_RADIAN = 0.04
 
 
 def rank_accepted(validations: Sequence[PairValidation]) -> list[int]:
-    """Return the indices of accepted validations: strong before weak, each most precise first.
+    """Return the indices of accepted validations, strong before weak, by descending precision.
 
-    The paper keeps the order of R. A weak match has a rival that explains the frames nearly as
-    well, so strong matches precede it. Cameras are ranked by expected error, frames that see all
-    around by the distance of their sensors.
+    The paper preserves the order of R. A weak match has a rival that explains the frames nearly as
+    well, so strong matches precede it. Cameras are ranked by expected error, and frames that see
+    all around by the distance between their sensors.
 
     Parameters
     ----------
@@ -648,8 +651,8 @@ def rank_accepted(validations: Sequence[PairValidation]) -> list[int]:
 def expected_error(validation: PairValidation) -> float:
     """Return the expected error of a transform between cameras, metres; infinite if unknown.
 
-    The deviation of the translation and an error that grows with the angle between the views are
-    added in quadrature.
+    It is the quadrature sum of the translation's standard deviation and an error that grows with
+    the angle between the views.
     """
     T, covariance = validation.T_match_query, validation.covariance
     if T is None or covariance is None:

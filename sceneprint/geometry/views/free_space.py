@@ -1,10 +1,11 @@
-"""Find the floors of a surface, and places for a sensor above them.
+"""The floors of a surface, and places for a sensor above them.
 
     surfels  --find_floors-->  Floors
     Floors, parameters  --candidate_places-->  places (C, 3)
 
-All coordinates are in level axes, z upwards. A floor is the lowest surface that is level over a few
-metres, and every such surface a storey above. `lookout.py` checks whether a place is free.
+All coordinates are in level axes with z upwards. Floors are the lowest surface that is level over a
+few metres, and further such surfaces at least a storey above. `lookout.py` checks whether a place
+is free.
 """
 
 from __future__ import annotations
@@ -19,20 +20,21 @@ from sceneprint.geometry.views.parameters import ViewParameters
 from sceneprint.geometry.views.samples import Surfels
 from sceneprint.types import Floats, Ints64
 
-#: Least cosine between up and the normal of a level surface.
+#: Minimum cosine between up and the normal of a level surface.
 _LEVEL = 0.9
-#: Greatest difference in height within a floor, metres.
+#: Maximum difference in height within a floor, metres.
 _STEP = 0.15
-#: Least height of a storey, metres.
+#: Minimum height of a storey, metres.
 _STOREY = 2.0
-#: Least share of the cells around a column that a floor fills: the lowest, and those above.
+#: Minimum share of the cells around a column that the lowest floor fills, and that higher floors
+#: fill.
 _LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
-#: Greatest share of a camera's surface below its floor: more make it a table in a room whose floor
-#: was not seen. Outdoors there may be more below the ground.
+#: Maximum share of a camera's surface below its floor. If there is more, the level surface is a
+#: table in a room whose floor was not observed. Outdoors, more surface may lie below the ground.
 _MOST_BELOW = 0.07
-#: Maximum numbers of places in a grid, and of bins (columns times heights).
+#: Maximum number of places in a grid, and of bins (columns times heights).
 _MOST_COLUMNS, _MOST_BINS = 1_000_000, 8_000_000
-#: Maximum number of heights of places without a floor, and of storeys.
+#: Maximum number of storeys, and of heights of places without a floor.
 _MOST_HEIGHTS = 50
 _MOST_STOREYS = 12
 
@@ -45,7 +47,7 @@ class Floors:
     ----------
     low : (2,) corner of the grid, metres
     side : width of a column, metres
-    heights : (S, nx, ny) metres, by storey; NaN if there is none
+    heights : (S, nx, ny) heights by storey, metres; NaN without a floor
     level : (L, 3) points of level surfaces
     """
 
@@ -62,7 +64,7 @@ class Floors:
 
 
 def robust_extent(pieces: Surfels) -> tuple[Floats, Floats]:
-    """Return the low and the high corner of a surface, without stray points far from it."""
+    """Return the lower and the upper corner of a surface, without distant stray points."""
     n = len(pieces.points)
     stray = max(n // 2000, min(n // 100, 4))
     ordered = np.sort(pieces.points.astype(np.float64), axis=0)
@@ -70,15 +72,15 @@ def robust_extent(pieces: Surfels) -> tuple[Floats, Floats]:
 
 
 def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Floors:
-    """Find the floors of a surface.
+    """Return the floors of a surface.
 
     Parameters
     ----------
     pieces : surfels in level axes
-    side : width of a column, metres; it grows if there are too many
+    side : width of a column, metres; it grows if there are too many columns
     has_tables : whether level surfaces may be furniture, as in a depth camera's surface
     """
-    # either side, because a mesh may be inside out, and no place above a ceiling is free
+    # both sides count, because a mesh may be inside out, and no place above a ceiling is free
     level = pieces.points[np.abs(pieces.normals[:, 2]) > _LEVEL].astype(np.float64)
     low, high = robust_extent(pieces)
     level = level[((level >= low) & (level <= high)).all(axis=1)]
@@ -102,7 +104,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
         exists = is_floor.any(axis=2)
         if not exists.any():
             break
-        # the fullest of the first few bins, because a floor's noise may fill several
+        # the noise of a floor may fill several bins, of which the fullest is selected
         first = is_floor.argmax(axis=2)
         near = np.abs(np.arange(shape[2]) - first[..., None]) <= 1
         at = np.where(near, counts, -1.0).argmax(axis=2)[..., None]
@@ -122,7 +124,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
 
 
 def _sum_neighbours(values: Floats) -> Floats:
-    """Return the sums over the 3 x 3 columns around each, and the bins above and below."""
+    """Return the sums over 3 x 3 columns and over the bins above and below, for each bin."""
     for axis in range(3):
         padded = np.pad(values, [(1, 1) if a == axis else (0, 0) for a in range(3)])
         before, own, after = (padded.take(range(k, k + values.shape[axis]), axis) for k in range(3))
@@ -133,8 +135,9 @@ def _sum_neighbours(values: Floats) -> Floats:
 def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing: float) -> Floats:
     """Return places at the heights of the sensor above the floors, (C, 3) in level axes.
 
-    The front of a mesh shows free space, so places beside an unobserved floor count too; in a
-    cloud, a place needs a floor below it. Without any floor, places are spread over all heights.
+    In a cloud, a place requires a floor below it. In a mesh, places beside an observed floor are
+    included too, since the front of a mesh shows free space. If there is no floor, places are
+    distributed over all heights.
 
     Parameters
     ----------
@@ -189,4 +192,4 @@ def _has_floor(level: Floats, places: Floats, heights: Floats, reach: float) -> 
             for dz in (-1, 0, 1):
                 near |= np.isin(key(at + np.array([dx, dy, dz])), occupied)
             around += near
-    return around >= 6  # most of the nine: on a floor, not beside it
+    return around >= 6  # fewer of the nine cells would include places beside a floor

@@ -1,9 +1,10 @@
-"""Compute the parts of a surface that are visible from places.
+"""Visibility of a surface from places.
 
     Surfels, place  --Lookout.look-->  Sight
 
-Pieces of the surface are drawn on the faces of a cube around the place, a few degrees a pixel. An
-element is a piece of surface seen from one side at one distance: (piece, azimuth, octave).
+Pieces of the surface are drawn on the faces of a cube around the place, with pixels of a few
+degrees. An element is a piece of surface as seen from one side at one distance: (piece, azimuth,
+octave).
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from sceneprint.geometry.views.render import cube_faces, rays_of
 from sceneprint.geometry.views.samples import Surfels, sort_into_blocks
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 
-#: Pixels along an edge of the cube: three degrees each.
+#: Number of pixels along an edge of the cube, of three degrees each.
 _FACE_PX = 28
-#: Greatest elevation of directions beside a place, rad.
+#: Maximum elevation of horizontal directions from a place, rad.
 _BESIDE = math.radians(30.0)
-#: Number of azimuths from which a piece is seen, and of octaves of distance.
+#: Number of azimuths from which a piece can be seen, and of octaves of distance.
 SIDES, OCTAVES = 6, 3
-#: Bit of a mask: the piece is seen from behind its normal.
+#: Bit of a mask for a piece that is seen from behind, against its normal.
 BEHIND = np.uint32(1 << 31)
 #: Tolerance of the depth buffer: share of the distance, plus a number of cells.
 _SAME_SHARE, _SAME_CELLS = 0.03, 1.5
@@ -34,16 +35,16 @@ _SAME_SHARE, _SAME_CELLS = 0.03, 1.5
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """The visible parts of a surface from a place.
+    """The parts of a surface that are visible from a place.
 
     Parameters
     ----------
     elements : (E,) int32 visible elements
-    masks : (E,) uint32: bit d is set if view d shows the element; BEHIND
+    masks : (E,) uint32; bit d is set if view d shows the element, and BEHIND if seen from behind
     hit : (D,) share of each view with a surface within range
-    beside : share of the directions from the horizon to 30 degrees above with a surface
-    back : (D,) share of the surface that is seen from behind
-    close : (D,) share of the surface that is nearer than a view should be
+    beside : share of the directions from the horizon to 30 degrees above it with a surface
+    back : (D,) share of the surface in each view that is seen from behind
+    close : (D,) share of the surface in each view that is too near
     nearest : distance of the nearest piece, metres
     """
 
@@ -62,7 +63,9 @@ def _see(
     size: int, depth: Floats32, reach: float, gap: float, views: Floats, limits: Floats,
     elements: Ints32, masks: NDArray[np.uint32],
 ) -> int:  # fmt: skip
-    """Write the elements visible through a face of the cube, and their views; return the count."""
+    """Write the elements that are visible on a face of the cube, and their views; return their
+    number.
+    """
     found = 0
     half = size / 2.0
     for block in range(len(starts)):
@@ -82,7 +85,7 @@ def _see(
             for d in range(len(views)):
                 own = views[d]
                 deep = own[0, 2] * x + own[1, 2] * y + own[2, 2] * z
-                if limits[0] > 0.0:  # all around
+                if limits[0] > 0.0:  # the sensor sees all around
                     if abs(z) <= limits[0] * distance:
                         mask |= np.uint32(1) << np.uint32(d)
                     continue
@@ -110,7 +113,7 @@ def _assess(
     depth: Floats32, item: Ints32, normals: Floats32, rays: Floats, lengths: Floats,
     inside: NDArray[np.bool_], forward: Floats, farthest: float, close: float, sums: Floats,
 ) -> None:  # fmt: skip
-    """Sum for each view the solid angles of all rays, hits, hits from behind, and near hits."""
+    """Sum the solid angles of all rays, hits, hits from behind, and near hits for each view."""
     for n in range(len(depth)):
         distance, weight, i = depth[n] * lengths[n], lengths[n] ** -3.0, item[n]
         behind = False
@@ -127,17 +130,17 @@ def _assess(
 
 
 class Lookout:
-    """Pieces of a surface prepared for looking from places.
+    """The pieces of a surface, whose visibility from places can be computed.
 
     Parameters
     ----------
     pieces : surfels in level axes
-    reach : greatest distance of a visible piece, metres
+    reach : maximum distance of a visible piece, metres
     farthest : range of the sensor, metres
-    close : depth below which a surface is close, metres
+    close : depth below which a surface is too near, metres
     views : (D, 3, 3) R_level_view, at most 24
-    camera : camera of the views; None: each view is all around
-    elevation : greatest elevation of such a view above and below the horizon, rad
+    camera : camera of the views; None for a sensor that sees all around
+    elevation : maximum elevation of such a sensor above and below the horizon, rad
     """
 
     def __init__(
@@ -153,13 +156,11 @@ class Lookout:
         self._face, self._turns = cube_faces(_FACE_PX)
         self._pinhole = pinhole(self._face)
         self._views = views
-        # directions of the cube's pixels
         rays = np.concatenate([rays_of(self._face).reshape(-1, 3) @ R.T for R in self._turns])
         lengths = np.linalg.norm(rays, axis=1)
         self._rays = rays / lengths[:, None]
         self._lengths = lengths
         self._limits = np.array([math.sin(elevation), 0.0, 0.0, 0.0, 0.0])
-        # pixels inside each view, and pixels beside the place
         self._inside = np.abs(self._rays[None, :, 2]) <= math.sin(elevation)
         self._inside = self._inside.repeat(len(views) + 1, axis=0)
         self._inside[-1] = (self._rays[:, 2] > 0) & (self._rays[:, 2] < math.sin(_BESIDE))
@@ -183,7 +184,7 @@ class Lookout:
         return len(self.points) * SIDES * OCTAVES
 
     def look(self, place: Floats) -> Sight:
-        """Return the sight from a place (3,)."""
+        """Return the visible parts from a place (3,)."""
         size, gap = _FACE_PX, _SAME_CELLS * self._cell
         depths = np.full((6, size, size), np.inf, np.float32)
         items = np.full((6, size, size), -1, np.int32)

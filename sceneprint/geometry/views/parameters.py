@@ -1,6 +1,6 @@
-"""Derive the parameters of views from a model and a robot's sensor.
+"""Parameters of views, derived from a model and a robot's sensor.
 
-Lengths are shares of the sensor's range, except heights above the floor, which are the robot's.
+Lengths are shares of the sensor's range, except heights above the floor, which depend on the robot.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
 from sceneprint.types import Intrinsics
 
-#: Greatest range of a depth camera's model, metres: models of scans see farther.
+#: Maximum range of a depth camera's model, metres. Models for scanners have a longer range.
 _FARTHEST_CAMERA = 20.0
-#: Default camera: a Kinect at half its resolution.
+#: Default camera, a Kinect at half its resolution.
 DEFAULT_CAMERA = Intrinsics(width=320, height=240, fx=292.5, fy=292.5, cx=159.5, cy=119.5)
 #: Default heights of the sensor above the floor, metres: cameras on a small robot, on a large robot
-#: and in a hand; a scanner on a robot.
+#: and in a hand, then a scanner on a robot.
 CAMERA_HEIGHTS: tuple[float, ...] = (0.4, 1.0, 1.6)
 SCANNER_HEIGHTS: tuple[float, ...] = (1.0,)
-#: Greatest elevation of a scanner above and below its horizon, rad.
+#: Maximum elevation of a scanner above and below its horizon, rad.
 _ELEVATION = math.pi / 4.0
 
 
 class SensorModel(Protocol):
-    """The parameters of a model that describe its sensor."""
+    """The part of a model's parameters that describes its sensor."""
 
     @property
     def depth(self) -> DepthParameters:
-        """Return the range of a depth camera."""
+        """Return the parameters that contain the range of a depth camera."""
 
     @property
     def cloud(self) -> CloudParameters:
-        """Return the range and resolution of a scanner."""
+        """Return the parameters that contain the range and resolution of a scanner."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,15 @@ class ViewParameters:
 
     Parameters
     ----------
-    camera : a pinhole camera without distortion; None: a scanner that sees all around
+    camera : pinhole camera without distortion; None for a scanner that sees all around
     step : angle between a scanner's points, rad
-    elevation : greatest elevation of a scanner above and below its horizon, rad
+    elevation : maximum elevation of a scanner above and below its horizon, rad
     nearest, farthest : range of the sensor
     heights : ascending heights of the sensor above the floor
     spacing : distance between candidate viewpoints
-    clearance : least distance from a viewpoint to a surface
+    clearance : minimum distance from a viewpoint to a surface
     grain : distance within which points of a cloud are merged
-    cell : size of the pieces of surface to cover
+    cell : size of the pieces of surface that views must cover
     most_views : maximum number of views
     """
 
@@ -77,19 +77,19 @@ def view_parameters(
 
     Parameters
     ----------
-    model : parameters of the model; a range above 20 m means scans
-    camera : camera of the robot, without its lens distortion; None: a scanner for a model of scans,
-        else a default camera
-    heights : heights of the sensor above the floor, metres; None: defaults of the sensor
+    model : parameters of the model; a range above 20 m means a scanner
+    camera : camera of the robot, without lens distortion; None selects a scanner for a scanner's
+        model, else a default camera
+    heights : heights of the sensor above the floor, metres; None selects defaults of the sensor
 
     Raises
     ------
-    InvalidRequest : there is no height, or one is not above 0
+    InvalidRequest : If there are no heights or one is not above 0
     """
     if heights is not None and not (heights and all(0 < h < math.inf for h in heights)):
         raise InvalidRequest(
-            f"The heights of the sensor above the floor are {list(heights)}. Specify one or more, "
-            "each above 0 metres."
+            f"The heights of the sensor above the floor are {list(heights)}. Specify at least one "
+            "height; all must be above 0 m."
         )
     if camera is None and model.cloud.maximum_range > _FARTHEST_CAMERA:
         nearest, farthest = model.cloud.minimum_range, model.cloud.maximum_range

@@ -1,11 +1,10 @@
-"""Select the poses of views that cover a surface.
+"""The selection of poses whose views cover a surface.
 
     surface, parameters  --choose_views-->  ViewPlan
 
-Views from places above the floors are candidates, unless the place is not free or the view shows
-next to nothing. Repeatedly the view that shows most of the insufficiently covered surface is
-selected. Coverage is counted by piece of surface, side and distance, so a covered piece was seen as
-any robot may see it.
+Candidates are views from free places above the floors, if they show enough surface. A greedy loop
+selects the view that shows most of the insufficiently covered surface. Coverage is counted by piece
+of surface, side and distance, because robots may see a piece from any side and distance.
 """
 
 from __future__ import annotations
@@ -25,32 +24,32 @@ from sceneprint.geometry.views.parameters import ViewParameters
 from sceneprint.geometry.views.samples import Surfels, surfels
 from sceneprint.types import Floats, ReferenceSurface
 
-#: Maximum numbers of pieces of surface, and of places.
+#: Maximum number of pieces of surface, and of places.
 _MOST_PIECES, _MOST_PLACES = 60_000, 3_000
-#: Greatest distance of a covered piece, share of the range.
+#: Maximum distance of a covered piece, as a share of the range.
 _REACH = 0.5
-#: Least share of a view with a surface: of a camera, of a scanner, and of directions beside a
-#: scanner.
+#: Minimum share of a view that shows a surface, for a camera, for a scanner, and for the horizontal
+#: directions of a scanner.
 _LEAST_HIT, _LEAST_AROUND, _LEAST_BESIDE = 0.45, 0.25, 0.25
-#: Least median depth of a camera's view, share of the range.
+#: Minimum median depth of a camera's view, as a share of the range.
 _LEAST_DEPTH = 1.0 / 11.0
-#: Least share of directions with a surface from a place that votes on the front of a mesh.
+#: Minimum share of directions with a surface, for places that vote on the front of a mesh.
 _INDOORS = 0.6
-#: Greatest share of the surface that is seen from behind: in a camera's view of a mesh; in a
-#: scanner's, which sees both sides of partitions; and in a cloud, whose sides are estimated.
+#: Maximum share of surface that is seen from behind in a camera's view of a mesh, in a scanner's
+#: view, which shows both sides of partitions, and in a cloud, whose sides are estimated.
 _MOST_BACK, _MOST_BACK_AROUND, _MOST_BACK_GUESSED = 0.1, 0.5, 0.3
-#: Greatest cosine between up and the normal of a wall.
+#: Maximum cosine between up and the normal of a wall.
 _WALL = 0.7
-#: Greatest share of votes for the back of a cloud's one-sided piece.
+#: Maximum share of votes for the back of a one-sided piece of a cloud.
 _ONE_SIDED = 0.1
-#: Directions of a camera's views from one place: number of yaws, and pitches in degrees.
+#: Number of yaws, and pitches in degrees, of a camera's views from one place.
 _TURNS, _PITCHES = 8, (-25.0, 10.0)
-#: Gain of the first, the second and further views of an element.
+#: Gain of the first, the second and all further views of an element.
 _WORTH = np.array([1.0, 0.5, 0.0])
-#: Share of the first view's gain at which the selection ends: of a camera, and of a scanner, which
-#: sees all around and needs fewer views.
+#: Share of the first view's gain at which the selection ends, for a camera, and for a scanner,
+#: which sees all around and needs fewer views.
 _LEAST_GAIN, _LEAST_GAIN_AROUND = 0.01, 0.03
-#: Number of the map's views per test view; minimum and maximum number of test views.
+#: Number of the map's views per test view, minimum and maximum number of test views.
 _VIEWS_A_TEST, _LEAST_TESTS, _MOST_TESTS = 4, 20, 60
 
 
@@ -60,12 +59,12 @@ class ViewPlan:
 
     Parameters
     ----------
-    poses : (V, 4, 4) T_map_sensor, in the coordinates of the surface without its offset, in the
-        order of selection
-    held_out : (H, 4, 4) poses of test views that are not in the map
+    poses : (V, 4, 4) T_map_sensor in the order of selection, in the coordinates of the surface
+        without its offset
+    held_out : (H, 4, 4) poses of test views, which are not in the map
     floor : height of the lowest floor along `up`, metres; None without a floor
     candidates : number of candidate views
-    covered : share of the surface visible from free space that the selected views show
+    covered : share that the selected views show, of the surface that is visible from free space
     """
 
     poses: Floats
@@ -76,11 +75,9 @@ class ViewPlan:
 
 
 def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewPlan:
-    """Select poses in the free space of a surface whose views cover it.
+    """Return poses in the free space of a surface whose views cover it.
 
-    Returns
-    -------
-    plan : deterministic; without poses if there is no free space
+    The result is deterministic, and has no poses if there is no free space.
     """
     if not len(surface.points if surface.triangles is None else surface.triangles):
         return ViewPlan(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), None, 0, 0.0)
@@ -125,7 +122,7 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
 
 
 def level_axes(up: Floats) -> Floats:
-    """Return two level directions, and up, as rows (3, 3)."""
+    """Return two level directions and up as the rows of a rotation (3, 3)."""
     level = np.zeros(3)
     level[int(np.argmin(np.abs(up)))] = 1.0
     first = np.cross(level, up)
@@ -134,7 +131,7 @@ def level_axes(up: Floats) -> Floats:
 
 
 def camera_turns() -> Floats:
-    """Return R_level_camera of the views from one place, (D, 3, 3)."""
+    """Return R_level_camera (D, 3, 3) of a camera's views from one place."""
     turns = []
     for yaw in np.arange(_TURNS) * (2.0 * math.pi / _TURNS):
         for pitch in np.radians(_PITCHES):
@@ -146,7 +143,7 @@ def camera_turns() -> Floats:
 
 
 def _is_free(sight: Sight, p: ViewParameters, one_sided: bool) -> bool:
-    """Return whether a place has room for the sensor, and surface beside it (no ceiling below)."""
+    """Return whether a place has room for the sensor, surface beside it, and no ceiling below."""
     if sight.nearest < p.clearance:
         return False
     if p.camera is None:
@@ -157,7 +154,7 @@ def _is_free(sight: Sight, p: ViewParameters, one_sided: bool) -> bool:
 def _select_front(
     free: list[tuple[Floats, Sight]], pieces: Surfels, lookout: Lookout, p: ViewParameters
 ) -> list[tuple[Floats, Sight]]:
-    """Remove places, or flip views, behind one-sided surfaces."""
+    """Return the places in front of one-sided surfaces."""
     if pieces.one_sided:
         # a mesh that is inside out shows its back in all free space
         shares = np.array([sight.back.mean() for _, sight in free if sight.hit.mean() > _INDOORS])
@@ -166,7 +163,7 @@ def _select_front(
         if p.camera is None:
             free = [(place, sight) for place, sight in free if sight.back[0] <= _MOST_BACK_AROUND]
         return free
-    # only walls distinguish the sides of a surface: floors are always seen from above
+    # only walls distinguish the sides of a surface, since all places see floors from above
     is_wall = (lookout.normals != 0).any(axis=1) & (np.abs(lookout.normals[:, 2]) < _WALL)
     votes = np.zeros((len(lookout.points), 2))
     for _, sight in free:
@@ -183,7 +180,7 @@ def _select_front(
 
 
 def _useful_views(sight: Sight, p: ViewParameters) -> list[int]:
-    """Return the views that show enough of the surface, far enough away, from its front."""
+    """Return the views that show enough surface from its front, at a sufficient distance."""
     if p.camera is None:
         return [0]
     useful = (sight.hit >= _LEAST_HIT) & (sight.close <= 0.5) & (sight.back <= _MOST_BACK)
@@ -195,7 +192,7 @@ def _gain(
     elements: NDArray[np.int32], masks: NDArray[np.uint32], bit: int, counts: NDArray[np.uint8],
     worth: Floats,
 ) -> float:  # fmt: skip
-    """Return the gain of a view, by the number of views of each element so far."""
+    """Return the gain of a view, by the number of selected views of each element."""
     gain, of_view = 0.0, np.uint32(1) << np.uint32(bit)
     for i in range(len(elements)):
         if masks[i] & of_view:
@@ -208,7 +205,7 @@ def _add(
     elements: NDArray[np.int32], masks: NDArray[np.uint32], bit: int, counts: NDArray[np.uint8],
     most: int,
 ) -> None:  # fmt: skip
-    """Count the elements of a view as seen once more."""
+    """Add a view to the counts of its elements."""
     of_view = np.uint32(1) << np.uint32(bit)
     for i in range(len(elements)):
         if masks[i] & of_view and counts[elements[i]] < most:
@@ -219,13 +216,13 @@ def _cover(
     sights: Sequence[Sight], views: Sequence[tuple[int, int]], universe: int, most: int,
     least_gain: float,
 ) -> tuple[list[int], float]:  # fmt: skip
-    """Select views greedily until none adds much; return their indices and the covered share.
+    """Select views greedily until gains are small; return their indices and the covered share.
 
-    Gains only fall during the selection, so most need not be recomputed.
+    Gains only decrease during the selection, so most of them need not be recomputed.
 
     Parameters
     ----------
-    sights : sight of each place
+    sights : visible parts from each place
     views : place and direction of each view
     universe : number of elements
     most : maximum number of views

@@ -1,9 +1,9 @@
-"""Draw triangles and discs to the depth buffer of a pinhole camera.
+"""Rasterization of triangles and discs to the depth buffer of a pinhole camera.
 
     triangles or discs, camera (4,)  --draw_triangles, draw_discs-->  depth (H, W), item (H, W)
 
-A ray through a pixel is d = ((u - cx) / fx, (v - cy) / fy, 1), so the point t d has depth t.
-Callers sort items into blocks, and pass the blocks in view.
+A ray through a pixel is d = ((u - cx) / fx, (v - cy) / fy, 1), so the point t d has the depth t.
+Callers sort items into blocks and pass the visible blocks.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 
-#: Least depth that is drawn, metres.
+#: Minimum depth that is drawn, metres.
 NEAREST = 1e-3
-#: Greatest radius of a disc, pixels.
+#: Maximum radius of a disc, pixels.
 _WIDEST_PX = 64.0
 #: Radius below which a disc is one pixel.
 _SMALLEST_PX = 0.7
-#: Greatest distance of the plane of such a disc from its centre along the ray, in widths of a pixel
-#: beyond the radius; else the pixel shows the centre.
+#: Maximum distance along the ray between the plane of such a disc and its centre, in pixel widths
+#: beyond the radius. For larger distances, the pixel shows the centre.
 _GRAZING = 3.0
 
 
 def pinhole(camera: Intrinsics) -> Floats:
-    """Return a camera as an array for these kernels: fx, fy, cx, cy."""
+    """Return the array fx, fy, cx, cy of a camera, for the kernels of this module."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 @kernel
 def _edge(ax: float, ay: float, az: float, bx: float, by: float, bz: float, out: Floats) -> None:
-    """Write the normal a x b of the plane through the eye and an edge from a to b."""
+    """Write the normal a x b of the plane through the camera and an edge from a to b."""
     out[0], out[1], out[2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
@@ -41,20 +41,20 @@ def draw_triangles(
     points: Floats32, triangles: Ints32, starts: Ints64, ends: Ints64, T: Floats, camera: Floats,
     depth: Floats32, back: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """Draw the triangles of some blocks.
+    """Draw the triangles of blocks.
 
-    Edges are planes through the eye, so no clipping is needed; neighbours share the same numbers,
-    so no ray passes between them.
+    Edges are planes through the camera, so clipping is unnecessary. Adjacent triangles compute
+    their common edge with equal numbers, so no ray passes between them.
 
     Parameters
     ----------
-    points : (N, 3)
-    triangles : (M, 3), counterclockwise seen from the front
-    starts, ends : (B,) range of each block in view
+    points : (N, 3) corners
+    triangles : (M, 3) indices of points, counterclockwise as seen from the front
+    starts, ends : (B,) range of each visible block
     T : (4, 4) T_camera_points
     camera : result of `pinhole`
-    depth : (H, W) depth of the nearest triangle so far, metres; inf for none
-    back : (H, W) uint8, 1 if that triangle is seen from behind
+    depth : (H, W) depth of the nearest triangle, which is updated, metres; inf without a triangle
+    back : (H, W) uint8, 1 if the nearest triangle is seen from behind
     """
     height, width = depth.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
@@ -108,15 +108,15 @@ def draw_discs(
     points: Floats32, normals: Floats32, radii: Floats32, starts: Ints64, ends: Ints64, T: Floats,
     camera: Floats, depth: Floats32, item: Ints32,
 ) -> None:  # fmt: skip
-    """Draw the discs of some blocks.
+    """Draw the discs of blocks.
 
     Parameters
     ----------
     points : (N, 3) centres
-    normals : (N, 3), towards either side; a disc with normal 0 faces the camera
+    normals : (N, 3) normals of either sign; a disc whose normal is 0 faces the camera
     radii : (N,) metres
     starts, ends, T, camera, depth : arguments of `draw_triangles`
-    item : (H, W) index of the visible disc; -1 for none
+    item : (H, W) index of the visible disc; -1 for pixels without a disc
     """
     height, width = depth.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]

@@ -1,4 +1,4 @@
-"""Render a surface from the pose of a sensor, with occlusion and holes.
+"""Rendering of a surface from the pose of a sensor, with occlusion and holes.
 
     surface, pose  --Renderer.view-->  depth (H, W) of a camera, or points (K, 3) of a scanner
 
@@ -23,24 +23,24 @@ from sceneprint.geometry.views.samples import (
 )
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
 
-#: Radius of a point's disc, share of the spacing of points.
+#: Radius of a point's disc, as a share of the spacing of points.
 _OVERLAP = 0.7
-#: The same for a point on no plane, as of a wire or a leaf.
+#: The same for a point without a plane, such as a point of a wire or a leaf.
 _LONELY = 0.3
 #: Width of the cells for the neighbours of a normal, in spacings of points.
 _NEIGHBOURHOOD = 3.0
-#: Side of a block, share of the sensor's range.
+#: Side of a block, as a share of the sensor's range.
 _BLOCK = 1.0 / 20.0
 #: Share of a view's pixels below which a side of the surface is hidden.
 LEAST_SIDE = 0.3
 
 
 def cube_faces(size: int) -> tuple[Intrinsics, Floats]:
-    """Return the camera of a face of a cube around the eye, and R_sensor_face (6, 3, 3).
+    """Return the camera of a face of a cube around the sensor, and R_sensor_face (6, 3, 3).
 
     Parameters
     ----------
-    size : pixels along an edge
+    size : number of pixels along an edge
     """
     camera = Intrinsics(size, size, size / 2, size / 2, (size - 1) / 2, (size - 1) / 2)
     turns = []
@@ -53,7 +53,7 @@ def cube_faces(size: int) -> tuple[Intrinsics, Floats]:
 
 
 def rays_of(camera: Intrinsics) -> Floats32:
-    """Return rays through the centres of the pixels, of depth 1, (H, W, 3)."""
+    """Return rays of depth 1 through the centres of the pixels, (H, W, 3)."""
     rays = np.ones((camera.height, camera.width, 3), np.float32)
     rays[..., 0] = (np.arange(camera.width) - camera.cx) / camera.fx
     rays[..., 1] = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
@@ -61,17 +61,11 @@ def rays_of(camera: Intrinsics) -> Floats32:
 
 
 class Renderer:
-    """A surface prepared for rendering.
-
-    Parameters
-    ----------
-    surface : see ReferenceSurface
-    parameters : parameters of the sensor
-    """
+    """A renderer of one surface for one sensor."""
 
     def __init__(self, surface: ReferenceSurface, parameters: ViewParameters) -> None:
         self._p = p = parameters
-        # writable, because numba compiles kernels again for read-only arrays
+        # for read-only arrays, numba would compile the kernels again
         points = np.require(surface.points, np.float32, ["C", "W"])
         side = p.farthest * _BLOCK
         if surface.triangles is None:
@@ -94,7 +88,6 @@ class Renderer:
         else:
             self._camera, self._faces = p.camera, np.eye(3)[None]
         self._rays = rays_of(self._camera)
-        # lengths of the rays, and the rays within a scanner's elevation
         self._lengths = np.linalg.norm(self._rays, axis=2)
         up = np.einsum("hwi,fi->fhw", self._rays, self._faces[:, 2]) / self._lengths
         self._wanted = (p.camera is not None) | (np.abs(up) <= math.sin(p.elevation))
@@ -108,8 +101,8 @@ class Renderer:
 
         Returns
         -------
-        depth : (H, W) float32, metres along the optical axis, 0 if missing; of a camera
-        points : (K, 3) float32, metres, in the sensor's axes; of a scanner
+        depth : (H, W) float32, metres along the optical axis, 0 if missing; for a camera
+        points : (K, 3) float32, metres, in the sensor's axes; for a scanner
         """
         drawn = [self._face(T_map_sensor, R) for R in self._faces]
         depth, back = (np.stack(images) for images in zip(*drawn, strict=True))

@@ -1,4 +1,4 @@
-"""Sample a surface as points with normals, one per cell of a grid.
+"""Samples of a surface: points with normals, one per cell of a grid.
 
 points (N, 3)  --average_cells-->  points (n, 3)
 points (n, 3)  --project_to_planes-->  points (n, 3), normals (n, 3), spacing (n,)
@@ -17,12 +17,12 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.surface.voxels import least_axis
 from sceneprint.types import Floats, Floats32, Ints32, Ints64, ReferenceSurface
 
-#: Maximum number of cells per axis: three indices fit one key.
+#: Maximum number of cells per axis: three indices must fit one key.
 _MOST_CELLS = 1 << 20
-#: Greatest ratio of the least to the middle variance of neighbours on a plane.
+#: Maximum ratio of the smallest to the middle variance of neighbours on a plane.
 _FLAT = 0.15
-#: Half the maximum number of samples of a mesh. If it has more triangles, only some of those with
-#: one sample are sampled.
+#: Half the maximum number of samples of a mesh. If a mesh has more triangles, only a part of the
+#: triangles with one sample is sampled.
 _MOST_SAMPLES = 2_000_000
 
 
@@ -31,13 +31,13 @@ def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
 
     Parameters
     ----------
-    points : (N, 3)
+    points : (N, 3) metres
     cell : side of a cell, metres
 
     Returns
     -------
-    keys : (N,), (x * shape[1] + y) * shape[2] + z; a cell on each side of the points is empty
-    shape : (3,)
+    keys : (N,), (x * shape[1] + y) * shape[2] + z; the outermost cells on each side are empty
+    shape : (3,) number of cells
     """
     low = points.min(axis=0).astype(np.float64) - cell
     shape = np.floor((points.max(axis=0) - low) / cell).astype(np.int64) + 2
@@ -49,16 +49,16 @@ def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
 
 
 def fitting_cell(points: Floats32, cell: float) -> float:
-    """Return the side of a cell, enlarged until the cells can be numbered."""
+    """Return the side of a cell, enlarged until keys can number all cells."""
     return max(cell, float(np.ptp(points, axis=0).max(initial=0.0)) / (_MOST_CELLS - 4))
 
 
 def average_cells(points: Floats32, cell: float) -> Floats32:
-    """Return the mean of the points in each cell, (n, 3); a single point stays unchanged.
+    """Return the mean of the points in each cell, (n, 3); a single point is returned unchanged.
 
     Parameters
     ----------
-    points : (N, 3), one or more
+    points : (N, 3), N >= 1
     cell : side of a cell, metres
     """
     keys, _ = cell_keys(points, fitting_cell(points, cell))
@@ -78,9 +78,8 @@ def _fit(
     points: Floats32, order: Ints64, starts: Ints64, keys: Ints64, shape: Ints64, flat: float,
     normals: Floats32, heights: Floats, crowds: Floats,
 ) -> None:  # fmt: skip
-    """Fit the plane of each cell to the points in and around it.
-
-    Writes the normal, the height normal . x, and the mean number of points per cell.
+    """Write the normal and the height normal . x of the plane through the points in and around
+    each cell, and the mean number of points per cell.
     """
     m, values, axis = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for cell in range(len(keys)):
@@ -118,19 +117,19 @@ def _fit(
 def project_to_planes(points: Floats32, cell: float) -> tuple[Floats32, Floats32, Floats32]:
     """Project the points of a cloud onto the planes of their neighbours.
 
-    Drift makes the walls of a map thick, and a sensor would see their nearest points: the middle is
-    right.
+    Drift makes the walls of a map thick, and a rendered sensor would see their nearest points
+    instead of their middle.
 
     Parameters
     ----------
-    points : (N, 3), one or more
-    cell : side of a cell, metres; the cell's points and those around it are neighbours
+    points : (N, 3), N >= 1
+    cell : side of a cell, metres; neighbours are the points in the cell and in adjacent cells
 
     Returns
     -------
-    moved : (N, 3); points whose neighbours lie on no plane stay in place
-    normals : (N, 3), towards either side; 0 if the neighbours lie on no plane
-    spacing : (N,) metres, as if the neighbours were spread evenly on a plane
+    moved : (N, 3); points whose neighbours lie on no plane are not moved
+    normals : (N, 3) normals of either sign; 0 if the neighbours lie on no plane
+    spacing : (N,) spacing of the neighbours if they were evenly distributed on a plane, metres
     """
     cell = fitting_cell(points, cell)
     keys, shape = cell_keys(points, cell)
@@ -151,13 +150,13 @@ def project_to_planes(points: Floats32, cell: float) -> tuple[Floats32, Floats32
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Pieces of a surface, about one in each cell that it passes through.
+    """Pieces of a surface, approximately one per occupied cell.
 
     Parameters
     ----------
     points : (S, 3) float32, metres
-    normals : (S, 3) float32, unit length; towards the front of a mesh, either side of a cloud; 0 if
-        unknown
+    normals : (S, 3) float32 unit vectors, towards the front of a mesh or either side of a cloud; 0
+        if unknown
     cell : side of a cell, metres
     one_sided : whether normals point to the front
     """
@@ -173,8 +172,7 @@ def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
 
     Parameters
     ----------
-    surface : see ReferenceSurface
-    cell : side of a cell, metres; it grows until there are few enough
+    cell : side of a cell, metres; it grows until there are at most `most` pieces
     most : maximum number of pieces
     """
     if surface.triangles is None:
@@ -196,7 +194,7 @@ def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
 
 @kernel
 def _count_samples(points: Floats32, triangles: Ints32, step: float, every: int) -> float:
-    """Return an upper bound of the number of samples of `_sample`."""
+    """Return an upper bound of the number of samples that `_sample` writes."""
     total = 0.0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
@@ -213,7 +211,7 @@ def _sample(
     points: Floats32, triangles: Ints32, step: float, every: int, places: Floats32,
     normals: Floats32,
 ) -> int:  # fmt: skip
-    """Write points on a grid over each triangle, at least its centre, and its normal."""
+    """Write points on a grid over each triangle, or its centre, with its normal."""
     n = 0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
@@ -239,7 +237,7 @@ def _sample(
 
 
 def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32, Floats32]:
-    """Return points on the triangles of a mesh about `step` apart, farther if they are many."""
+    """Return points and normals on a mesh at a spacing of `step`, or more for large meshes."""
     points = np.require(points, np.float32, ["C", "W"])
     triangles = np.require(triangles, np.int32, ["C", "W"])
     every = max(len(triangles) // _MOST_SAMPLES, 1)
@@ -253,7 +251,7 @@ def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32
 
 @kernel
 def bounding_balls(points: Floats32, triangles: Ints32, middles: Floats32, reach: Floats32) -> None:
-    """Write the mean of the corners of each triangle, and their greatest distance from it."""
+    """Write the mean of the corners of each triangle, and their maximum distance from it."""
     for m in range(len(triangles)):
         for axis in range(3):
             total = 0.0
@@ -271,13 +269,13 @@ def bounding_balls(points: Floats32, triangles: Ints32, middles: Floats32, reach
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Items sorted by position, so that most that are out of view can be skipped.
+    """Items sorted by position, so that most invisible items can be skipped.
 
     Parameters
     ----------
     starts, ends : (B,) range of each block among the items
     centres : (B, 3) metres
-    radii : (B,) metres, of a ball that contains the block
+    radii : (B,) radii of balls that contain the blocks, metres
     """
 
     starts: Ints64
@@ -288,14 +286,14 @@ class Blocks:
     def in_view(
         self, T: Floats, camera: Floats, shape: tuple[int, ...], farthest: float
     ) -> tuple[Ints64, Ints64]:
-        """Return starts and ends of the blocks that a camera may see.
+        """Return starts and ends of the blocks that may be visible in a camera.
 
         Parameters
         ----------
         T : (4, 4) T_camera_points
         camera : fx, fy, cx, cy
-        shape : height and width of its image
-        farthest : greatest depth, metres
+        shape : height and width of the image
+        farthest : maximum depth, metres
         """
         x, y, z = (self.centres @ T[:3, :3].T + T[:3, 3]).T
         r = self.radii
@@ -304,7 +302,7 @@ class Blocks:
             (x, camera[0], camera[2], shape[1]), (y, camera[1], camera[3], shape[0]),
         ):  # fmt: skip
             for slope, sign in ((-(middle + 0.5) / focal, 1.0), ((size - middle) / focal, -1.0)):
-                # outside if it is farther than its radius beyond a side of the view
+                # a block is invisible if it lies farther than its radius beyond a side of the view
                 seen &= sign * (along - slope * z) > -r * math.sqrt(1.0 + slope * slope)
         return self.starts[seen], self.ends[seen]
 
@@ -316,7 +314,7 @@ def sort_into_blocks(points: Floats32, side: float, extents: Floats32) -> tuple[
     ----------
     points : (N, 3) centres of the items
     side : side of a block, metres
-    extents : (N,) greatest distance of each from its centre, metres
+    extents : (N,) maximum distance of each item's points from its centre, metres
     """
     side = fitting_cell(points, side)
     keys, _ = cell_keys(points, side)
