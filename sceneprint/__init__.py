@@ -8,9 +8,9 @@
     views_of = sceneprint.views_of_rows(matches, poses, open_geometry)
     place = sceneprint.localize([sceneprint.QueryFrame(geometry, matches)], poses, None, views_of)
 
-    answer = sceneprint.Client("http://robot-server:8008").query("warehouse", path)  # all at once
+    answer = sceneprint.Client("http://robot-server:8008").query("warehouse", path)  # all steps
 
-Modules are imported when their names are first used.
+Modules are imported at the first use of one of their names.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m sceneprint` is the `sceneprint` command."""
+"""The `sceneprint` command as `python -m sceneprint`."""
 
 import sys
 

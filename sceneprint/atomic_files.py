@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and who may read what the store makes."""
+"""Atomic and durable writes of files, and the permissions of the store's files."""
 
 from __future__ import annotations
 
@@ -15,28 +15,24 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 
-#: Permissions of all that the store makes, whatever the umask: frames are pictures of somebody's
-#: rooms, and the database has the hashes of keys.
+#: Permissions of the store's folders and files, whatever the umask: frames show private rooms, and
+#: the database contains the hashes of keys.
 PRIVATE_FOLDER, PRIVATE_FILE = 0o700, 0o600
 
 
 def create_private(path: Path) -> int:
-    """Create a file that only its owner may read, and open it for reading and writing.
-
-    Returns
-    -------
-    descriptor : of the empty file
+    """Create a file that only its owner may read; return a descriptor for reading and writing.
 
     Raises
     ------
-    OSError : it exists, or cannot be created.
+    OSError : If the file exists or cannot be created.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     return os.open(path, flags, PRIVATE_FILE)
 
 
 def public_mode(folder: Path) -> int | None:
-    """The permissions of a folder that users outside its group may read or enter; else None."""
+    """Return a folder's permissions if users outside its group may read or enter it, else None."""
     try:
         mode = stat.S_IMODE(folder.stat().st_mode)
     except OSError:
@@ -45,11 +41,11 @@ def public_mode(folder: Path) -> int | None:
 
 
 def nearest_folder(folder: Path) -> Path:
-    """The folder, or the first above it that is there: both are on one disk, once it is made.
+    """Return the folder or its nearest existing parent, which is on the same disk.
 
     Raises
     ------
-    OSError : a folder above it may not be entered.
+    OSError : If a parent folder may not be entered.
     """
     folder = folder.absolute()
     return next(one for one in (folder, *folder.parents) if one.is_dir())
@@ -60,17 +56,17 @@ def warn_if_public(folder: Path) -> None:
     mode = public_mode(folder)
     if mode is not None:
         log.warning(
-            "every user of this machine may read the data folder; `chmod -R o-rwx` ends that",
+            "all users of this machine may read the data folder; `chmod -R o-rwx` prevents this",
             extra={"data": str(folder), "permissions": f"{mode:o}"},
         )
 
 
 def check_writable(path: Path) -> None:
-    """See before long work that `write_whole` will be able to write there.
+    """Check, before long work, that `write_whole` can write a file.
 
     Raises
     ------
-    OSError : it is a folder, or its folder takes no files.
+    OSError : If the path is a folder, or no file can be created in its parent folder.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -83,31 +79,30 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes, *, private: bool = False) -> None:
-    """Put a file there in one step: a process killed here leaves the old one or none.
+    """Write a file atomically: if the process is killed, the previous file or none remains.
 
     Parameters
     ----------
-    path : of the file; its folder must exist
-    data : all of it
-    private : only its owner may read it; else the umask says who may
+    path : path of the file; its folder must exist
+    data : content of the file
+    private : whether only the owner may read the file; otherwise the umask applies
 
     Raises
     ------
-    OSError : it cannot be written; nothing is left behind.
+    OSError : If the file cannot be written. No partial file remains.
     """
     _put(path, data, private=private, durable=False)
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A path beside it for a library that writes files itself, such as in several steps.
+    """Yield a temporary path for a library that writes files itself; replace the file at the end.
 
-    What lies there when the block ends takes the file's place; where nothing does, or the block
-    fails, all stays as it was, and nothing is left behind.
+    If the block writes no file or raises an exception, the previous file remains.
 
     Raises
     ------
-    OSError : it cannot be put there.
+    OSError : If the file cannot be replaced.
     """
     part = _beside(path)
     try:
@@ -120,18 +115,18 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> None:
-    """As `write_whole` of a private file, which survives the loss of power when this returns.
+    """Write a private file atomically and durably: it survives a loss of power after the return.
 
     Parameters
     ----------
-    path : of the file; its folder must exist
-    data : all of it
-    folder_is_new : whether the folder may not be durable itself yet
+    path : path of the file; its folder must exist
+    data : content of the file
+    folder_is_new : whether the folder was created recently, so that its parent must be synced
 
     Raises
     ------
-    OSError : it cannot be written, and nothing is left behind; or the folder cannot be synced, and
-        the file is there, but might not survive.
+    OSError : If the file cannot be written, or its folder cannot be synced. In the latter case the
+        file exists, but may be lost.
     """
     _put(path, data, private=True, durable=True)
     sync_folder(path.parent)
@@ -140,36 +135,36 @@ def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> Non
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder where it is missing, and those above it; they survive the loss of power.
+    """Create a folder and its parents durably, if they are missing.
 
-    Only their owner may read what is made here; the permissions of others stay as they are.
+    Only the owner may read new folders; the permissions of existing folders are not changed.
 
     Raises
     ------
-    OSError : it cannot be made, or is a file.
+    OSError : If the folder cannot be created or is a file.
     """
     if folder.is_dir():
         return
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
     for one in reversed(missing):
         one.mkdir(PRIVATE_FOLDER, exist_ok=True)
-    folder.mkdir(PRIVATE_FOLDER, exist_ok=True)  # FileExistsError where it is a file
-    for made in missing:
-        sync_folder(made.parent)
+    folder.mkdir(PRIVATE_FOLDER, exist_ok=True)  # raises FileExistsError for a file
+    for one in missing:
+        sync_folder(one.parent)
 
 
 def put_new(part: Path, path: Path) -> None:
-    """Give a file its name where nothing has it; it survives the loss of power after that.
+    """Move a file to a path that must not exist, durably.
 
     Raises
     ------
-    FileExistsError : something has it.
+    FileExistsError : If the path exists.
     """
     try:
         os.link(part, path)
     except FileExistsError:
         raise
-    except OSError as error:  # a file system without links
+    except OSError as error:  # the file system has no links
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from error
         part.rename(path)
@@ -180,12 +175,12 @@ def put_new(part: Path, path: Path) -> None:
 
 @contextmanager
 def folder_turn(folder: Path) -> Iterator[bool]:
-    """Hold the right to write in a folder, which is made if need be; False where another has it.
+    """Hold the write lock of a folder, which is created if missing; yield False if it is taken.
 
-    The kernel releases the lock of a process that dies, however it dies.
+    The kernel releases the lock when the process ends, for whatever reason.
     """
     make_folder(folder)
-    # of this call alone: flock then keeps out other threads as well as other processes
+    # with a new descriptor, flock excludes other threads of this process too
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     descriptor = os.open(folder / ".lock", flags, PRIVATE_FILE)
     try:
@@ -204,7 +199,7 @@ def _put(path: Path, data: bytes, *, private: bool, durable: bool) -> None:
     try:
         with os.fdopen(create_private(part), "wb") if private else part.open("wb") as file:
             file.write(data)
-            if durable:  # before its name: a name must never lead to half a file
+            if durable:  # the content must be durable before its name
                 file.flush()
                 os.fsync(file.fileno())
         os.replace(part, path)  # noqa: PTH105  (the one call that is atomic by contract)
@@ -217,11 +212,11 @@ def _put(path: Path, data: bytes, *, private: bool, durable: bool) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder survive the loss of power.
+    """Make the names in a folder durable.
 
     Raises
     ------
-    OSError : it cannot; names the folder.
+    OSError : If the folder cannot be synced.
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -233,4 +228,6 @@ def sync_folder(folder: Path) -> None:
 
 
 def _beside(path: Path) -> Path:
-    return path.with_name(f".{secrets.token_hex(6)}.part")  # short: the name may be long already
+    return path.with_name(
+        f".{secrets.token_hex(6)}.part"
+    )  # the name of `path` may be too long for a suffix

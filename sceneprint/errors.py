@@ -1,4 +1,4 @@
-"""Define the exceptions of sceneprint: those that clients see, and internal ones.
+"""The exceptions of sceneprint, for clients and internal.
 
     SceneprintError, and all of sceneprint_client.errors
       x DamagedIndex            a cache file of the index is missing or damaged
@@ -6,11 +6,11 @@
       x BusyIndex               another process is building this index
       x StoreError
         - LostLease             another worker has the job
-        - BundleError           a bundle cannot be written, or cannot be restored there
-          - DamagedBundle       its bytes are not the original ones
+        - BundleError           a bundle cannot be written or restored
+          - DamagedBundle       the bytes of a bundle have changed
       x TrainingError           too little data, or parameters that cannot be fitted
 
-The classes are shared: `except sceneprint.errors.UnknownMap` catches exceptions of the client.
+The classes are shared, so `except sceneprint.errors.UnknownMap` catches exceptions of the client.
 """
 
 from sceneprint_client.errors import (
@@ -150,7 +150,7 @@ class DamagedIndex(SceneprintError):
 class DecoderFailure(SceneprintError):
     """A decoder crashed, took too long, or needed too much memory.
 
-    Its message continues a sentence from "it": the caller names the upload.
+    The message is the predicate of a sentence; the caller prefixes the name of the upload.
     """
 
 
@@ -159,16 +159,16 @@ class BusyIndex(SceneprintError):
 
 
 class LostLease(StoreError):
-    """The job's lease expired, and another worker has the job."""
+    """The lease of a job expired, and another worker has the job."""
 
 
 class BundleError(StoreError):
-    """A bundle cannot be written, or cannot be restored there."""
+    """A bundle cannot be written or restored."""
 
 
 class DamagedBundle(BundleError):
-    """The bytes of a bundle are not the original ones."""
+    """The bytes of a bundle have changed."""
 
 
 class TrainingError(SceneprintError):
-    """A model cannot be trained from this data with these parameters."""
+    """A model cannot be trained on this data with these parameters."""

@@ -1,6 +1,8 @@
-"""Fuse views of one place to a surface by a truncated signed distance.
+"""Fusion of views of one place to a surface, by a truncated signed distance.
 
-views (V)  --fuse-->  TriangleMesh, voxel     by Open3D, which only this module imports, when needed
+views (V)  --fuse-->  TriangleMesh, voxel
+
+Only this module imports Open3D, at the first fusion.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ PACKAGES = "libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
 
 
 def open3d(feature: str) -> Any:
-    """Import open3d, for one thread.
+    """Return the module open3d, limited to one thread.
 
     Parameters
     ----------
@@ -32,24 +34,24 @@ def open3d(feature: str) -> Any:
 
     Raises
     ------
-    MissingDependency : Open3D, or a system library that it needs, is missing
+    MissingDependency : If Open3D or a system library that it requires is missing
     """
     try:
         import open3d as module
     except (ImportError, OSError) as error:
         raise MissingDependency(
-            f"{feature} needs Open3D, which cannot be imported here ({error}). Install it "
-            f"(pip install open3d), and on Debian or Ubuntu: apt-get install {PACKAGES}"
+            f"{feature} requires Open3D, which cannot be imported ({error}). Install it (pip "
+            f"install open3d) and, on Debian or Ubuntu, its libraries: apt-get install {PACKAGES}"
         ) from error
-    module.utility.set_max_threads(1)  # a fixed order of sums
+    module.utility.set_max_threads(1)  # several threads would sum in a random order
     module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
     return module
 
 
 #: Number of voxels along the edge of a block.
 _SIDE = 8
-#: Number of voxels before and behind a surface, along the ray, that store its distance. Angles of
-#: incidence below asin(1 / 6), 10 degrees, leave holes; a wider band would merge thin objects.
+#: Number of voxels before and behind a surface, along the ray, that store its distance. Surfaces at
+#: less than asin(1 / 6), 10 degrees, to the ray have holes; a wider band would merge thin objects.
 BAND = 6.0
 
 
@@ -57,12 +59,12 @@ BAND = 6.0
 class FusionParameters:
     """Parameters of a fusion."""
 
-    voxel_m: float | None = None  #: edge of a voxel; None: as fine as the views and blocks allow
-    nearest_m: float = 0.3  #: least depth of a fused sample
-    farthest_m: float = 6.0  #: greatest depth of a fused sample: farther ones are too uncertain
-    finest_m: float = 0.01  #: least automatic edge: finer voxels store noise
-    #: Maximum number of blocks. A block of 512 voxels has 4 KiB and some 50 points: 64 MiB in all,
-    #: with a mesh file of about 50 MB.
+    voxel_m: float | None = None  #: edge of a voxel; None selects the finest possible edge
+    nearest_m: float = 0.3  #: minimum depth of a fused sample
+    farthest_m: float = 6.0  #: maximum depth of a fused sample; farther samples are inaccurate
+    finest_m: float = 0.01  #: minimum automatic edge; finer voxels store noise
+    #: Maximum number of blocks. A block of 512 voxels has 4 KiB and about 50 points, so the maximum
+    #: takes 64 MiB and gives a mesh file of about 50 MB.
     most_blocks: int = 16_384
     most_samples: int = 640 * 480  #: maximum number of samples per view; larger images are thinned
 
@@ -78,14 +80,14 @@ def fuse(
 
     Returns
     -------
-    mesh : in the parent frame, points in rising order of x, then y, then z
+    mesh : mesh in the parent frame, with points sorted by x, then y, then z
     voxel : edge of the voxels, metres
 
     Raises
     ------
-    MissingDependency : Open3D, or a system library that it needs, is missing
-    UselessFrame : no sample of any view lies within the range
-    InvalidRequest : voxels of the requested size take too many blocks
+    MissingDependency : If Open3D or a system library that it requires is missing
+    UselessFrame : If no sample of the views lies within the range
+    InvalidRequest : If voxels of the requested size need too many blocks
     """
     p = p or FusionParameters()
     o3d = open3d("A reconstruction")
@@ -103,22 +105,22 @@ def fuse(
 def prepare_view(view: DepthFrame, p: FusionParameters) -> DepthFrame:
     """Return a view thinned to `most_samples`, without samples out of range.
 
-    Samples are omitted, not averaged: a mean across an edge would be a false surface.
+    Samples are omitted instead of averaged, because a mean across an edge would be a false surface.
     """
     depth, camera = np.asarray(view.depth, np.float32), view.intrinsics
     while depth.size > p.most_samples:
         camera = halve_camera(camera)
-        # the first of each 2 x 2 samples; its ray is a quarter of a new pixel up and left
+        # the first of 2 x 2 samples lies a quarter of a new pixel to the top left of its centre
         depth = depth[: 2 * camera.height : 2, : 2 * camera.width : 2]
         camera = replace(camera, cx=camera.cx + 0.25, cy=camera.cy + 0.25)
     with np.errstate(invalid="ignore"):
-        good = (depth >= p.nearest_m) & (depth <= p.farthest_m)  # NaN compares false
+        good = (depth >= p.nearest_m) & (depth <= p.farthest_m)  # false for NaN
     in_range: Floats32 = np.ascontiguousarray(np.where(good, depth, np.float32(0)))
     return replace(view, depth=in_range, intrinsics=camera)
 
 
 def _points(view: DepthFrame) -> Floats:
-    """Return the samples of a view in its own frame, (N, 3)."""
+    """Return the samples (N, 3) of a view in its sensor's frame."""
     k = view.intrinsics
     y, x = np.nonzero(view.depth)
     z = view.depth[y, x].astype(np.float64)
@@ -128,14 +130,14 @@ def _points(view: DepthFrame) -> Floats:
 def _select_voxel(
     views: Sequence[DepthFrame], points: Sequence[Floats], p: FusionParameters
 ) -> float:
-    """Return the requested edge, or the least without gaps between pixels and within the blocks."""
+    """Return the requested edge, or the minimum that leaves no gaps and needs few enough blocks."""
     if p.voxel_m is not None:
         count = _count(views, points, p.voxel_m)
         if count > p.most_blocks:
-            # the number of blocks on surfaces falls with the square of the edge
+            # the number of blocks on surfaces is inversely proportional to the squared edge
             enough = p.voxel_m * math.sqrt(count / p.most_blocks) * 1.05
             raise InvalidRequest(
-                f"Voxels of {p.voxel_m:g} m take {count} blocks of memory, and there may be "
+                f"Voxels of {p.voxel_m:g} m need {count} blocks of memory, but the limit is "
                 f"{p.most_blocks}. Request {enough:.3f} m or more, or fewer views.",
                 (("voxel_m", "is too small for the extent of the views"),),
             )
@@ -158,13 +160,13 @@ def _count(views: Sequence[DepthFrame], points: Sequence[Floats], voxel: float) 
 
 
 def _blocks(T: Floats, points: Floats, voxel: float) -> NDArray[np.int32]:
-    """Return the blocks within the band along the rays of a view, (B, 3), by T_parent_view."""
+    """Return the blocks (B, 3) within the band along the rays of a view; T is T_parent_view."""
     if not len(points):
         return np.zeros((0, 3), np.int32)
     band, edge = BAND * voxel, _SIDE * voxel
     z = points[:, 2:]
     keys = []
-    for offset in np.linspace(-band, band, 5):  # steps below a block, for slanted rays too
+    for offset in np.linspace(-band, band, 5):  # steps shorter than a block
         cells = np.floor(transform_points(T, points * np.maximum((z + offset) / z, 0.0)) / edge)
         packed = (cells.astype(np.int64) + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1])
         keys.append(np.unique(packed))
@@ -196,11 +198,13 @@ def _extract_mesh(
             core.Tensor(inverse(T)), 1.0, p.farthest_m, BAND,
         )  # fmt: skip
     try:
-        mesh = grid.extract_triangle_mesh(0.5)  # a single view suffices
+        mesh = grid.extract_triangle_mesh(
+            0.5
+        )  # the threshold accepts surfaces that only one view saw
     except RuntimeError as error:  # Open3D raises it for a mesh without points
         raise UselessFrame(
-            f"The {len(views)} views make no surface of voxels of {voxel:g} m. Request smaller "
-            "ones, or select other frames."
+            f"The {len(views)} views give no surface at voxels of {voxel:g} m. Request smaller "
+            "voxels, or select other frames."
         ) from error
     return _sort_mesh(
         mesh.vertex.positions.numpy().astype(np.float64),
@@ -210,13 +214,15 @@ def _extract_mesh(
 
 
 def _sort_mesh(points: Floats, normals: Floats, triangles: NDArray[np.int32]) -> TriangleMesh:
-    """Return a mesh in an order that does not depend on that of Open3D's hash table."""
+    """Return a mesh in an order that does not depend on the order of Open3D's hash table."""
     order = np.lexsort(points.T[::-1])
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     triangles = place[triangles].reshape(-1, 3)
     start = triangles.argmin(axis=1) if len(triangles) else np.zeros(0, np.intp)
-    order_of_corners = (start[:, None] + np.arange(3)) % 3  # least index first, same winding
+    order_of_corners = (
+        start[:, None] + np.arange(3)
+    ) % 3  # the lowest index comes first, with the same winding
     triangles = np.take_along_axis(triangles, order_of_corners, axis=1)
     triangles = triangles[np.lexsort(triangles.T[::-1])]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -225,11 +231,11 @@ def _sort_mesh(points: Floats, normals: Floats, triangles: NDArray[np.int32]) ->
 
 def _pose(view: DepthFrame) -> Floats:
     if view.pose is None:
-        raise ValueError(f"view {view.name!r} has no pose")
+        raise ValueError(f"The view {view.name!r} has no pose. Pass views with T_parent_view.")
     return view.pose
 
 
-#: Colours of the views, repeated if there are more views; the query's grey first.
+#: Colours of the views, which are repeated if there are more views. The query's grey comes first.
 PALETTE = np.array(
     [
         (150, 154, 160), (49, 112, 184), (222, 126, 46), (52, 160, 105), (158, 84, 172),

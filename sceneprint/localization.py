@@ -1,11 +1,11 @@
-"""Decide where a query was taken by its validated matches: found, ambiguous, or not found.
+"""The pose of a query from its validated matches: found, ambiguous, or not found.
 
 matches, poses, MapViews  --localize-->  PoseEstimate
 
-Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
-judged on the frames of the map that would see the same surfaces. The evidence for each gives its
-confidence, the probability that it is right. The best pose is `found` if its confidence reaches
-that of the query; all others together have at most the remainder.
+Accepted matches vote with their poses. These poses, and further poses that candidates suggest, are
+evaluated on the frames of the map that would see the same surfaces. The evidence for a pose gives
+its confidence, the probability that it is right. The best pose is `found` if its confidence reaches
+the confidence that the query requires; all other poses together have at most the remainder.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]
 #: Evidence that decided: strong matches that vote for the pose; the map's frames, if no match is
-#: strong; or the robot's prior, if the map supports it as well as any other pose.
+#: strong; or the robot's prior, if the map supports no other pose better.
 Verifier = Literal["matches", "map", "prior"]
 
 
@@ -59,8 +59,8 @@ class AlternativePose:
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    support : number of viewpoints of matches that vote for it
-    confidence : probability that it is right; None without a map
+    support : number of viewpoints of matches that vote for the pose
+    confidence : probability that the pose is right; None without a map
     evidence : evidence for the confidence; None without a map
     """
 
@@ -77,17 +77,18 @@ class PoseEstimate:
     Parameters
     ----------
     status : found, ambiguous, or not_found
-    reason : short sentence
+    reason : short explanation of the status
     parent : parent frame of the poses
     average : T_parent_query with the spread and number of agreeing votes; None unless found
-    covariance : (6, 6) of it, ordered as in `place_covariance`; None if a vote has none
-    strength : strength of the matches that vote for it; None unless found
+    covariance : (6, 6) covariance of `average`, in the order of `place_covariance`; None if a vote
+        has none
+    strength : strength of the matches that vote for the answer; None unless found
     verified_by : evidence that decided; None unless found
-    alternatives : plausible poses, best first; the answer alone if found
+    alternatives : plausible poses, best first; only the answer if found
     votes : number of accepted matches with a pose in the parent frame
     members : rows of the matches that vote for the answer
-    guided : number of these that were guided by the others
-    places : all judged places
+    guided : number of guided matches among `members`
+    places : all evaluated places
     """
 
     status: LocalizationStatus
@@ -123,21 +124,21 @@ def localize(
     p: LocalizationParameters | None = None,
     overlap_p: OverlapParameters | None = None,
 ) -> PoseEstimate | None:
-    """Estimate where a query was taken, by its matches and the frames of the map.
+    """Estimate the pose of a query from its matches and the frames of the map.
 
     Parameters
     ----------
     frames : one or more frames of the query
-    poses : T_parent_sensor (4, 4) of every row of the database, or by the rows of the matches
-    parents : parent frame of every row; default: one for all. Poses are compared within one parent
-        frame only: that of the prior, or that of most matches
-    views_of : see ViewsOf; None: pairs alone decide
-    prior : the robot's prior
-    p : default: parameters of the artifacts' model
+    poses : T_parent_sensor (4, 4) of all rows of the database, or by row for the matches
+    parents : parent frames of the rows; None for a single parent frame. Poses are compared only
+        within the parent frame of the prior or of most matches
+    views_of : see ViewsOf; None decides by pairs only
+    prior : pose that the robot expects
+    p : parameters; None selects the parameters of the artifacts' model
 
     Returns
     -------
-    estimate : or None if nothing suggests a pose
+    estimate : the result; None if no evidence suggests a pose
     """
     p = p or model_parameters(frames)
     parent, prior, places = judge_places(
@@ -151,10 +152,10 @@ def localize(
 
 
 class QueryDatabase(Protocol):
-    """The frames that one query searches: in the store of a service, or in an evaluation."""
+    """The frames that a query searches, in the store of a service or in an evaluation."""
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
-        """Return where the last of some frames was taken, by their matches; see `localize`."""
+        """Return the estimated pose of the last frame, from all frames' matches; see `localize`."""
 
     def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
         """Return the matches of a frame's candidates, without guided ones.
@@ -162,28 +163,28 @@ class QueryDatabase(Protocol):
         Parameters
         ----------
         frame : index of the frame
-        known : validations of candidates, by row, that are not repeated
+        known : validations of candidates by row, which are not repeated
 
         Returns
         -------
-        matches : see `associate`; None if the time is over
+        matches : result of `associate`; None if the deadline passed
         """
 
     def posed(self, rows: Sequence[int]) -> Mapping[int, PosedFrame]:
-        """Return those of some rows that have a pose."""
+        """Return the rows that have a pose."""
 
     def compare(self, rows: Sequence[int]) -> Sequence[PairMatch]:
-        """Return the matches of the last frame with some rows, without guided ones."""
+        """Return the matches of the last frame with `rows`, without guided ones."""
 
 
 def decide(
     frames: Sequence[QueryFrame], ranking: Ranking, database: QueryDatabase,
     p: LocalizationParameters,
 ) -> PoseEstimate | None:  # fmt: skip
-    """Estimate where the last frame of a query was taken, after the validations that may change it.
+    """Estimate the pose of a query's last frame, after all validations that may change it.
 
-    Guided matches are no votes: if no pose is found with them, their frames are searched. Before a
-    pose is found, similar frames elsewhere are compared; see `rival_rows`.
+    Guided matches do not vote. If no pose is found with guided matches, their frames are searched.
+    Before a pose is found, similar frames of other places are compared; see `rival_rows`.
 
     Parameters
     ----------
@@ -192,7 +193,7 @@ def decide(
 
     Returns
     -------
-    estimate : or None if nothing suggests a pose
+    estimate : the result; None if no evidence suggests a pose
     """
     of_candidates = [frame.matches for frame in frames]
     elsewhere: Sequence[PairMatch] = ()
@@ -235,16 +236,16 @@ def views_of_rows(
     ahead: Sequence[bool] | None = None,
     rendered: Sequence[bool] | None = None,
 ) -> ViewsOf:
-    """Return a function that opens the map's frames for `localize`, if all poses are in memory.
+    """Return a function that opens the map's frames for `localize`, from poses in memory.
 
     Parameters
     ----------
-    matches : matches of the query: poses are first compared on their rows
+    matches : matches of the query, on whose rows poses are compared first
     poses : T_parent_sensor (4, 4) of every row
-    open_geometry : returns the artifact of a row, or None
-    parents : parent frame of every row; default: one for all
-    ahead : whether the sensor of each row looks along z; default: all do
-    rendered : whether each row is a view rendered from a surface; default: none is
+    open_geometry : function that returns the artifact of a row, or None
+    parents : parent frame of every row; None for a single parent frame
+    ahead : whether the sensor of each row looks along z; None means that all do
+    rendered : whether each row is a view rendered from a surface; None means that none is
     """
 
     def views_of(parent: str, at: Floats) -> MapViews:  # noqa: ARG001
@@ -265,7 +266,7 @@ def views_of_rows(
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """A frame of the map: its parent frame, T_parent_sensor (4, 4), whether it looks along z."""
+    """A frame of the map, with its T_parent_sensor (4, 4) and whether its sensor looks along z."""
 
     parent: str
     T: Floats
@@ -280,23 +281,23 @@ def rival_rows(
     query_ahead: bool,
     p: LocalizationParameters | None = None,
 ) -> list[int]:
-    """Return frames similar to the query that show another place than the estimate.
+    """Return similar frames at other places than the estimate.
 
-    If two equal rooms were mapped from the same viewpoints, each signature is in the database
-    twice, and all of C may be of the wrong room. So frames of another place with signatures as near
-    as those that vote are validated before a pose is found.
+    If two identical rooms were mapped from the same viewpoints, each signature is in the database
+    twice, and all members of C may show the wrong room. Therefore frames of other places whose
+    signatures are as near as those of the voting matches are validated before a pose is found.
 
     Parameters
     ----------
     estimate : result of `localize`
     ranking : R
     tried : rows that were validated
-    posed : describes those of some rows that have a pose
+    posed : function that returns the rows with a pose
     query_ahead : whether the query's sensor looks along z
 
     Returns
     -------
-    rows : the first of R, at most `p.rivals`; none if nothing is found, or the prior decided
+    rows : first such rows of R, at most `p.rivals`; none unless matches or the map decided
     """
     p = p or LocalizationParameters()
     if estimate is None or estimate.average is None or estimate.verified_by == "prior":
@@ -320,14 +321,14 @@ def rival_rows(
 
 
 def mark_unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
-    """Return an estimate as ambiguous, because similar frames elsewhere were not compared."""
+    """Return an estimate as ambiguous, because similar frames of other places were not compared."""
     if estimate.average is None:
         return estimate
     return replace(
         estimate, status="ambiguous", average=None, covariance=None, strength=None,
         verified_by=None, members=(), guided=0,
-        reason="the deadline passed before frames of another place that look alike were compared; "
-        "allow more time",
+        reason="the deadline passed before similar frames of other places were compared. Allow "
+        "more time",
     )  # fmt: skip
 
 
@@ -335,11 +336,11 @@ def _estimate_of(
     parent: str, places: Sequence[Place], prior: PosePrior | None, p: LocalizationParameters, *,
     blind: bool = False,
 ) -> PoseEstimate:  # fmt: skip
-    """Return the estimate for judged places.
+    """Return the estimate for evaluated places.
 
     Parameters
     ----------
-    parent, prior, places : results of `judge_places`; one place or more
+    parent, prior, places : results of `judge_places`, with at least one place
     blind : whether free space is unknown
     """
     if all(place.evidence is None for place in places):
@@ -372,7 +373,7 @@ def _known(evidence: PlaceEvidence | None) -> PlaceEvidence:
 
 
 def _confidences(places: Sequence[Place], p: LocalizationParameters) -> list[float]:
-    """Return the confidence of each place; 0 for places that need votes and have none."""
+    """Return the confidence of each place; 0 for places without the votes that they require."""
     judged = compute_confidences([_known(place.evidence) for place in places], p.judgement)
     return [
         0.0 if p.voted_only and not place.votes else confidence
@@ -380,7 +381,7 @@ def _confidences(places: Sequence[Place], p: LocalizationParameters) -> list[flo
     ]
 
 
-#: Number of suggesting viewpoints for which a prior counts.
+#: Number of viewpoints as which a prior counts.
 _SUGGESTED_BY_PRIOR = 2
 
 
@@ -389,7 +390,7 @@ def _confirmed_by_prior(
 ) -> tuple[Place, float] | None:
     """Return the place that the prior selects, and its confidence; None if it selects none.
 
-    Unexpected places are no rivals of expected ones that fit the map as well.
+    Unexpected places are not rivals of expected places that fit the map equally well.
     """
     inside = [place for place in places if prior.expects(place.T)]
     most = max(place.score for place in places)
@@ -415,14 +416,14 @@ def _confirmed_by_prior(
 def _estimate_by_votes(
     parent: str, places: Sequence[Place], blind: bool, p: LocalizationParameters
 ) -> PoseEstimate:
-    """Return the estimate for places by their votes alone, without a map."""
+    """Return the estimate for places by their votes only, without a map."""
     order = sorted(places, key=lambda place: (not place.accepted, -place.weight))
     best, heaviest = order[0], max((place.weight for place in order[1:]), default=0.0)
     against = None
     if not best.accepted:
         against = "no match is accepted"
     elif heaviest * p.outweigh > best.weight:
-        against = "the matches disagree: none of their poses has twice the weight of the next"
+        against = "the matches disagree: the best pose has less than twice the weight of the next"
     elif not best.strong and not blind:
         against = "the accepted matches are weak"
     if against is None:
@@ -438,7 +439,7 @@ def _found(
     parent: str, place: Place, places: Sequence[Place], verified_by: Verifier,
     confidence: float | None, p: LocalizationParameters,
 ) -> PoseEstimate:  # fmt: skip
-    """Return the estimate that a query was taken at a place."""
+    """Return the estimate of a query that was taken at a place."""
     accepted = place.accepted
     votes = accepted[: p.views]
     covariances = [vote.covariance for vote in votes if vote.covariance is not None]
@@ -464,12 +465,12 @@ def _found_reason(
 ) -> str:  # fmt: skip
     """Return a sentence on the evidence for the answer."""
     if verified_by == "map":
-        return "the map's frames confirm this pose, and no other comes near"
+        return "the map's frames confirm this pose, and all other poses fit much worse"
     if verified_by == "prior":
-        return "several poses fit, and only this one lies where the prior expects the robot"
+        return "several poses fit, but only this pose agrees with the prior"
     if agreeing == 1:
-        reason = "one match gives the pose"
-        return reason if accepted == 1 else f"{reason}, and {accepted - 1} weaker ones disagree"
+        reason = "one match determines the pose"
+        return reason if accepted == 1 else f"{reason}, and {accepted - 1} weaker matches disagree"
     spread = (
         f", within {average.spread_m:.2g} m and {math.degrees(average.spread_rad):.2g} deg"
         if average.support > 1
@@ -477,5 +478,5 @@ def _found_reason(
     )
     reason = f"{agreeing} of {accepted} matches agree on the pose{spread}"
     if guided:
-        reason += f"; {guided} of them followed from the others"
+        reason += f", including {guided} guided by other matches"
     return f"{reason}, all from one viewpoint" if support == 1 else reason

@@ -1,4 +1,4 @@
-"""Draw frames as small pictures: depth, normals or patches.
+"""Small pictures of frames: depth, normals or patches.
 
 Surface, labels  --depth_view | normals_view | patches_view-->  colours  --picture-->  PNG
 Surfaces, transform  --overlay_picture-->  PNG
@@ -27,7 +27,7 @@ from sceneprint.types import (
 )
 from sceneprint_client.api.results import WIDTHS
 
-#: Colour of unknown pixels: dark grey, which no normal and no depth has.
+#: Colour of unknown pixels, a dark grey that represents no normal and no depth.
 UNKNOWN = 40
 
 
@@ -36,8 +36,8 @@ def normal_colours(normals: Floats32, valid: NDArray[np.bool_]) -> Bytes:
 
     Parameters
     ----------
-    normals : (h, w, 3) of unit length
-    valid : (h, w)
+    normals : (h, w, 3) unit vectors
+    valid : (h, w) mask
 
     Returns
     -------
@@ -49,10 +49,10 @@ def normal_colours(normals: Floats32, valid: NDArray[np.bool_]) -> Bytes:
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-#: Least and greatest number of pixels along the longer side of a view from above.
+#: Minimum and maximum number of pixels along the longer side of a view from above.
 _LEAST, _MOST = 16, 320
 _OPTICAL = "x right, y down, z forward"
-_AXES = "the x, y and z of its own axes"
+_AXES = "x, y and z in the axes of the cloud"
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,8 @@ class Vista:
 
     Parameters
     ----------
-    pixels : (h, w) int32, index of the point of each pixel; -1 for none
-    distances : (N,) float64, metres, of each point
+    pixels : (h, w) int32, index of the point of each pixel; -1 for pixels without a point
+    distances : (N,) float64, distances of the points, metres
     what : kind of distances: "depth" along a camera's axis, "range" from a viewpoint, or "height"
     axes : description of the axes of normals
     """
@@ -73,20 +73,21 @@ class Vista:
     axes: str
 
     def of(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Return the values (h, w, ...) of the shown points; arbitrary if a pixel shows none."""
+        """Return the values (h, w, ...) of the shown points; arbitrary for pixels without one."""
         chosen: NDArray[Scalar] = values[self.pixels]
         return chosen
 
     @property
     def shown(self) -> NDArray[np.bool_]:
-        """Return whether each pixel shows a point, (h, w)."""
+        """Return a mask (h, w) of the pixels that show a point."""
         return self.pixels >= 0
 
 
 def vista_of(surface: Surface) -> Vista:
-    """Return the image of a surface: from its camera, or around its viewpoint.
+    """Return the image of a surface from its camera or around its viewpoint.
 
-    Unordered points are seen from the side of their least extent, which is above in a building.
+    The view of unordered points is along the axis of their minimum extent, which is vertical in a
+    building.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def vista_of(surface: Surface) -> Vista:
     if isinstance(surface.camera, Intrinsics):
         return Vista(pixels, points[:, 2], "depth", _OPTICAL)
     if isinstance(surface.camera, Sphere):
-        # azimuth rises to the left if the pole is up; an optical frame's y points down
+        # azimuth increases to the left if the pole is up; y of an optical frame points down
         flipped = pixels[::-1] if surface.camera.pole == 1 else pixels[:, ::-1]
         return Vista(flipped, np.linalg.norm(points, axis=1), "range", _AXES)
     return _from_above(points, surface.valid.ravel())
@@ -110,13 +111,13 @@ def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Int
     Parameters
     ----------
     vista : vista of `surface`
-    surface : the drawn surface
-    points : (N, 3) metres, in its coordinates
-    labels : (N,) label of each point, -1 for none
+    surface : surface that is drawn
+    points : (N, 3) metres, in the coordinates of the surface
+    labels : (N,) label of each point; -1 without a label
 
     Returns
     -------
-    labels : (h, w) label of the point nearest to that of each pixel; -1 for none
+    labels : (h, w) label of the point that is nearest to each pixel's point; -1 without a label
     """
     from scipy.spatial import KDTree
 
@@ -133,28 +134,30 @@ def _from_above(points: Floats, valid: NDArray[np.bool_]) -> Vista:
         return Vista(np.full((1, 1), -1, np.int32), np.zeros(len(points)), "height", _AXES)
     centred = points - points[seen].mean(axis=0)
     _, axes = np.linalg.eigh(centred[seen].T @ centred[seen])
-    for i in (0, 2):  # the sense of the nearest coordinate axis
+    for i in (0, 2):  # orient the axes like the nearest coordinate axes
         axes[:, i] *= np.sign(axes[np.argmax(np.abs(axes[:, i])), i])
     above, right = axes[:, 0], axes[:, 2]
     heights = centred @ above
-    flat = np.stack([centred @ np.cross(right, above), centred @ right], axis=1)  # down, right
+    flat = np.stack(
+        [centred @ np.cross(right, above), centred @ right], axis=1
+    )  # image axes: down, right
     low = flat[seen].min(axis=0)
     size = np.maximum(flat[seen].max(axis=0) - low, 1e-6)
     longer = min(max(math.isqrt(len(seen)), _LEAST), _MOST)
     cell = size.max() / (longer - 1)
     rows, columns = np.rint((flat[seen] - low) / cell).astype(np.intp).T
     pixels: Ints32 = np.full((rows.max() + 1, columns.max() + 1), -1, np.int32)
-    order = np.argsort(heights[seen], kind="stable")  # the highest is written last
+    order = np.argsort(heights[seen], kind="stable")  # the highest point is written last
     pixels[rows[order], columns[order]] = seen[order]
     return Vista(pixels, heights, "height", _AXES)
 
 
-#: Maximum number of rows; higher pictures are scaled down.
+#: Maximum number of rows; pictures with more rows are scaled down.
 MOST_ROWS = 2560
 
-#: Percentiles of near and far depth: a stray sample must not darken all others.
+#: Percentiles of near and far depth, so that stray samples do not darken the picture.
 _RANGE = (1.0, 99.0)
-#: The colour map viridis at equal steps; linear interpolation errs by at most 6 of 255.
+#: Colours of the map viridis at equal steps; the error of linear interpolation is at most 6 of 255.
 _VIRIDIS = np.array(
     [
         (68, 1, 84), (72, 24, 106), (71, 45, 123), (66, 64, 134), (59, 82, 139), (51, 99, 141),
@@ -164,9 +167,9 @@ _VIRIDIS = np.array(
     ],
     np.float64,
 )  # fmt: skip
-#: Number of spare colours, so that the last patches can select too.
+#: Number of additional colours, so that the last patches have a choice too.
 _SPARE = 64
-#: Oklab to linear sRGB: to the cube roots of cone responses, then to the primaries.
+#: Conversion of Oklab to linear sRGB: to the cube roots of cone responses, then to the primaries.
 _TO_CONES = np.array(
     [(1, 0.3963377774, 0.2158037573), (1, -0.1055613458, -0.0638541728),
      (1, -0.0894841775, -1.2914855480)]
@@ -180,7 +183,7 @@ _TO_PRIMARIES = np.array(
 def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     """Return depth in a perceptually uniform colour map: near is yellow, far is violet.
 
-    For clouds it shows the range, or from above the height: high is yellow.
+    For clouds, the view shows the range or, from above, the height: high is yellow.
 
     Parameters
     ----------
@@ -190,7 +193,7 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     -------
     colours : (h', w', 3) uint8, pixels of `vista_of`; dark grey if unknown
     meaning : `near_m` and `far_m`, the depths or ranges at the ends of the colour map; for heights
-        `low_m` and `high_m`, from their mean
+        `low_m` and `high_m`, relative to the mean height
     """
     vista = vista_of(surface)
     z, shown = vista.of(vista.distances), vista.shown
@@ -203,7 +206,8 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
         ends, words = ("low_m", "high_m"), (f"{far:.2f} m or higher", f"{near:.2f} m or lower")
     meaning = {
         **dict(zip(ends, (f"{near:.4f}", f"{far:.4f}"), strict=True)),
-        "Description": f"{vista.what}: yellow {words[0]}, violet {words[1]}, dark grey unknown",
+        "Description": f"{vista.what}: yellow is {words[0]}, violet is {words[1]}, dark grey is "
+        "unknown",
     }
     return np.where(shown[..., None], mixed, UNKNOWN), meaning
 
@@ -217,7 +221,7 @@ def viridis(shares: Floats) -> Bytes:
 
 
 def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
-    """Return unit normals in the sensor's axes: red, green, blue are 127.5 (1 + x, y, z).
+    """Return unit normals in the sensor's axes as colours: (r, g, b) = 127.5 (1 + (x, y, z)).
 
     Parameters
     ----------
@@ -226,12 +230,12 @@ def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     Returns
     -------
     colours : (h', w', 3) uint8, pixels of `vista_of`; dark grey if unknown
-    meaning : description
+    meaning : description of the colours
     """
     vista = vista_of(surface)
     frame = "optical frame" if vista.what == "depth" else "sensor's frame"
     text = (
-        f"normals in the {frame}: red, green, blue are 127.5 (1 + n) of {vista.axes}; dark grey "
+        f"normals in the {frame}: red, green, blue are 127.5 (1 + n) of {vista.axes}; dark grey is "
         "unknown"
     )
     normals = vista.of(surface.normals.reshape(-1, 3))
@@ -239,41 +243,41 @@ def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
 
 def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
-    """Return patches, each in a colour that differs from those of its neighbours.
+    """Return patches in colours that differ between neighbours.
 
     Parameters
     ----------
-    labels : (h, w) index of each pixel's patch, -1 for none
+    labels : (h, w) index of each pixel's patch; -1 for pixels without a patch
 
     Returns
     -------
     colours : (h, w, 3) uint8, deterministic; dark grey without a patch
-    meaning : description
+    meaning : description of the colours
     """
     count = int(labels.max(initial=-1)) + 1
     palette = np.concatenate([_colours_of(labels, count), np.full((1, 3), UNKNOWN, np.uint8)])
-    text = f"{count} patches of the finest level, each a colour; dark grey none"
+    text = f"{count} patches of the finest level, one colour per patch; dark grey is no patch"
     return palette[labels], {"patches": str(count), "Description": text}
 
 
 def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
-    """Return colours as a PNG of a width; pixels are repeated or omitted, never mixed.
+    """Return colours as a PNG file of a width; pixels are repeated or omitted, but not mixed.
 
     Parameters
     ----------
     colours : (h, w, 3) uint8
-    width : columns; fewer if there would be more than MOST_ROWS rows
-    text : texts for the file's tEXt chunks
+    width : number of columns; it is reduced if there would be more than MOST_ROWS rows
+    text : texts for the tEXt chunks of the file
 
     Raises
     ------
-    ValueError : the width is beyond WIDTHS
+    ValueError : If the width is outside WIDTHS
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     if not WIDTHS[0] <= width <= WIDTHS[1]:
-        raise ValueError(f"width {width}: from {WIDTHS[0]} to {WIDTHS[1]}")
+        raise ValueError(f"The width {width} is not in the range {WIDTHS[0]} to {WIDTHS[1]}.")
     scale = min(width / colours.shape[1], MOST_ROWS / colours.shape[0])
     rows, columns = (_sample_indices(n, max(round(n * scale), 1)) for n in colours.shape[:2])
     info = PngInfo()
@@ -284,9 +288,9 @@ def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
     return buffer.getvalue()
 
 
-#: Colours of the query and of the match, red, green, blue, as on the dashboard.
+#: Colours (red, green, blue) of the query and of the match, as on the dashboard.
 QUERY_COLOUR, MATCH_COLOUR = (217, 119, 43), (43, 108, 176)
-#: Pixels along the longer side of a panel, and points per pixel of full colour.
+#: Number of pixels along the longer side of a panel, and of points in a pixel of full colour.
 _PANEL, _FULL = 480, 1.5
 
 
@@ -295,17 +299,17 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
 
     Parameters
     ----------
-    query, match : points in their own cameras, metres
-    T_match_query : (4, 4) query coordinates to the match's
-    title : one line of ASCII above the panels
+    query, match : surfaces in their cameras' coordinates, metres
+    T_match_query : (4, 4) transform from the query to the match
+    title : line of ASCII above the panels
     """
     from PIL import Image, ImageDraw
 
-    # from above: x to the right, and z, the match camera's axis, upwards
+    # in the view from above, x points to the right and z, the axis of the match's camera, upwards
     ours, theirs = (surface.points[surface.valid].astype(np.float64) for surface in (query, match))
     aligned = transform_points(T_match_query, ours)
     everything = np.concatenate([theirs, ours, aligned])[:, [0, 2]]
-    low, high = np.percentile(everything, (1, 99), axis=0)  # without stray points
+    low, high = np.percentile(everything, (1, 99), axis=0)  # exclude stray points
     scale = (_PANEL - 1) / (high - low).max()
     columns, rows = np.ceil((high - low) * scale).astype(int) + 1
     panels = []
@@ -332,12 +336,12 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
 
 
 def _sample_indices(n: int, wanted: int) -> NDArray[np.intp]:
-    """Return the indices of `wanted` of `n` pixels, those under the centres."""
+    """Return the indices of the pixels, of `n`, at the centres of `wanted` pixels."""
     return ((np.arange(wanted) + 0.5) * n / wanted).astype(np.intp)
 
 
 def _colours_of(labels: Ints32, count: int) -> Bytes:
-    """Return a colour per patch: the free colour most unlike those of its neighbours so far."""
+    """Return a colour per patch: the free colour that differs most from its neighbours' colours."""
     lab = _palette(count + _SPARE)
     squares = (lab**2).sum(axis=1)[:, None]
     neighbours = _neighbours(labels, count)
@@ -367,9 +371,9 @@ def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
 
 
 def _palette(count: int) -> Floats:
-    """Return colours (count, 3) in Oklab, spread evenly over hues and lightnesses."""
+    """Return colours (count, 3) in Oklab, evenly distributed over hues and lightnesses."""
     n = np.arange(1, count + 1)
-    # powers of the plastic number spread points evenly over the square (Roberts 2018)
+    # powers of the plastic number distribute points evenly over the square (Roberts 2018)
     plastic = 1.32471795724474602596
     lightness = 0.48 + 0.4 * ((0.5 + n / plastic) % 1.0)
     hue = 2.0 * math.pi * ((0.5 + n / plastic**2) % 1.0)

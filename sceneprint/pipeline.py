@@ -1,4 +1,4 @@
-"""Run the stages of the paper's Fig. 1.
+"""The stages of the paper's Fig. 1.
 
 frame --prepare--> signature, geometry
 signature, database --retrieve--> R --diversify--> C --associate--> C_vld --localize--> pose
@@ -77,22 +77,22 @@ __all__ = [
 
 
 def sign(frame: AnyFrame, signer: Signer) -> Signature:
-    """Return the stored signature of a frame: Sec. III-A, III-B, III-F; whitened if its model is.
+    """Return the stored signature of a frame: Sec. III-A, III-B, III-F.
 
     Raises
     ------
-    UselessFrame : no samples lie within the sensor's range, or no two patches are within reach
+    UselessFrame : If no samples lie within the sensor's range, or no two patches are within reach
     """
     p = signer.model.parameters
     return encode(hierarchy_of(see(frame, p), p, frame.name), signer, frame.name)
 
 
 def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
-    """Return the signature and the geometry artifact of a frame, from one pass over its surface.
+    """Return the signature and the geometry artifact of a frame, which share its surface.
 
     Raises
     ------
-    UselessFrame : see `sign`
+    UselessFrame : If `sign` raises it
     """
     p = signer.model.parameters
     seen = see(frame, p)
@@ -121,22 +121,22 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
 
 
 def _scan(cloud: Cloud, p: CloudParameters) -> Surface:
-    """Return the range image of a cloud; if it sees all around, with points spread over it."""
+    """Return the range image of a cloud, with spread points if the sensor sees all around."""
     shown = range_image(cloud, p)
     if not (isinstance(shown.camera, Sphere) and shown.camera.sees_around):
         return shown
     points = spread_points(cloud, shown, p)
-    # distant surfaces have few points, so cubes must be narrower than for even points
+    # distant surfaces have few points, so cubes must be narrower than for evenly spread points
     even = math.sqrt(float(points.areas.sum(dtype=float)) / SPREAD_POINTS)
     return replace(shown, spread=thin_points(points, SPREAD_POINTS, even / 12))
 
 
 def distance(a: Signature, b: Signature) -> int:
-    """Return the distance of two stored signatures in their model's metric: -s(X, Y) of Sec. III-C.
+    """Return the distance between two stored signatures: -s(X, Y) of Sec. III-C.
 
     Raises
     ------
-    ModelMismatch : the signatures are of two models
+    ModelMismatch : If the signatures are of two models
     """
     _same_model(a, b)
     return int(distances(a.vector, b.vector[None], a.metric)[0])
@@ -145,17 +145,17 @@ def distance(a: Signature, b: Signature) -> int:
 def retrieve(
     query: Signature, database: Sequence[Signature], model: Model, size: int | None = None
 ) -> Ranking:
-    """Return R, the database frames most similar to the query: Sec. III-C.
+    """Return R, the database frames that are most similar to the query: Sec. III-C.
 
     Parameters
     ----------
     database : N signatures
     model : model of all signatures
-    size : size of R; default: by the size of the map, see `ranking_size`
+    size : size of R; None selects it by the size of the map, see `ranking_size`
 
     Raises
     ------
-    ModelMismatch : the signatures are of several models, or not of `model`
+    ModelMismatch : If the signatures are of several models, or not of `model`
     """
     _same_model(query, model)
     for signature in database:
@@ -171,17 +171,17 @@ def diversify(
     k: int = 10,
     p: DiversityParameters | None = None,
 ) -> Selection:
-    """Return C, `k` of R that are near the query and differ from each other: Sec. III-D.
+    """Return C, the `k` members of R that are near the query and diverse: Sec. III-D.
 
     Parameters
     ----------
     ranking : R
-    database : database of R
+    database : signatures to which R refers
     k : size of C
 
     Returns
     -------
-    selection : positions in R, the top-ranked first, in the order of R
+    selection : positions in R, in the order of R
     """
     ranked = [database[i] for i in ranking.indices]
     metric: Metric = ranked[0].metric if ranked else "l2"
@@ -205,16 +205,16 @@ def validate(
     Parameters
     ----------
     query, match : geometry artifacts of one model
-    seed : seed of the random choices; the result repeats it
-    p : default: `model.parameters.validation` of the artifacts' model
-    mode : "full", or "paper" for the paper's test alone
+    seed : seed of the random choices, which the result contains
+    p : parameters; None selects `model.parameters.validation` of the artifacts' model
+    mode : "full", or "paper", which applies only the paper's test
     matching : "histograms", or "sequence" for the paper's matching, which is slower
-    ups : (3,) unit vectors, up in the query's and in the match's coordinates if known
-    other_axes : whether scanners may not have stood upright
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates; None if unknown
+    other_axes : whether to consider scanners that did not stand upright
 
     Raises
     ------
-    ModelMismatch : the artifacts are of two models, or of a model that this process has not used
+    ModelMismatch : If the artifacts are of two models, or of a model that this process has not used
         and `p` is missing
     """
     _same_model(query, match)
@@ -232,7 +232,7 @@ def validate_guided(
 
     Raises
     ------
-    ModelMismatch : see `validate`
+    ModelMismatch : If `validate` raises it
     """
     _same_model(query, match)
     return check_predicted(
@@ -243,19 +243,19 @@ def validate_guided(
 def validate_without_up(
     query: Geometry, match: Geometry, seed: int, p: ValidationParameters | None, ups: Ups
 ) -> PairValidation | None:
-    """Validate by the surfaces alone, if a query found nothing with `up`: Sec. III-E.
+    """Validate by the surfaces only, if a query found no match with `up`: Sec. III-E.
 
     See `sceneprint.geometry.validation.validation.validate_without_up`.
 
     Raises
     ------
-    ModelMismatch : see `validate`
+    ModelMismatch : If `validate` raises it
     """
     _same_model(query, match)
     return check_up(query, match, seed, p or _validation_parameters(query), ups)
 
 
-#: Parameters of the models that this process has used, by id: an artifact stores only the id.
+#: Parameters of the models that this process has used, by id, since an artifact stores only the id.
 _PARAMETERS: dict[str, tuple[ValidationParameters, AnswerParameters]] = {}
 
 
@@ -264,21 +264,21 @@ def _validation_parameters(geometry: Geometry) -> ValidationParameters:
     _learn_presets(geometry.model_id)
     if geometry.model_id not in _PARAMETERS:
         raise ModelMismatch(
-            f"The artifacts are of model {geometry.model_id[:12]}, which ships with no preset and "
-            "has not been used by this process. Pass `p`, its `model.parameters.validation`."
+            f"The artifacts are of model {geometry.model_id[:12]}, which is not a preset and has "
+            "not been used by this process. Pass `p`, its `model.parameters.validation`."
         )
     return _PARAMETERS[geometry.model_id][0]
 
 
 def answer_parameters(geometry: Geometry) -> AnswerParameters:
-    """Return the answer parameters of an artifact's model; defaults if it was not used here."""
+    """Return the answer parameters of an artifact's model; defaults if the model is unknown."""
     _learn_presets(geometry.model_id)
     parameters = _PARAMETERS.get(geometry.model_id)
     return AnswerParameters() if parameters is None else parameters[1]
 
 
 def _learn_presets(model_id: str) -> None:
-    """Store the parameters of the presets, unless those of the model are known."""
+    """Store the parameters of the presets if those of the model are unknown."""
     if model_id not in _PARAMETERS:
         for model in map(read_model, PRESETS):
             _PARAMETERS[model.id] = model.parameters.validation, model.answer
@@ -299,16 +299,17 @@ def _same_model(a: Signature | Geometry, b: Signature | Geometry | Model) -> Non
         )
 
 
-#: Default number of accepted matches per query; confidences are learnt with it.
+#: Default number of accepted matches per query, for which confidences are fitted.
 VERDICT_MATCHES = 5
 
-#: Returns the parent frame and T_parent_sensor (4, 4) of a row of the database, or None.
+#: Function that returns the parent frame and T_parent_sensor (4, 4) of a row of the database, or
+#: None.
 PoseOf = Callable[[int], tuple[str, Floats] | None]
 
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    """A database frame validated against a query.
+    """A database frame and its validation against a query.
 
     Parameters
     ----------
@@ -342,39 +343,38 @@ def associate(
 ) -> list[PairMatch]:
     """Validate candidates in the order of R until `k` are accepted: Sec. III-E.
 
-    Once two strong matches from different viewpoints agree on the query's pose, the map's poses
-    predict the transforms of later candidates: these are refined and checked, and searched only if
-    the check fails.
+    If two strong matches from different viewpoints agree on the query's pose, the map's poses
+    predict the transforms of later candidates. Predicted transforms are refined and checked, and
+    searched only if the check fails.
 
     Parameters
     ----------
     query : geometry artifact
     ranking : R
-    among : ascending positions in R to try: C, or the first of R
-    open_geometry : returns the artifact of a row; None skips the row
+    among : ascending positions in R to validate: C, or the first of R
+    open_geometry : function that returns the artifact of a row; None skips the row
     k : number of accepted matches after which to stop, at least 1
     seed, p, mode, matching : arguments of `validate`
-    go_on : called before each candidate; False ends the search
-    up : (3,) unit vector in the query's sensor, or None
-    up_of : the same for a row of the database
-    pose_of : parent frame and T_parent_sensor (4, 4) of a row, or None; default: no row has a pose,
-        and every transform is searched
-    known : validations by row that are not repeated
-    retry : whether to retry the first few in other ways if nothing is accepted
+    go_on : function that is called before each candidate; False ends the search
+    up : (3,) up, a unit vector in the query's sensor; None if unknown
+    up_of : function that returns the same for a row of the database
+    pose_of : see PoseOf; by default no row has a pose, and every transform is searched
+    known : validations by row, which are not repeated
+    retry : whether to validate the first candidates in other ways if no match is accepted
 
     Returns
     -------
-    matches : all tried candidates: C_vld first (`rank_accepted`), then those that are not accepted,
-        first those that fit but tilt against `up`. If nothing is accepted, the first few are
-        validated again without `up`, and scans with other axes.
+    matches : all validated candidates: C_vld first (`rank_accepted`), then transforms that fit but
+        tilt against `up`, then the remaining ones. If no match is accepted, the first candidates
+        are validated again without `up`, and scans with other axes.
 
     Raises
     ------
-    ModelMismatch : the artifacts are of two models
-    ValueError : k is below 1
+    ModelMismatch : If the artifacts are of two models
+    ValueError : If k is below 1
     """
     if k < 1:
-        raise ValueError(f"k = {k}: request 1 match or more")
+        raise ValueError(f"k is {k}. Request at least 1 match.")
     tried: list[PairMatch] = []
     accepted = 0
     for position in among:
@@ -414,22 +414,23 @@ def associate(
 
 
 def unguided_validations(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
-    """Return the validations that were searched, by row; None if no match was guided."""
+    """Return the validations by search, by row; None if no match was guided."""
     if not any(match.validation.guided for match in matches):
         return None
     return {m.index: m.validation for m in matches if not m.validation.guided}
 
 
-#: Number of strong matches from different viewpoints that can guide others.
+#: Number of strong matches from different viewpoints that guide other matches.
 _GUIDES = 2
 
 
 def _predicted(
     tried: Sequence[PairMatch], index: int, pose_of: PoseOf, p: MapParameters
 ) -> Floats | None:
-    """Return T_match_query of a candidate by its pose and the matches before.
+    """Return T_match_query of a candidate as its pose and the previous matches predict it.
 
-    None if too few of these are strong, or an accepted or ambiguous one supports another pose.
+    The result is None if too few of these matches are strong, or if an accepted or ambiguous match
+    supports another pose.
     """
     own = pose_of(index)
     if own is None:
@@ -456,7 +457,8 @@ def _predicted(
     return inverse(own[1]) @ T_parent_query
 
 
-#: Number of candidates that are retried for a scanner that did not stand upright, or a wrong `up`.
+#: Number of candidates that are validated again for a scanner that did not stand upright or a wrong
+#: `up`.
 _TILTED_TRIES = 3
 
 
@@ -464,9 +466,9 @@ def _retry_tilted(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Validate the first candidates as scans of a scanner on its side or upside down, in place.
+    """Validate the first candidates again for a scanner on its side or upside down.
 
-    Only accepted results replace earlier ones.
+    Accepted results replace earlier ones in `tried`.
     """
     for place, before in enumerate(tried[:_TILTED_TRIES]):
         geometry = open_geometry(before.index)
@@ -487,7 +489,7 @@ def _retry_without_up(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Validate the first candidates by surfaces alone, because `up` may be wrong, in place."""
+    """Validate the first candidates by surfaces only, since `up` may be wrong; update `tried`."""
     for place, before in enumerate(tried[:_TILTED_TRIES]):
         geometry, ups = open_geometry(before.index), before.validation.ups
         if geometry is None or not go_on():

@@ -1,8 +1,8 @@
-"""Judge the places where a query may have been taken by matches, map and prior.
+"""Evaluation of the places where a query may have been taken, by matches, map and prior.
 
 matches, poses, MapViews  --judge_places-->  Place, ...
 
-Accepted matches vote with their poses. These poses, and all others that candidates suggest, are
+Accepted matches vote with their poses. These poses, and further poses that candidates suggest, are
 compared on the frames of the map that would see the same surfaces.
 """
 
@@ -40,23 +40,23 @@ from sceneprint.types import Floats, Geometry
 class LocalizationParameters:
     """Parameters of the answer; docs/trust.md describes how they were tuned."""
 
-    confidence: float = 0.99  #: least confidence of a pose that is found
-    worth: float = 0.05  #: least confidence of an alternative
+    confidence: float = 0.99  #: minimum confidence of a pose that is found
+    worth: float = 0.05  #: minimum confidence of an alternative
     views: int = 5  #: maximum number of averaged votes, and of alternatives
-    weak: float = 0.4  #: weight of a weak or ambiguous match; a strong one counts 1
-    outweigh: float = 2.0  #: least ratio of the weights of the best two places, without a map
-    voted_only: bool = False  #: whether a pose needs the vote of a match
+    weak: float = 0.4  #: weight of a weak or ambiguous match; a strong match has weight 1
+    outweigh: float = 2.0  #: minimum ratio of the weights of the best two places, without a map
+    voted_only: bool = False  #: whether a pose requires the vote of a match
     prior_odds: float = 20.0  #: factor of the odds of a pose that a prior expects
-    prior_share: float = 0.9  #: least score of a pose that a prior selects, as a share of the best
-    most_noise: float = 0.2  #: greatest noise of the map that excuses violations
-    rivals: int = 2  #: maximum number of frames elsewhere to compare before a pose is found
-    rival_distance: float = 1.2  #: their greatest distance, as a multiple of the farthest vote's
+    prior_share: float = 0.9  #: minimum score for a prior to select a pose, share of the best
+    most_noise: float = 0.2  #: maximum noise of the map that excuses violations
+    rivals: int = 2  #: maximum number of frames of other places that are compared
+    rival_distance: float = 1.2  #: their maximum distance, as a multiple of the farthest vote's
     map: MapParameters = field(default_factory=MapParameters)
     judgement: ConfidenceModel = field(default_factory=ConfidenceModel)
 
     @classmethod
     def of(cls, answer: AnswerParameters) -> LocalizationParameters:
-        """Return the parameters of a model."""
+        """Return the parameters from a model's parameters of the answer."""
         return cls(map=answer.map, judgement=answer.confidence)
 
 
@@ -68,7 +68,7 @@ class QueryFrame:
     ----------
     geometry : artifact of the frame
     matches : results of `associate`, accepted or not
-    T : (4, 4) T_query_sensor, by odometry; the identity for the frame to localize
+    T : (4, 4) T_query_sensor by odometry; the identity for the localized frame
     """
 
     geometry: Geometry
@@ -78,13 +78,13 @@ class QueryFrame:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The pose that a robot expects before the query.
+    """The pose at which a robot expects itself.
 
     Parameters
     ----------
     parent : parent frame of the pose
     T : (4, 4) T_parent_query
-    covariance : (6, 6) of errors (x, y, z, rx, ry, rz) in the parent's axes: metres, radians
+    covariance : (6, 6) of errors (x, y, z, rx, ry, rz) in the parent's axes, metres and radians
     """
 
     parent: str
@@ -94,14 +94,14 @@ class PosePrior:
     def reaches(self, pose: Floats, p: MapParameters) -> bool:
         """Return whether a frame at T_parent_sensor (4, 4) may see the robot's surroundings.
 
-        They are within `p.same_surfaces` plus three deviations of the prior.
+        Its maximum distance is `p.same_surfaces` plus three standard deviations of the prior.
         """
         deviation = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
         apart = float(np.linalg.norm(pose[:3, 3] - self.T[:3, 3]))
         return apart <= p.same_surfaces + 3 * deviation
 
     def expects(self, T: Floats) -> bool:
-        """Return whether a pose T_parent_query (4, 4) lies within 99.9 % of its mass."""
+        """Return whether a pose T_parent_query (4, 4) is within 99.9 % of the prior."""
         error = pose_error(self.T, T)
         return float(error @ np.linalg.solve(self.covariance, error)) <= _CHI_SQUARE_6
 
@@ -112,7 +112,7 @@ _CHI_SQUARE_6 = 22.458
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
-    """A match's vote: the pose T and the viewpoint of the match, (4, 4) in the parent frame."""
+    """The vote of a match: its pose T and its viewpoint, (4, 4) in the parent frame."""
 
     match: PairMatch
     T: Floats
@@ -132,10 +132,10 @@ class Place:
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    votes : votes of matches, most reliable first
+    votes : votes of matches, the most reliable first
     support : number of viewpoints of the voting matches
-    weight : weight of these votes, 1 for a strong match, less for a weak or an ambiguous one
-    evidence : evidence for its pose; None without a map
+    weight : total weight of the votes: 1 for a strong match, less for a weak or ambiguous match
+    evidence : evidence for the pose; None without a map
     """
 
     T: Floats
@@ -151,16 +151,17 @@ class Place:
 
     @property
     def strong(self) -> bool:
-        """Return whether a strong match votes for it."""
+        """Return whether a strong match votes for the place."""
         return any(vote.match.validation.strength == "strong" for vote in self.votes)
 
     @property
     def score(self) -> float:
-        """Return its score on the map, 0 without a map."""
+        """Return the score on the map; 0 without a map."""
         return 0.0 if self.evidence is None else self.evidence.score
 
 
-#: Returns the frames of a parent frame that may see the surroundings of poses (n, 4, 4).
+#: Function that returns the frames of a parent frame that may see the surroundings of poses
+#: (n, 4, 4).
 ViewsOf = Callable[[str, Floats], MapViews]
 
 _NONE = np.empty((0, 4, 4))
@@ -176,7 +177,7 @@ def judge_places(
     parents: Sequence[str] | Mapping[int, str] | None, views_of: ViewsOf | None,
     prior: PosePrior | None, p: LocalizationParameters, overlap_p: OverlapParameters,
 ) -> tuple[str, PosePrior | None, list[Place]]:  # fmt: skip
-    """Return every place that a match, the map or the prior suggests, with its evidence.
+    """Return all places that a match, the map or the prior suggests, with their evidence.
 
     Parameters
     ----------
@@ -185,7 +186,7 @@ def judge_places(
     Returns
     -------
     parent : parent frame in which poses are compared
-    prior : the argument, or None if it is of another parent frame
+    prior : the argument; None if its parent frame is another
     places : places with votes first, then by score
     """
     parent = _parent(frames, parents)
@@ -213,7 +214,7 @@ def judge_places(
 
 
 def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None) -> str:
-    """Return the parent frame with most strong matches, then most accepted, then most tried."""
+    """Return the parent frame with the most strong, then accepted, then validated matches."""
     counts: dict[str, tuple[int, int, int]] = {}
     for frame in frames:
         for match in frame.matches:
@@ -223,14 +224,12 @@ def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, 
             counts[name] = (
                 strong + (v.strength == "strong"), accepted + (v.status == "accepted"), tried + 1
             )  # fmt: skip
-    # the first of equals, by the order of insertion
     return max(counts, key=counts.__getitem__, default="")
 
 
 def _accepts(
     frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None, parent: str
 ) -> bool:
-    """Return whether a match in a parent frame is accepted."""
     return any(
         match.validation.status == "accepted"
         and ("" if parents is None else parents[match.index]) == parent
@@ -241,13 +240,13 @@ def _accepts(
 
 @dataclass(frozen=True, eq=False)
 class _Suggestions:
-    """Poses that candidates suggest: the best of each candidate first, then the next best.
+    """Poses that candidates suggest: the best pose of each candidate, then the next best.
 
     Parameters
     ----------
     T : (n, 4, 4) T_parent_query
-    viewpoints : (n, 4, 4) T_parent_sensor of the candidate
-    similarities : (n,) similarities of the candidate's and the query's signatures
+    viewpoints : (n, 4, 4) T_parent_sensor of the candidates
+    similarities : (n,) similarities between the candidates' signatures and the query's
     """
 
     T: Floats
@@ -258,7 +257,6 @@ class _Suggestions:
 def _suggest_poses(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats]
 ) -> _Suggestions:
-    """Return the poses that candidates suggest."""
     of_each = [
         (match, poses[match.index] @ match.validation.hypotheses @ inverse(frame.T))
         for frame in frames
@@ -284,7 +282,7 @@ def _votes(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
     p: LocalizationParameters,
 ) -> list[_Vote]:  # fmt: skip
-    """Return the votes of accepted matches, best first, then those of ambiguous ones."""
+    """Return the votes of accepted matches, best first, then the votes of ambiguous matches."""
     votes: list[_Vote] = []
     for frame in frames:
         first = rank_accepted([match.validation for match in frame.matches])
@@ -308,7 +306,7 @@ def _votes(
 def _group_votes(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
 ) -> list[list[_Vote]]:
-    """Group votes by place: those of the scored poses, in their order, then their own."""
+    """Group votes by place: the places of scored poses in their order, then further places."""
     groups: list[list[_Vote]] = [[] for _ in scored]
     others: list[list[_Vote]] = []
     for vote in votes:
@@ -346,7 +344,7 @@ def _place(
     group: list[_Vote], pose: ScoredPose | None, p: LocalizationParameters,
     evidence: PlaceEvidence | None = None,
 ) -> Place:  # fmt: skip
-    """Return the place of some votes, or of a scored pose, or of both."""
+    """Return the place of votes, a scored pose, or both."""
     accepted = any(vote.accepted for vote in group)
     T = group[0].T if pose is None or accepted else pose.T
     support, weight = _weight(group, p)
@@ -354,9 +352,9 @@ def _place(
 
 
 def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
-    """Return the number of voting viewpoints, and the weight of their first votes.
+    """Return the number of voting viewpoints, and the total weight of the first vote of each.
 
-    Neither a copy of a view nor a guided match counts as a vote.
+    Copies of a view and guided matches do not count.
     """
     voting = [vote for vote in group if not vote.match.validation.guided]
     viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
@@ -373,10 +371,10 @@ def _evidence(
     Parameters
     ----------
     group : votes for the place
-    pose : scored pose; None if there is none
+    pose : scored pose; None without one
     suggested : result of `_suggest_poses`
     views : the map's frames
-    rival, rival_weight : best score, and greatest weight, of another place
+    rival, rival_weight : best score and maximum weight of the other places
     """
     weight = _weight(group, p)[1]
     strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]

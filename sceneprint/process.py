@@ -1,11 +1,8 @@
-"""What a process sets up when it starts, and what it says of its work.
+"""Set-up and instrumentation of a process: logs, limits, stop signals, secrets, context, latencies.
 
-Log lines, limits, stop signals, and secrets out of files: a log line is one JSON object on standard
-error, and container engines hand secrets over in files, in place of the environment.
-
-What is known of the current request goes with it into threads: its id, its tenant and its actor.
-
-Times are counted in histograms, which add up over processes.
+A log line is one JSON object on standard error. Container engines pass secrets in files instead of
+the environment. The id, tenant and actor of the current request are context variables, which
+threads inherit. Latencies are counted in histograms, which can be added over processes.
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ from types import FrameType
 
 from sceneprint.errors import InvalidRequest
 
-#: What every record has; the rest was given with `extra` and is written as it is.
+#: Attributes of every log record. All others come from `extra` and are written unchanged.
 _OWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
 
 
@@ -38,13 +35,13 @@ _request: ContextVar[str | None] = ContextVar("request", default=None)
 
 
 def name_request(request_id: str | None) -> None:
-    """Name the request in all that this task, and the threads it begins, log from now on."""
+    """Set the request id for the log lines of this task and of the threads that it starts."""
     _request.set(request_id)
 
 
 @contextmanager
 def of_request(request_id: str | None) -> Iterator[None]:
-    """Name the request in all that is logged meanwhile, here and in threads begun here."""
+    """Set the request id within the context; see `name_request`."""
     before = _request.set(request_id)
     try:
         yield
@@ -53,15 +50,15 @@ def of_request(request_id: str | None) -> Iterator[None]:
 
 
 def request_id() -> str | None:
-    """Id of the request that is worked on, if there is any."""
+    """Return the id of the current request, if there is one."""
     return _request.get()
 
 
 class JsonFormatter(logging.Formatter):
-    """A record as one line: time, level, logger, message, request, and what `extra` gave."""
+    """A formatter of log records as JSON: time, level, logger, message, request, and `extra`."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line."""
+        """Return the line of a record."""
         line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -77,7 +74,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def log_as_json(level: int = logging.INFO) -> None:
-    """Let all loggers of this process write JSON lines to standard error."""
+    """Configure all loggers of this process to write JSON lines to standard error."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     logging.basicConfig(level=level, handlers=[handler], force=True)
@@ -86,15 +83,13 @@ def log_as_json(level: int = logging.INFO) -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
 
 
-# Open files.
-
-#: Enough for any number of maps; some systems allow a billion, and programs that close them all
-#: one by one then take minutes to start.
+#: Maximum limit of open files, sufficient for any number of maps. Some systems allow a billion, and
+#: programs that close all descriptors one by one would then start slowly.
 MOST = 1 << 20
 
 
 def raise_descriptors() -> int:
-    """Let this process have as many files open as the system lets it; returns how many."""
+    """Raise the limit of open files to the system's maximum, at most MOST; return it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MOST if hard == resource.RLIM_INFINITY else min(hard, MOST)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -103,130 +98,125 @@ def raise_descriptors() -> int:
     return MOST if soft == resource.RLIM_INFINITY else soft
 
 
-# What a worker process may take, and how it is told to stop.
-
-
 def limit_memory(more: int) -> None:
-    """Let this process take so many bytes more than it has; what needs more raises MemoryError.
+    """Limit the additional memory that this process may allocate, beyond which MemoryError occurs.
 
-    Counted is what it writes to itself, on the heap or not: tables and indexes are mapped from
-    files, and cost nobody anything.
+    The limit covers private writable memory, but not tables and indexes, which are mapped from
+    files.
 
     Parameters
     ----------
-    more : bytes; 0 for no limit
+    more : number of bytes; 0 sets no limit
     """
     if more == 0:
         return
-    found = re.search(r"^VmData:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-    if found is None:
+    data = re.search(r"^VmData:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    if data is None:
         return
-    wanted, (_, most) = int(found[1]) * 1024 + more, resource.getrlimit(resource.RLIMIT_DATA)
+    wanted, (_, most) = int(data[1]) * 1024 + more, resource.getrlimit(resource.RLIMIT_DATA)
     if most != resource.RLIM_INFINITY:
         wanted = min(wanted, most)
     resource.setrlimit(resource.RLIMIT_DATA, (wanted, most))
 
 
 class StopSignal:
-    """Whether SIGTERM or SIGINT has come; made once, in the main thread.
+    """A handler of SIGTERM and SIGINT; create one per process, in the main thread.
 
     Attributes
     ----------
-    asked : whether one has
-    descriptor : readable from then on
+    requested : whether a signal has arrived
+    descriptor : file descriptor that becomes readable when a signal arrives
     """
 
     def __init__(self) -> None:
-        self.asked = False
-        self.descriptor, told = os.pipe()
-        os.set_blocking(told, False)
-        signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+        self.requested = False
+        self.descriptor, wakeup = os.pipe()
+        os.set_blocking(wakeup, False)
+        signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
         for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._ask)
+            signal.signal(number, self._request)
 
     def wait(self, seconds: float) -> None:
-        """Until one has come, or the time is over."""
+        """Wait until a signal arrives or the time has passed."""
         select.select([self.descriptor], [], [], seconds)
 
-    def _ask(self, _number: int, _frame: FrameType | None) -> None:
-        self.asked = True
+    def _request(self, _number: int, _frame: FrameType | None) -> None:
+        self.requested = True
 
 
-#: Variables that hold a secret; the variable with `_FILE` at its end names a file instead.
+#: Variables with secrets. A variable with the suffix `_FILE` contains the path of a file instead.
 SECRETS = (
     "SCENEPRINT_DATABASE_URL", "PGPASSWORD", "AWS_ACCESS_KEY_ID",
     "AWS_SECRET_ACCESS_KEY", "AZURE_STORAGE_ACCOUNT_KEY",
 )  # fmt: skip
-#: A secret is one line; a larger file is another one.
+#: Maximum size of a file with a secret.
 MOST_BYTES = 16 << 10
 
 
 def read_secret_files(environment: MutableMapping[str, str]) -> None:
-    """Set each secret whose file is named; line ends after it do not belong to it.
+    """Set the secrets that are specified by files; final line ends are removed.
 
-    The environment that a process was started with, which others may see (`docker inspect`,
-    `/proc`), then holds no secret.
+    The initial environment of a process, which other users may see (`docker inspect`, `/proc`),
+    then contains no secret.
 
     Raises
     ------
-    InvalidRequest : a file that cannot be read, is empty or is none of a secret; or both are set.
+    InvalidRequest : If a file cannot be read or contains no secret, or if both a secret and its
+        file are set.
     """
     for name in SECRETS:
-        given = environment.get(f"{name}_FILE")
-        if not given:
+        path = environment.get(f"{name}_FILE")
+        if not path:
             continue
         if environment.get(name):
             raise InvalidRequest(f"{name} and {name}_FILE are both set. Unset one of them.")
         try:
-            with Path(given).open("rb") as file:
+            with Path(path).open("rb") as file:
                 data = file.read(MOST_BYTES + 1)
             text = data.decode().rstrip("\r\n")
         except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "it is not UTF-8"
+            reason = getattr(error, "strerror", None) or "not UTF-8"
             raise InvalidRequest(
-                f"{name}_FILE: {given!r:.200} cannot be read ({reason}). Check the path and its "
+                f"{name}_FILE: {path!r:.200} cannot be read ({reason}). Check the path and its "
                 "permissions."
             ) from None
         if not text or len(data) > MOST_BYTES or "\n" in text or "\0" in text:
             raise InvalidRequest(
-                f"{name}_FILE: {given!r:.200} does not hold a secret, which is one line of text. "
-                "Check its content."
+                f"{name}_FILE: {path!r:.200} does not contain a secret. Write one line of text to "
+                "the file."
             )
         environment[name] = text
-        del environment[f"{name}_FILE"]  # processes that are started from here have it already
+        del environment[f"{name}_FILE"]  # child processes inherit the secret instead
 
 
-# Times of many answers in a few numbers that can be added up: a histogram of fixed bounds.
-#
-# Bin i holds what took from FIRST_S * STEP^i up to STEP times that. The bounds are the same in
-# every
-# process, so that the histograms of several add to that of all, and a quantile of the sum is that
-# of all answers, but for the width of a bin: it is wrong by 9 % at most.
+# A histogram of times has the same bins in all processes, so that histograms can be added. Bin i
+# counts times from FIRST_S * STEP^i to FIRST_S * STEP^(i + 1). The maximum error of a quantile is
+# 9 %, half the width of a bin.
 
-#: Lower bound of bin 0, seconds, and how much wider each bin reaches than the one before.
+#: Lower bound of bin 0, seconds, and ratio of successive bounds.
 FIRST_S, STEP = 1e-4, 2.0**0.25
-#: Bins: what takes longer than FIRST_S STEP^91, 12 minutes, is in the last one.
+#: Number of bins. The last bin counts all times above FIRST_S STEP^91, 12 minutes.
 BINS = 92
 
 
 def bin_of(seconds: float) -> int:
-    """The bin of a time."""
+    """Return the bin of a time."""
     if seconds <= FIRST_S:
         return 0
     return min(int(math.log(seconds / FIRST_S, STEP)), BINS - 1)
 
 
 def quantile(histogram: Mapping[int, int], share: float) -> float | None:
-    """The time that this share of all answers did not take longer than.
+    """Return a quantile of the times in a histogram.
 
     Parameters
     ----------
-    histogram : number of answers in each bin that has any
-    share : from 0 to 1
+    histogram : number of times by bin; empty bins may be missing
+    share : share of the times that do not exceed the result, from 0 to 1
 
     Returns
     -------
-    seconds, the geometric middle of the bin; None where there were no answers
+    seconds : geometric mean of the bounds of the bin; None for an empty histogram
     """
     total = sum(histogram.values())
     if total == 0:
@@ -240,22 +230,22 @@ def quantile(histogram: Mapping[int, int], share: float) -> float | None:
 
 
 class Latencies:
-    """A histogram that grows."""
+    """A histogram to which times are added."""
 
     def __init__(self) -> None:
         self._bins: Counter[int] = Counter()
 
     def add(self, seconds: float) -> None:
-        """Count an answer."""
+        """Add a time."""
         self._bins[bin_of(seconds)] += 1
 
     def as_json(self) -> dict[str, int]:
-        """As it is stored."""
+        """Return the histogram as it is stored."""
         return {str(place): number for place, number in sorted(self._bins.items())}
 
 
 def merged(parts: list[Mapping[str, int]]) -> dict[int, int]:
-    """Several stored histograms as one."""
+    """Return the sum of stored histograms."""
     total: Counter[int] = Counter()
     for part in parts:
         for place, number in part.items():
@@ -263,20 +253,20 @@ def merged(parts: list[Mapping[str, int]]) -> dict[int, int]:
     return dict(total)
 
 
-# Who makes changes: set for a request or a command, and written to the audit log with each change.
+# The actor of a request or a command, which is written to the audit log with each change.
 
-#: Name of the actor of a command on the data folder; no key may have it.
+#: Name of the actor of a command on the data folder, which no key may have.
 COMMAND = "command"
 
 
 @dataclass(frozen=True)
 class Actor:
-    """Who makes changes.
+    """The originator of changes.
 
     Parameters
     ----------
-    name : of the key; "" where the service requires none; COMMAND of a command
-    address : of the client's connection; None of a command
+    name : name of the key; "" if the service requires no keys; COMMAND for a command
+    address : address of the client; None for a command
     """
 
     name: str
@@ -287,13 +277,13 @@ _actor: ContextVar[Actor | None] = ContextVar("actor", default=None)
 
 
 def set_actor(actor: Actor | None) -> None:
-    """Set who makes the changes of this task, and of the threads it begins."""
+    """Set the actor of this task and of the threads that it starts."""
     _actor.set(actor)
 
 
 @contextmanager
 def acting_as(name: str) -> Iterator[None]:
-    """Make the changes of the block as this actor."""
+    """Set the actor within the context."""
     before = _actor.set(Actor(name))
     try:
         yield
@@ -302,26 +292,26 @@ def acting_as(name: str) -> Iterator[None]:
 
 
 def current_actor() -> Actor | None:
-    """Return who makes changes; None of a worker, which carries out what somebody else started."""
+    """Return the current actor; None for a worker, which executes the requests of other actors."""
     return _actor.get()
 
 
-# Whose work this is: set once for a request or a job, known wherever it is charged.
+# The tenant of a request or a job, to whom its work is charged.
 
-#: The tenant of work that no key asked for: commands, upkeep, a service that asks for no keys.
+#: Tenant of work without a key: commands, upkeep, or a service that requires no keys.
 NOBODY = ""
 
 _current: ContextVar[str] = ContextVar("tenant", default=NOBODY)
 
 
 def set_tenant(name: str) -> None:
-    """Charge what this task, and the threads it begins, does from now on to a tenant."""
+    """Set the tenant of this task and of the threads that it starts."""
     _current.set(name)
 
 
 @contextmanager
 def work_of(name: str) -> Iterator[None]:
-    """Charge what is done meanwhile, here and in threads begun here, to a tenant."""
+    """Set the tenant within the context; see `set_tenant`."""
     before = _current.set(name)
     try:
         yield
@@ -330,5 +320,5 @@ def work_of(name: str) -> Iterator[None]:
 
 
 def current_tenant() -> str:
-    """Name of the tenant whose work is being done; NOBODY where no key asked for it."""
+    """Return the name of the current tenant; NOBODY for work without a key."""
     return _current.get()

@@ -1,6 +1,6 @@
-"""Records that are written as JSON with a checksum of their own: manifests.
+"""Records that are written as JSON with a checksum, such as manifests.
 
-record  --seal-->  bytes  --unseal-->  values of JSON, which the record's class validates
+record  --seal-->  bytes  --unseal-->  JSON values, which the record's class validates
 """
 
 from __future__ import annotations
@@ -13,22 +13,27 @@ from pydantic import BaseModel, ConfigDict
 
 
 class StrictRecord(BaseModel):
-    """An immutable record that takes no other fields and converts no values."""
+    """An immutable record that accepts no other fields and converts no values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 def seal(record: StrictRecord) -> bytes:
-    """Return a record as JSON with its checksum; equal records give equal bytes."""
+    """Return a record as JSON with a checksum; equal records give equal bytes."""
     values = json.loads(record.model_dump_json())
     return json.dumps(values | {"sha256": _checksum(values)}, indent=1).encode()
 
 
 def unseal(data: bytes) -> dict[str, Any]:
-    """Return the values of a record that was sealed; ValueError where they are changed or none."""
+    """Return the values of a sealed record.
+
+    Raises
+    ------
+    ValueError : If the bytes are not a sealed record or were changed.
+    """
     values = json.loads(data)
     if not isinstance(values, dict) or values.pop("sha256", None) != _checksum(values):
-        raise ValueError("its checksum does not fit")
+        raise ValueError("the checksum does not match")
     return values
 
 

@@ -18,7 +18,7 @@ from sceneprint_client.api.base import is_loopback
 
 
 def default_data_dir() -> Path:
-    """Return the folder in which a user's maps are kept by default."""
+    """Return the default folder of a user's maps."""
     return Path(platformdirs.user_data_dir("sceneprint", appauthor=False))
 
 
@@ -27,13 +27,13 @@ OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
 
 
 def _setting(help_text: str, change: str = "", *, shown: str = "", **field: Any) -> Any:
-    """Return a field whose help, and advice on when to change it, docs/settings.md shows.
+    """Return a field with the help and the advice that docs/settings.md shows.
 
     Parameters
     ----------
-    help_text : what the value is, and its unit
-    change : when to change it
-    shown : default in words, where it is computed
+    help_text : description of the value, and its unit
+    change : advice on when to change the value
+    shown : description of a computed default
     **field : arguments of `pydantic.Field`
     """
     extra: dict[str, Any] = {"change": change, "shown": shown}
@@ -45,13 +45,13 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(
         env_prefix="SCENEPRINT_", frozen=True,
-        hide_input_in_errors=True,  # it may be a URL with a password
+        hide_input_in_errors=True,  # values may be URLs with passwords
     )  # fmt: skip
 
     # Places
     data_dir: Path = _setting(
         "Folder of the SQLite database and the blobs; also `--data`. Back it up.",
-        "On a server: name a disk with room.",
+        "On a server, to select a disk with enough space.",
         shown="`sceneprint` in the user's data folder",
         default_factory=default_data_dir,
     )
@@ -62,36 +62,36 @@ class Settings(BaseSettings):
         default=None,
     )
     blob_url: SecretStr | None = _setting(
-        "Store of uploads, artifacts and kept answers: `s3://bucket/prefix`, `gs://bucket/prefix`, "
-        "`az://account/container/prefix`, `file:///folder` or `memory:///`, which ends with the "
-        "process. Credentials come from the environment of the cloud, never from the URL.",
+        "Store of uploads, artifacts and stored answers: `s3://bucket/prefix`, "
+        "`gs://bucket/prefix`, `az://account/container/prefix`, `file:///folder` or `memory:///`, "
+        "which is lost with the process. Credentials come from the cloud's environment variables, "
+        "not from the URL.",
         "If several machines share the maps.",
         shown="`blobs` in the data folder",
         default=None,
     )
     index_dir: Path | None = _setting(
         "Folder of this machine's search indexes. Workers rebuild it if it is deleted.",
-        "For a faster disk than that of the blobs.",
+        "To use a faster disk than that of the blobs.",
         shown="`index` in the data folder",
         default=None,
     )
     index_url: str | None = _setting(
-        "Object store in which a fleet shares search indexes, written like `BLOB_URL`. Each is "
-        "built once, and nodes fetch the indexes that they search.",
+        "Object store in which hosts share search indexes, in the format of `BLOB_URL`. Each index "
+        "is built once, and hosts download the indexes that they search.",
         "If several hosts search the same maps.",
-        shown="none: each host builds its own",
+        shown="none: each host builds its indexes",
         default=None,
     )
     index_cache_bytes: int = _setting(
         "Maximum size of this machine's copies of shared indexes, bytes. The least recently used "
-        "are removed; none that was used within ten minutes is.",
+        "copies are removed, except those used within the last ten minutes.",
         "For smaller disks or larger maps.",
         default=16 << 30, ge=0,
     )  # fmt: skip
     cache_dir: Path = _setting(
-        "Folder of the pair tables of models, 28 MB each. Processes compute them again if it is "
-        "deleted.",
-        "If the home folder cannot be written.",
+        "Folder of the pair tables of models, 28 MB each. Processes compute missing tables again.",
+        "If the home folder is not writable.",
         shown="`sceneprint` in the user's cache folder",
         default_factory=default_cache_dir,
     )
@@ -109,18 +109,18 @@ class Settings(BaseSettings):
         default=8008, ge=0, le=65535,
     )  # fmt: skip
     tls_cert: Path | None = _setting(
-        "PEM file of the service's certificate and its chain. Together with `TLS_KEY`, the service "
-        "accepts HTTPS only.",
+        "PEM file of the service's certificate chain. With `TLS_CERT` and `TLS_KEY`, the service "
+        "accepts only HTTPS.",
         "To serve other machines without a proxy.",
         default=None,
     )
     tls_key: Path | None = _setting(
-        "PEM file of the certificate's key, not encrypted.",
+        "PEM file of the certificate's unencrypted key.",
         "Together with `TLS_CERT`.",
         default=None, validate_default=True,
     )  # fmt: skip
     require_keys: bool = _setting(
-        "Whether a loopback address requires keys as well.",
+        "Whether a loopback address requires keys too.",
         "Behind a proxy or tunnel on this machine.",
         default=False,
     )
@@ -131,39 +131,40 @@ class Settings(BaseSettings):
         default=(),
     )
     concurrent_requests: int = _setting(
-        "Number of uploads, and of queries, that run at once.",
-        "Rarely: more does not add processors.",
+        "Maximum number of uploads, and of queries, that run concurrently.",
+        "Rarely, since the number of processors limits the throughput.",
         shown="number of processors, at least 2",
         default_factory=lambda: max(os.cpu_count() or 1, 2), ge=1, le=256,
     )  # fmt: skip
     query_cores: int = _setting(
-        "Number of cores that the queries of a service share. A query that finds a free core runs "
-        "its two halves in parallel, with the same answer.",
-        "Fewer, if workers on the same machine need them.",
+        "Number of cores that the queries of a service share. If a core is free, a query runs its "
+        "two halves in parallel, with the same answer.",
+        "Fewer if workers on the same machine need the cores.",
         shown="number of processors",
         default_factory=lambda: os.cpu_count() or 1, ge=1, le=256,
     )  # fmt: skip
     geometry_cache_bytes: int = _setting(
-        "Memory of each process for the geometry of recently compared frames, bytes; 0.8 MB a "
-        "frame; 0 disables it. Further queries in the same place are answered sooner.",
-        "Less if many services share a machine; more for large maps.",
+        "Memory of each process for the geometry of recently compared frames, bytes, 0.8 MB per "
+        "frame; 0 disables the cache. It accelerates further queries in the same place.",
+        "Lower if many services share a machine; higher for large maps.",
         default=256 << 20, ge=0,
     )  # fmt: skip
 
     # Limits of requests
     queued_requests: int = _setting(
-        "Number of uploads, and of queries, that may wait; the next one gets 503.",
+        "Maximum number of uploads, and of queries, that wait; further requests get 503.",
         "Higher if many robots send at once.",
         default=64, ge=0, le=10_000,
     )  # fmt: skip
     queue_timeout_s: float = _setting(
-        "Maximum wait of an upload or query before it starts, seconds; then it gets 503.",
-        "Lower if a late answer is of no use.",
+        "Maximum wait of an upload or query before it starts, seconds; after that it gets 503.",
+        "Lower if late answers are useless.",
         default=5.0, gt=0, le=3600,
     )  # fmt: skip
     max_upload_bytes: int = _setting(
-        "Maximum size of a request's body, bytes: a cloud of 6 million points of three float32.",
-        "Higher for larger files of points; lower if only small sensors send.",
+        "Maximum size of a request's body, bytes. The default fits a cloud of 6 million points of "
+        "three float32.",
+        "Higher for larger clouds; lower if all sensors are small.",
         default=72 << 20, ge=1024, le=512 << 20,
     )  # fmt: skip
     max_import_bytes: int = _setting(
@@ -172,24 +173,24 @@ class Settings(BaseSettings):
         default=4 << 30, ge=1024,
     )  # fmt: skip
     body_timeout_s: float = _setting(
-        "Time in which a small body must arrive, seconds; each MiB adds 4 s.",
-        "Longer for very poor links.",
+        "Maximum time in which a small body must arrive, seconds; each MiB adds 4 s.",
+        "Longer for very slow connections.",
         default=30.0, ge=1, le=3600,
     )  # fmt: skip
     tenant_requests_per_s: float = _setting(
-        "Rate of each tenant's requests at each service process, averaged over five seconds; 0 for "
-        "no limit. A query counts as 5, a page as 1 and 1 more for each 50 rows.",
+        "Maximum rate of a tenant's requests per service process, averaged over five seconds; 0 "
+        "sets no limit. A query counts as 5 requests, a page as 1 plus 1 per 50 rows.",
         "According to the size of the fleet.",
         default=200.0, ge=0, le=1e6,
     )  # fmt: skip
     wrong_keys_per_minute: float = _setting(
-        "Rate of wrong keys from each address; 0 for no limit.",
+        "Maximum rate of wrong keys per address; 0 sets no limit.",
         "Rarely.",
         default=60.0, ge=0, le=1e6,
     )  # fmt: skip
     max_event_streams: int = _setting(
-        "Number of event streams that a service process keeps open; the next gets 503. A tenant "
-        "has three quarters of them at most, and then gets 429.",
+        "Maximum number of open event streams per service process; further streams get 503. A "
+        "tenant may have three quarters of them; further streams of the tenant get 429.",
         "According to the number of dashboards.",
         default=64, ge=0, le=10_000,
     )  # fmt: skip
@@ -203,46 +204,46 @@ class Settings(BaseSettings):
         default_factory=lambda: os.cpu_count() or 1, ge=0, le=256,
     )  # fmt: skip
     worker_memory_bytes: int = _setting(
-        "Memory that a worker may allocate beyond what it has when it is ready, bytes; 0 for no "
-        "limit. A job that needs more fails, and no other process is affected.",
+        "Maximum memory that a worker may allocate after its start, bytes; 0 sets no limit. A job "
+        "that needs more fails, without effect on other processes.",
         "Lower on small machines; higher for very large maps.",
         default=2 << 30, ge=0,
     )  # fmt: skip
     job_lease_s: float = _setting(
-        "Time after which a silent worker loses its job, seconds.",
-        "Longer on machines that are suspended.",
+        "Time without a heartbeat after which a worker loses its job, seconds.",
+        "Longer on machines that may be suspended.",
         default=60.0, ge=0.1, le=3600,
     )  # fmt: skip
     job_timeout_s: float = _setting(
-        "Maximum time of a job, or of one slice of a long job, seconds. A worker that takes longer "
-        "is ended.",
+        "Maximum time of a job, or of one slice of a long job, seconds. A worker that exceeds it "
+        "is terminated.",
         "Longer on very slow machines.",
         default=120.0, ge=1, le=3600,
     )  # fmt: skip
     decoders: int = _setting(
-        "Number of confined processes in which a service decodes uploads, 100 MB each, and 240 MB "
-        "after they have read PLY or PCD. Each worker has one of its own. 0 decodes uploads in the "
-        "service and its workers.",
-        "0 if every sender is trusted and memory is short.",
+        "Number of confined processes in which a service decodes uploads. Each takes 100 MB, or "
+        "240 MB after it has read PLY or PCD. Each worker has an additional decoder. 0 decodes "
+        "uploads in the service and its workers.",
+        "0 if all senders are trusted and memory is short.",
         shown="number of processors, from 2 to 8",
         default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256,
     )  # fmt: skip
     decoder_memory_bytes: int = _setting(
-        "Memory that a decoder may allocate for one upload, bytes; 0 for no limit.",
+        "Maximum memory that a decoder may allocate for one upload, bytes; 0 sets no limit.",
         "Lower on small machines.",
         default=2 << 30, ge=0,
     )  # fmt: skip
     decoder_timeout_s: float = _setting(
-        "Time for which a decoder may compute, or hang, with one upload, seconds.",
+        "Maximum time of a decoder for one upload, seconds.",
         "Longer on very slow machines.",
         default=30.0, ge=0.1, le=3600,
     )  # fmt: skip
 
     # Upkeep
     unindexed_frames: int = _setting(
-        "Number of frames or deletions newer than the index at which a worker publishes the next "
+        "Number of frames and deletions since the last index after which a worker publishes a new "
         "index.",
-        "Rarely: queries read these frames from memory.",
+        "Rarely, since queries read these frames from memory.",
         default=1000, ge=1, le=100_000,
     )  # fmt: skip
     index_check_interval_s: float = _setting(
@@ -259,55 +260,55 @@ class Settings(BaseSettings):
     build_surfaces: Literal["auto", "on_request"] = _setting(
         "Whether workers build the surface of each map (`auto`), or only on request "
         "(`on_request`). Deleted frames are always removed from a surface that exists.",
-        "If nobody looks at surfaces, to spare workers and disk.",
+        "If surfaces are not used, to reduce the load of workers and disk.",
         default="auto",
     )
     join_sessions: Literal["auto", "on_request"] = _setting(
         "Whether workers associate sessions of different parent frames (`auto`), or only on "
-        "request (`on_request`). Only a strong join moves poses.",
-        "If parent frames are to stay apart, or to spare workers.",
+        "request (`on_request`). Only strong joins move poses.",
+        "If parent frames must remain separate, or to reduce the load of workers.",
         default="auto",
     )
 
     # Retention
     undo_window_s: float = _setting(
         "Time for which a deletion can be undone, seconds; 0 makes it final at once.",
-        "0 if a deletion must be final; longer for people who notice late.",
+        "0 if deletions must be final at once; longer if mistakes are noticed late.",
         default=600.0, ge=0, le=31_536_000,
     )  # fmt: skip
     purge_deadline_s: float = _setting(
-        "Maximum time until no byte of a deleted frame is left on this node, seconds, counted from "
-        "when the deletion can no longer be undone.",
-        "According to what you promised the people in the frames.",
+        "Maximum time until all bytes of a deleted frame are erased on this host, seconds, from "
+        "the end of `UNDO_WINDOW_S`.",
+        "According to your promises to the people in the frames.",
         default=3600.0, ge=1, le=31_536_000,
     )  # fmt: skip
     deleted_rows_days: float = _setting(
-        "Time for which rows of deleted and redundant frames, and of their jobs, stay in the "
+        "Time for which rows of deleted and redundant frames, and of their jobs, remain in the "
         "database, days.",
-        "Longer than any host is ever off: an older index is built again from the database.",
+        "Longer than the longest downtime of a host: an older index must be rebuilt.",
         default=7.0, ge=1, le=36_500,
     )  # fmt: skip
     query_log_days: float = _setting(
-        "Time for which queries are listed with their answers, days. 0 stores none, and no event "
-        "reports a query.",
-        "According to what you promised the operators of the robots.",
+        "Time for which queries and their answers are stored, days. 0 stores no queries, and "
+        "events do not report them.",
+        "According to your promises to the operators of the robots.",
         default=30.0, ge=0, le=36_500,
     )  # fmt: skip
     query_log_bytes: int = _setting(
-        "Maximum size of all stored answers, bytes, 200 kB each. The oldest are removed first; 0 "
-        "stores none.",
+        "Maximum size of all stored answers, bytes; each takes 200 kB. The oldest are removed "
+        "first; 0 stores no answers.",
         "According to the rate of queries.",
         default=256 << 20, ge=0,
     )  # fmt: skip
     events_per_map: int = _setting(
-        "Number of events of each map that are kept, 200 bytes each.",
-        "According to how long a robot may be away.",
+        "Maximum number of stored events per map, 200 bytes each.",
+        "According to the longest time for which a robot may be offline.",
         default=1_000_000, ge=1000,
     )  # fmt: skip
     audit_log_days: float = _setting(
-        "Time for which entries of the audit log are kept, days. A tenant has at most 200,000 "
-        "changes and as many refusals.",
-        "According to your auditors.",
+        "Time for which entries of the audit log are stored, days. The log contains at most "
+        "200,000 changes and 200,000 refusals per tenant.",
+        "According to the requirements of your auditors.",
         default=365.0, gt=0, le=36_500,
     )  # fmt: skip
 
@@ -315,14 +316,14 @@ class Settings(BaseSettings):
     @classmethod
     def _has_certificate(cls, value: Path | None, info: ValidationInfo) -> Path | None:
         if (value is None) != (info.data.get("tls_cert") is None):
-            raise ValueError("HTTPS needs SCENEPRINT_TLS_CERT and SCENEPRINT_TLS_KEY; set both")
+            raise ValueError("HTTPS requires both SCENEPRINT_TLS_CERT and SCENEPRINT_TLS_KEY")
         return value
 
     @field_validator("index_url")
     @classmethod
     def _is_shared(cls, value: str | None) -> str | None:
         if value is not None and value.startswith("memory:"):
-            raise ValueError("memory:/// is inside one process; use file:///folder")
+            raise ValueError("memory:/// exists only in one process; use file:///folder")
         return value
 
     @field_validator("blob_url", "index_url")
@@ -349,54 +350,54 @@ class Settings(BaseSettings):
 
     @property
     def asks_for_keys(self) -> bool:
-        """Whether requests need a key."""
+        """Return whether requests require a key."""
         return self.require_keys or not is_loopback(self.host)
 
     @property
     def database(self) -> str:
-        """URL of the database."""
+        """Return the URL of the database."""
         from sqlalchemy import URL
 
         if self.database_url is not None:
             return self.database_url.get_secret_value()
-        # SQLAlchemy escapes characters of the folder's name that have a meaning in a URL
+        # SQLAlchemy escapes special characters in the folder's name
         url = URL.create("sqlite", database=str((self.data_dir / "sceneprint.db").absolute()))
         return url.render_as_string(hide_password=False)
 
     @property
     def blobs(self) -> Path | str:
-        """Folder or URL of uploads and geometry artifacts."""
+        """Return the folder or URL of uploads and geometry artifacts."""
         value = "" if self.blob_url is None else self.blob_url.get_secret_value()
         return value if value and not value.startswith("file:") else self.blob_dir
 
     @property
     def served_blobs(self) -> Path | str:
-        """Folder or URL of the blobs of a service, whose workers are other processes.
+        """Return the folder or URL of the blobs of a service with separate worker processes.
 
         Raises
         ------
-        UnusableStore : BLOB_URL keeps blobs inside one process.
+        UnusableStore : If BLOB_URL stores blobs in the memory of one process.
         """
         if str(self.blobs).startswith("memory:"):
             raise UnusableStore(
-                "SCENEPRINT_BLOB_URL=memory:/// keeps blobs inside one process, so the workers of "
-                "a service cannot read them. Use file:///folder, or `Client.embedded`."
+                "SCENEPRINT_BLOB_URL=memory:/// stores blobs in the memory of one process, so the "
+                "workers of a service cannot read them. Use file:///folder, or `Client.embedded`."
             )
         return self.blobs
 
     @property
     def blob_dir(self) -> Path:
-        """Folder of uploads and geometry artifacts, if BLOB_URL is a folder."""
+        """Return the folder of uploads and geometry artifacts, if BLOB_URL is a folder."""
         return self._blob_root / "blobs"
 
     @property
     def quarantine_dir(self) -> Path:
-        """Folder of damaged blobs that `sceneprint fsck --repair` has moved away."""
+        """Return the folder of damaged blobs that `sceneprint fsck --repair` has moved."""
         return self.data_dir / "quarantine"
 
     @property
     def query_dir(self) -> Path:
-        """Folder of stored answers. Deleting it loses only these."""
+        """Return the folder of stored answers, whose deletion affects nothing else."""
         return self._blob_root / "queries"
 
     @property
@@ -408,29 +409,32 @@ class Settings(BaseSettings):
 
     @property
     def bell_dir(self) -> Path:
-        """Folder of the FIFOs that wake idle workers."""
+        """Return the folder of the FIFOs that wake idle workers."""
         return self.data_dir / "bells"
 
     @property
     def indexes(self) -> Path:
-        """Folder of search indexes."""
+        """Return the folder of search indexes."""
         return self.index_dir or self.data_dir / "index"
 
 
 def _require_objects(url: str) -> None:
-    """Raise ValueError if a URL names no object store or holds credentials; never repeat it."""
+    """Raise ValueError if a URL is not that of an object store or contains credentials.
+
+    Messages must not contain the URL.
+    """
     scheme, _, rest = url.partition("://")
     if scheme not in OBJECT_SCHEMES or "://" not in url:
         known = ", ".join(f"{one}://" for one in OBJECT_SCHEMES)
-        raise ValueError(f"it does not start with any of {known}")
+        raise ValueError(f"the URL must start with one of {known}")
     try:
         holds = "@" in urlsplit(url).netloc or "?" in rest or "#" in rest
     except ValueError:
         holds = True
     if holds:
         raise ValueError(
-            "it contains more than a bucket and a prefix; credentials come from the environment "
-            "(AWS_..., GOOGLE_..., AZURE_...), never from a URL"
+            "the URL must contain only a bucket and a prefix; set credentials in the environment "
+            "(AWS_..., GOOGLE_..., AZURE_...)"
         )
     if scheme in ("s3", "gs", "az") and not urlsplit(url).netloc:
-        raise ValueError("it names no bucket")
+        raise ValueError("the URL contains no bucket")

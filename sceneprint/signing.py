@@ -1,4 +1,4 @@
-"""Compute the signature of a frame (Sec. III-A and III-B).
+"""The signature of a frame (Sec. III-A and III-B).
 
 Frame  --describe-->  Hierarchy  --encode-->  Signature
 """
@@ -55,11 +55,11 @@ class Signature:
 
     Parameters
     ----------
-    vector : (d,) uint8, whitened; or (25 G H,), psi itself, for a model without a whitening
-    model_id : id of its model; signatures of two models are never compared
-    n_patches : number of patches of each level in it, finest first
-    n_pairs : number of ordered pairs of each of these levels
-    metric : metric of the model's vectors
+    vector : (d,) uint8, whitened; (25 G H,), psi, for a model without a whitening
+    model_id : id of the model; signatures of different models cannot be compared
+    n_patches : number of patches of each level, finest first
+    n_pairs : number of ordered pairs of each level
+    metric : metric of the vectors
     """
 
     vector: Bytes
@@ -71,7 +71,7 @@ class Signature:
 
 @dataclass(frozen=True, eq=False)
 class Signer:
-    """A model with its pair table, ready to sign."""
+    """A model with its pair table."""
 
     model: Model
     table: PairTable
@@ -86,18 +86,19 @@ def open_signer(
 ) -> Signer:
     """Open a preset, a model file or a model, and its pair table.
 
-    The first call on a machine builds the table (seconds) and caches it; later calls map it.
+    The first call on a machine builds the table, which takes seconds, and caches it. Further calls
+    map the cached table.
 
     Parameters
     ----------
     model : "depth", "lidar", "paper", the path of a model file, or a model
-    cache_dir : folder of derived files; default: the user's cache folder
-    progress : receives finished bins and their total while the table is built
-    cached : whether to use the cache; False for a model that is used once
+    cache_dir : folder of derived files; None selects the user's cache folder
+    progress : callback for the number of finished bins and their total while the table is built
+    cached : whether to use the cache; False suits a model that is used once
 
     Raises
     ------
-    UnreadableModel : see `read_model`
+    UnreadableModel : If `read_model` raises it
     """
     read = model if isinstance(model, Model) else read_model(model)
     if not cached:
@@ -106,15 +107,15 @@ def open_signer(
 
 
 def see(frame: AnyFrame, p: ModelParameters) -> Surface:
-    """Return points and normals of a frame's surface: the input of Sec. III.
+    """Return points and normals of a frame's surface, the input of Sec. III.
 
     Returns
     -------
-    surface : an ordered map for a depth image; Voxels for a cloud
+    surface : image of points for a depth image; Voxels for a cloud
 
     Raises
     ------
-    UselessFrame : no samples lie within the sensor's range
+    UselessFrame : If no samples lie within the sensor's range
     """
     if isinstance(frame, Cloud):
         return voxels(frame, p.cloud)
@@ -137,7 +138,7 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
 
     Raises
     ------
-    UselessFrame : the samples lie on no surface
+    UselessFrame : If the samples lie on no surface
     """
     if isinstance(seen, Voxels):
         finest = supervoxels(seen, p.cloud.seed_px, p.cloud.maximum_patches, p.segmentation)
@@ -147,14 +148,14 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
         samples, advice = "depth samples", "Check that the image is depth and its scale is right"
     if finest.max(initial=-1) < 0:
         raise UselessFrame(
-            f"{_named(name)}its {samples} lie on no surface: they are too scattered for "
-            f"a patch. {advice}, or send another."
+            f"{_named(name)}the {samples} lie on no surface: they are too scattered for a patch. "
+            f"{advice}, or send another frame."
         )
     return hierarchy(seen, finest, p.hierarchy)
 
 
 def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
-    """Return the patches of one size for correspondences: Sec. III-E.
+    """Return patches of a fixed size for correspondences: Sec. III-E.
 
     Parameters
     ----------
@@ -173,12 +174,12 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
     Parameters
     ----------
     patches : hierarchy with all levels of the model's signature
-    signer : see `open_signer`
+    signer : result of `open_signer`
     name : name of the frame, for errors
 
     Raises
     ------
-    UselessFrame : the finest of these levels has no pair of patches within reach
+    UselessFrame : If the finest level has no pair of patches within reach
     """
     model, whitening = signer.model, signer.model.whitening
     used = [patches.levels[level] for level in model.levels]
@@ -194,7 +195,7 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
 
 
 def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
-    """Return the pair statistics of one level through the 4-D table."""
+    """Return the pair statistics of one level, computed with the 4-D table."""
     p = signer.model.parameters
     weights = patch_weights(level, p.weights)
     counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
@@ -202,7 +203,7 @@ def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
 
 
 def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
-    """Return the pair statistics of one level, pair by pair: slow, the oracle of the table."""
+    """Return the pair statistics of one level without the table: slow, for tests of the table."""
     p = model.parameters.properties
     pairs = neighbour_pairs(level, p)
     weights = patch_weights(level, model.parameters.weights)[pairs].prod(axis=1)
@@ -211,24 +212,24 @@ def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
 
 
 def float_signature(levels: list[LevelStatistics], model: Model, name: str = "") -> Floats:
-    """Return psi before quantisation: Eq. (2) of each level, rooted, normalised, end to end.
+    """Return psi before quantisation: the normalised Fisher vectors of all levels, concatenated.
 
     The part of a coarse level without pairs is zero.
 
     Parameters
     ----------
-    levels : one or more, finest first
+    levels : statistics of at least one level, finest first
     name : name of the frame, for errors
 
     Raises
     ------
-    UselessFrame : the finest level has no pairs
+    UselessFrame : If the finest level has no pairs
     """
     if levels[0].n_pairs == 0:
         radius = model.parameters.properties.radius
         raise UselessFrame(
-            f"{_named(name)}no two surface patches lie within {radius:g} m of each other, so there "
-            "is no geometry between them to describe. Send a frame that sees more of the scene."
+            f"{_named(name)}no two surface patches lie within {radius:g} m of each other, so no "
+            "geometry can be described. Send a frame that shows more of the scene."
         )
     return signature(
         [

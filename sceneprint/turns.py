@@ -1,9 +1,10 @@
-"""Turns: what tenants share goes round among them, however much one of them asks for.
+"""Fair shares of a limited number of turns among tenants, whatever their number of requests.
 
-    enter  -->  waiting  --admit-->  holding  --release-->      TurnOrder: who is next
-    ThreadTurns.acquire, release                                between threads
+    enter  -->  waiting  --admit-->  holding  --release-->      TurnOrder
+    ThreadTurns.acquire, release                                for threads
 
-The next is who holds fewest, and of equals who was served the longest ago.
+The next turn goes to the tenant that holds the fewest turns; ties go to the tenant whose latest
+turn is the oldest.
 """
 
 from __future__ import annotations
@@ -16,26 +17,26 @@ from typing import Generic, TypeVar
 
 Waiter = TypeVar("Waiter")
 
-#: Seconds after it last asked in which a tenant counts as one to share turns with.
+#: Time after its latest request for which turns are reserved for a tenant, seconds.
 PRESENT_S = 60.0
-#: Seconds after it last asked in which others rest after their turns for a tenant, and most that
-#: they rest.
+#: Time after its latest request for which other tenants rest for a tenant, and maximum rest,
+#: seconds.
 ACTIVE_S = 1.0
 
 
 class TurnOrder(Generic[Waiter]):
-    """Who waits, who holds turns, and who is next; not safe to share between threads.
+    """The waiting tenants, the tenants that hold turns, and their order; not thread-safe.
 
-    Beside another tenant one holds `beside` turns at most, so that the other need not wait for the
-    work of the first to end; alone it has all.
+    If several tenants are present, each may hold at most `beside` turns, so that other tenants need
+    not wait for its work to end. A single tenant may hold all turns.
 
     Parameters
     ----------
-    count : of turns that are held at once
-    beside : most that one tenant holds while there is another; default: half of them
-    clock : seconds, never going back
-    rests : whether a tenant waits after its turn as long as that took, a second at most, while
-        another is active: its work has the processors that others need for half of the time
+    count : total number of turns
+    beside : maximum number of turns per tenant if several are present; None selects half of `count`
+    clock : monotonic clock, seconds
+    rests : whether a tenant rests after a turn for the duration of that turn, at most ACTIVE_S,
+        while another tenant is active; its work then uses at most half of the processors' time
     """
 
     def __init__(
@@ -46,23 +47,23 @@ class TurnOrder(Generic[Waiter]):
         self._beside = max(count // 2, 1) if beside is None else beside
         self._held: Counter[str] = Counter()
         self._waiting: dict[str, deque[tuple[int, Waiter]]] = {}
-        # when each tenant came last, and the number of its latest turn; the oldest first
+        # time of each tenant's latest request and number of its latest turn, the oldest first
         self._seen: OrderedDict[str, tuple[float, int]] = OrderedDict()
-        self._given = 0
-        # when each tenant got its latest turn, and until when it rests
+        self._turns = 0
+        # start of each tenant's latest turn, and end of its rest
         self._began: dict[str, float] = {}
         self._resting: dict[str, float] = {}
         self._rested_at: float | None = None
 
     def enter(self, tenant: str, waiter: Waiter, weight: int = 1) -> int:
-        """Wait for a turn, or for several at once; returns how many those are."""
+        """Add a waiter for `weight` simultaneous turns; return the admissible number of turns."""
         weight = min(weight, max(self._count // 2, 1))
         self._see(tenant)
         self._waiting.setdefault(tenant, deque()).append((weight, waiter))
         return weight
 
     def leave(self, tenant: str, waiter: Waiter) -> bool:
-        """Wait no longer; False for who does not wait: it was admitted."""
+        """Remove a waiter; return False if it was admitted already."""
         for one in self._waiting.get(tenant, ()):
             if one[1] is waiter:
                 self._waiting[tenant].remove(one)
@@ -72,7 +73,7 @@ class TurnOrder(Generic[Waiter]):
         return False
 
     def admit(self) -> list[Waiter]:
-        """Give turns to those whose turn it is; they hold them from now on."""
+        """Return the next waiters, which hold turns from now on."""
         admitted: list[Waiter] = []
         most = self._count if len(self._seen) < 2 else self._beside
         while True:
@@ -89,17 +90,17 @@ class TurnOrder(Generic[Waiter]):
                 return admitted
             _, _, tenant, weight = min(may)
             if self._held.total() + weight > self._count:
-                return admitted  # nobody overtakes who waits for several
-            self._given += 1
+                return admitted  # a waiter for several turns must not be overtaken
+            self._turns += 1
             self._held[tenant] += weight
             self._began[tenant] = now
-            self._seen[tenant] = self._seen[tenant][0], self._given
+            self._seen[tenant] = self._seen[tenant][0], self._turns
             waiter = self._waiting[tenant][0][1]
             self.leave(tenant, waiter)
             admitted.append(waiter)
 
     def release(self, tenant: str, weight: int = 1) -> None:
-        """Give turns back."""
+        """Release turns."""
         self._held[tenant] -= weight
         if not self._held[tenant]:
             del self._held[tenant]
@@ -108,15 +109,14 @@ class TurnOrder(Generic[Waiter]):
                 self._resting[tenant] = now + min(now - began, ACTIVE_S)
 
     def rest_s(self) -> float | None:
-        """Seconds until `admit` should be called again for those who rested; None for none."""
+        """Return the seconds until the next rest of a waiting tenant ends; None if none rests."""
         return None if self._rested_at is None else max(self._rested_at - self._clock(), 0.0)
 
     def waiters(self) -> list[Waiter]:
-        """All who wait."""
+        """Return all waiters."""
         return [one for queue in self._waiting.values() for _, one in queue]
 
     def _is_resting(self, tenant: str, now: float) -> bool:
-        """Whether a tenant rests yet."""
         until = self._resting.get(tenant)
         if until is None:
             return False
@@ -126,7 +126,7 @@ class TurnOrder(Generic[Waiter]):
         return True
 
     def _is_beside(self, tenant: str, now: float) -> bool:
-        """Whether another tenant asked a moment ago."""
+        """Return whether another tenant is active."""
         others = (seen for one, (seen, _) in reversed(self._seen.items()) if one != tenant)
         latest = next(others, None)
         return latest is not None and latest > now - ACTIVE_S
@@ -145,12 +145,7 @@ class TurnOrder(Generic[Waiter]):
 
 
 class ThreadTurns:
-    """Turns of threads.
-
-    Parameters
-    ----------
-    count, beside : see TurnOrder
-    """
+    """Turns for threads; see TurnOrder."""
 
     def __init__(self, count: int, beside: int | None = None) -> None:
         self._order: TurnOrder[threading.Lock] = TurnOrder(count, beside)
@@ -158,8 +153,8 @@ class ThreadTurns:
         self._closed = False
 
     def acquire(self, tenant: str, longest_s: float) -> bool:
-        """Wait for a turn; False where none comes in time, or none will: see `close`."""
-        mine = threading.Lock()  # one that is held until somebody gives it the turn
+        """Wait for a turn; return False if none is free in time, or after `close`."""
+        mine = threading.Lock()  # it is released when this thread is admitted
         mine.acquire()
         with self._lock:
             if self._closed:
@@ -175,13 +170,13 @@ class ThreadTurns:
         return not self._leave(tenant, mine)
 
     def release(self, tenant: str) -> None:
-        """Give a turn back."""
+        """Release a turn."""
         with self._lock:
             self._order.release(tenant)
             self._admit()
 
     def close(self) -> None:
-        """Give no more turns; who waits is told at once."""
+        """Admit no more threads, and wake all waiting threads."""
         with self._lock:
             self._closed = True
             for one in self._order.waiters():
@@ -191,7 +186,7 @@ class ThreadTurns:
         with self._lock:
             if not self._order.leave(tenant, mine):
                 return False
-            self._admit()  # it may have been in the way of others
+            self._admit()  # the waiter may have blocked others
             return True
 
     def _admit(self) -> None:

@@ -1,4 +1,4 @@
-"""Define the records that modules exchange: frames, and the results of their processing.
+"""The records that modules exchange: frames, and the results of their processing.
 
 Lengths are metres, angles radians, times seconds; other units are in the name. Camera frames are
 optical: x right, y down, z forward. Clouds keep their sensor's axes.
@@ -38,23 +38,23 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Sphere:
-    """The "camera" of a range image about a viewpoint: azimuth by elevation, in equal steps.
+    """The camera of a range image about a viewpoint: azimuth by elevation, in equal steps.
 
-    With (a, b, c) the sensor's axes in cyclic order such that c is the pole, a direction has
-    azimuth = atan2(b, a) and elevation = asin(c); column = (azimuth - left) / step, where azimuth
-    counts from that of column 0, and row = (top - elevation) / step. Pixel centres are at integers.
+    Let (a, b, c) be the sensor's axes in cyclic order such that c is the pole. A direction has
+    azimuth = atan2(b, a) and elevation = asin(c); column = (azimuth - left) / step, with the
+    azimuth relative to column 0, and row = (top - elevation) / step. Pixel centres are at integers.
 
     Parameters
     ----------
     width, height : size of the image, pixels
-    step : angle between pixels either way, radians
+    step : angle between adjacent pixels, radians
     left : azimuth of column 0, radians
     top : elevation of row 0, radians
-    pole : 0, 1 or 2: the axis of elevation
+    pole : index of the axis of elevation: 0, 1 or 2
 
     Raises
     ------
-    InvalidIntrinsics : the image is empty, has too many pixels, or covers more than a sphere
+    InvalidIntrinsics : If the image is empty, has too many pixels, or covers more than a sphere
     """
 
     width: int
@@ -67,13 +67,13 @@ class Sphere:
     def __post_init__(self) -> None:
         within = self.width >= 1 and self.height >= 1 and self.pole in (0, 1, 2)
         if not (within and math.isfinite(self.left) and math.isfinite(self.top)):
-            raise InvalidIntrinsics(f"{self} is no range image. Sign the cloud again.")
+            raise InvalidIntrinsics(f"{self} is not a range image. Sign the cloud again.")
         if self.width * self.height > MAXIMUM_SAMPLES:
             raise InvalidIntrinsics(
                 f"A range image of {self.width} x {self.height} exceeds the limit of "
                 f"{MAXIMUM_SAMPLES} samples. Sign the cloud with a coarser model."
             )
-        # half a pixel more than the sphere is rounding
+        # rounding errors can exceed the sphere by half a pixel
         if not (0 < (self.width - 1) * self.step < 2 * math.pi) or not (
             0 <= (self.height - 1) * self.step <= math.pi + self.step
         ):
@@ -103,14 +103,14 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
-    """One depth image, undistorted, as the geometry reads it.
+    """An undistorted depth image, the input of the geometry.
 
     Parameters
     ----------
     depth : (H, W) float32, metres along the optical axis (z); 0 if missing
-    intrinsics : the camera, without distortion
+    intrinsics : intrinsics without distortion
     name : name of the frame in messages
-    pose : (4, 4) T_parent_sensor, or None if unknown; ignored by the geometry
+    pose : (4, 4) T_parent_sensor; None if unknown. The signature does not depend on it
     """
 
     depth: Floats32
@@ -121,16 +121,16 @@ class DepthFrame:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """One point cloud, as the geometry reads it.
+    """A point cloud, the input of the geometry.
 
     Parameters
     ----------
-    points : (N, 3) float32, metres, in the sensor's axes, the viewpoint at the origin; all finite
-    has_viewpoint : False for points that were not seen from one place, such as fused ones: free
-        space is unknown then
+    points : (N, 3) float32, metres, in the sensor's axes, with the viewpoint at the origin; finite
+    has_viewpoint : whether all points were observed from the origin; False for fused points, whose
+        free space is unknown
     name : name of the frame in messages
-    pose : (4, 4) T_parent_sensor, or None if unknown; ignored by the geometry
-    note : changes to the points before, for display; may be empty
+    pose : (4, 4) T_parent_sensor; None if unknown. The signature does not depend on it
+    note : description of earlier changes to the points, for display; may be empty
     """
 
     points: Floats32
@@ -142,15 +142,15 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSurface:
-    """A surface that was imported as a map: a point cloud, or a triangle mesh.
+    """A surface that was imported as a map: a point cloud or a triangle mesh.
 
     Parameters
     ----------
-    points : (N, 3) float32, metres, relative to `offset`; all finite
-    triangles : (M, 3) int32 indices into `points`, counterclockwise seen from the front; None for a
+    points : (N, 3) float32, metres, relative to `offset`; finite
+    triangles : (M, 3) int32 indices of points, counterclockwise as seen from the front; None for a
         cloud
-    offset : (3,) float64, metres; points + offset are the coordinates of the file. Zero unless the
-        origin is more than a kilometre away
+    offset : (3,) float64, metres; points + offset are the coordinates of the file. It is zero
+        unless the origin is more than a kilometre away
     up : (3,) float64, unit vector against gravity
     """
 
@@ -160,25 +160,25 @@ class ReferenceSurface:
     up: Floats
 
 
-#: A frame of either kind.
+#: A depth image or a cloud.
 AnyFrame = DepthFrame | Cloud
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The observed surface, as an ordered map of points and normals.
+    """The observed surface, as an image of points and normals.
 
-    Unordered points, as those of a cloud, are a map of one row without a camera.
+    Unordered points, such as those of a cloud, are an image of one row without a camera.
 
     Parameters
     ----------
-    points : (h, w, 3) float32, metres, sensor frame; NaN-free, 0 if not valid
-    normals : (h, w, 3) float32, unit length, towards the sensor; 0 if not valid
+    points : (h, w, 3) float32, metres, in the sensor's frame; 0 if invalid, never NaN
+    normals : (h, w, 3) float32 unit vectors towards the sensor; 0 if invalid
     valid : (h, w) bool
-    areas : (h, w) float32, square metres of surface per pixel; 0 if not valid
-    camera : camera of this (reduced) map; None for unordered points
-    spread : for a scan, unordered points spread evenly over its surface
-        (`range_image.spread_points`); else None
+    areas : (h, w) float32, square metres of surface per pixel; 0 if invalid
+    camera : camera of this image; None for unordered points
+    spread : unordered points that are evenly distributed over the surface of a scan
+        (`range_image.spread_points`); None for other frames
     """
 
     points: Floats32
@@ -190,20 +190,20 @@ class Surface:
 
     @property
     def fitted(self) -> Surface:
-        """Return the target of fine alignment: the spread points of a scan, else the map itself."""
+        """Return the target of fine alignment: the spread points of a scan, else this surface."""
         return self if self.spread is None else self.spread
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Surface patches of one level, {x_i} of Sec. III.
+    """The surface patches of one level, {x_i} of Sec. III.
 
     Parameters
     ----------
-    means : (P, 3) float64, metres: l of Eq. (1)
-    normals : (P, 3) float64, unit length, towards the sensor: n of Eq. (1)
+    means : (P, 3) float64, metres; l of Eq. (1)
+    normals : (P, 3) float64 unit vectors towards the sensor; n of Eq. (1)
     areas : (P,) float64, square metres
-    sizes : (P,) int32, pixels of the surface map
+    sizes : (P,) int32, number of pixels
     coherences : (P,) float64 in (0, 1], length of the mean of the pixels' normals; 1 if flat
     """
 
@@ -224,7 +224,7 @@ class Hierarchy:
     Parameters
     ----------
     levels : H levels of patches
-    labels : H maps (h, w) int32: index of each pixel's patch in that level, -1 for none
+    labels : H images (h, w) int32, index of each pixel's patch in the level; -1 without a patch
     """
 
     levels: tuple[Patches, ...]
@@ -233,14 +233,14 @@ class Hierarchy:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The geometry artifact: everything that validation needs of a frame.
+    """The geometry artifact: all data of a frame that validation requires.
 
     Parameters
     ----------
     surface : (h, w) points and normals
     patches : P patches of one metric size, for correspondences
-    descriptors : (P, d) uint8, macro-scale surroundings of each patch; compared by distance
-    model_id : id of its model; artifacts of two models are never compared
+    descriptors : (P, d) uint8, descriptors of the patches' macro-scale surroundings
+    model_id : id of the model; artifacts of different models cannot be compared
     """
 
     surface: Surface
@@ -249,17 +249,17 @@ class Geometry:
     model_id: str
 
 
-#: Kinds of camera; unordered points have NOWHERE.
+#: Kinds of cameras; NOWHERE stands for unordered points.
 PINHOLE, SPHERE, NOWHERE = 0, 1, 2
 
 
 def camera_of(camera: Camera | None, nearest: float) -> Floats:
-    """Return a camera as an array for kernels, (7,): its kind, `nearest`, and five numbers.
+    """Return a camera as an array for kernels, (7,): its kind, `nearest`, and five parameters.
 
     Parameters
     ----------
-    camera : None for unordered points
-    nearest : least depth of a point that is looked up, metres
+    camera : camera; None for unordered points
+    nearest : minimum depth of a point that is looked up, metres
     """
     if isinstance(camera, Intrinsics):
         return np.array([PINHOLE, nearest, camera.fx, camera.fy, camera.cx, camera.cy, 0.0])
@@ -272,5 +272,5 @@ def camera_of(camera: Camera | None, nearest: float) -> Floats:
 
 
 def kind_of(camera: Camera | None) -> int:
-    """Return the kind of a camera, the first number of `camera_of`."""
+    """Return the kind of a camera, the first element of `camera_of`."""
     return int(camera_of(camera, 0.0)[0])

@@ -87,7 +87,7 @@ def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[Dept
     mesh, voxel = fuse(around[:1], p)
     assert voxel == 0.05
     assert len(mesh.points) > 0
-    with pytest.raises(InvalidRequest, match=r"Voxels of 0\.05 m take \d+ blocks") as refused:
+    with pytest.raises(InvalidRequest, match=r"Voxels of 0\.05 m need \d+ blocks") as refused:
         fuse(around[:1], replace(p, most_blocks=40))
     # what is advised suffices; unasked, a voxel is chosen that does
     advised = float(str(refused.value).split("Request ")[1].split(" m")[0])

@@ -58,7 +58,7 @@ def test_two_matches_guide_the_rest_to_the_truth(walk: Room) -> None:
         assert metres < 0.03
         assert radians < np.radians(1.0)
         assert v.guided == (v.predicted is not None) == (match.index > 2)
-        assert v.reason.startswith("surfaces agree")
+        assert v.reason.startswith("the surfaces agree")
         assert ("where other matches place the query" in v.reason) == v.guided
     # the same bits from what was predicted: an answer is shown again from it
     first = matches[2].validation
@@ -77,7 +77,7 @@ def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk: Room) 
     assert found is not None
     assert found.average is not None
     assert (found.status, found.votes, len(found.members), found.guided) == ("found", 5, 5, 3)
-    assert found.reason.endswith("3 of them followed from the others")
+    assert found.reason.endswith("including 3 guided by other matches")
     assert found.average.votes == 5
     # three weak matches elsewhere weigh 1.2: two strong ones do not outweigh that, five would
     elsewhere = poses[0].copy()

@@ -110,7 +110,7 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
     assert found.average is not None
     np.testing.assert_allclose(found.average.T, turn @ shifted(2.0), atol=1e-12)
     assert (found.status, found.parent, found.votes, found.members) == ("found", "there", 1, (1,))
-    assert found.reason == "one match gives the pose"
+    assert found.reason == "one match determines the pose"
     assert (found.evidence, found.confidence, found.verified_by) == (None, None, "matches")
     [itself] = found.alternatives
     assert (itself.T.tolist(), itself.support) == (found.average.T.tolist(), 1)
@@ -138,7 +138,7 @@ def test_a_pose_is_found_where_it_outweighs_every_other(
         assert (found.average.support, found.average.T[0, 3]) == (here, pytest.approx(0.0))
     else:
         assert found.average is None
-        assert "none of their poses" in found.reason
+        assert "less than twice the weight" in found.reason
         told = [(one.support, one.T[0, 3]) for one in found.alternatives]
         assert told == [(here, pytest.approx(0.0)), (there, pytest.approx(5.0))]
 
@@ -362,7 +362,7 @@ _OF_FRAMES = ConfidenceParameters(
     planes=Penalty(9.0, 5.0, 0.0),  # 0 from 12 planes on, 5 at 6
     excess=Penalty(8.0, 6.0, 3.0),  # 3 at 5 %, 6 at 12 %
     rival=Penalty(6.0, 4.0, 1.0),  # 1 at half its score, 4 at 0.8, 6 from its own score on
-    suggested=Penalty(4.0, 4.0, 0.0),  # 4 where one view alone suggests it
+    suggested=Penalty(4.0, 4.0, 0.0),  # 4 if only one view suggests the pose
     **{
         name: Penalty(0.0, 0.0, 0.0)
         for name in KNOTS
@@ -531,7 +531,7 @@ def test_a_pose_is_found_where_its_confidence_is_enough(
             matches, [picture((40, SAME))], [picture((rival, SAME))], p=strict
         ).status == ("ambiguous")
     else:
-        assert found.reason.startswith("another pose explains the frame as well")
+        assert found.reason.startswith("another pose explains the frame equally well")
         lenient = replace(BY_HAND, confidence=0.95)
         again = judged(matches, [picture((40, SAME))], [picture((rival, SAME))], p=lenient)
         assert again.status == ("found" if rival == 24 else "ambiguous")
@@ -571,7 +571,7 @@ def test_a_pose_that_one_view_alone_suggests_is_not_sure() -> None:
         found = judged(matches, [WHOLE] * 3)
         assert found.status == status
         assert [one.support for one in found.alternatives] == [1]
-        assert status == "found" or "one view alone suggests this pose" in found.reason
+        assert status == "found" or "views of the place suggests this pose" in found.reason
 
 
 @pytest.mark.parametrize(

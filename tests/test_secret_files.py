@@ -33,7 +33,7 @@ def test_a_file_holds_what_its_variable_would(tmp_path: Path) -> None:
 def test_what_is_no_secret_is_refused_and_never_shown(name: str, tmp_path: Path) -> None:
     path = tmp_path / "secret"
     for content, said in (
-        (None, "No such file"), (b"", "does not hold a secret"), (b"a\nhunter2", "one line"),
+        (None, "No such file"), (b"", "does not contain a secret"), (b"a\nhunter2", "one line"),
         (b"hunter2" * 9999, "one line"), (b"hunter2\xff", "not UTF-8"), (b"hunter2\0", "one line"),
     ):  # fmt: skip
         if content is not None:

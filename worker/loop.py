@@ -60,7 +60,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
 
     def should_continue(seconds: float) -> bool:
         stop.wait(seconds)
-        return not stop.asked and os.getppid() == parent
+        return not stop.requested and os.getppid() == parent
 
     with ExitStack() as stack:
         try:  # it waits without a limit, because a replacement would only wait as well
@@ -73,7 +73,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         worker = Worker(context, listener, trace, stop)
         record_start(context.store, worker.name)
         log.info("worker ready", extra={"worker": worker.name})
-        while not (stop.asked or worker.unsound) and os.getppid() == parent:
+        while not (stop.requested or worker.unsound) and os.getppid() == parent:
             worker.turn()
     log.info("worker stopped", extra={"worker": worker.name})
     if worker.unsound:
@@ -118,7 +118,7 @@ class Worker:
         claimed = self._jobs.claim(self.name)
         if claimed is None:
             return False
-        if self._stop.asked:
+        if self._stop.requested:
             self._jobs.put_back(claimed)
             return True
         held = claimed.job

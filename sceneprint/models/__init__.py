@@ -1,4 +1,4 @@
-"""Define models, read and write their files, and build their pair tables."""
+"""Models, their files and their pair tables."""
 
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters
 from sceneprint.models.model_file import (

@@ -1,9 +1,9 @@
-"""Define a model: everything that determines signatures and artifacts, identified by its content.
+"""A model: all data that determine signatures and artifacts, identified by their content.
 
-`scale_lengths` gives the parameters of a larger or smaller world. A cloud times s, under parameters
-scaled by s, has the same signature, and validates to the same transforms with translations times s.
-Depth images differ slightly: the gate of their plane fit (`NormalParameters.plane_gate`) is a share
-of 1/z and 1/metres at once.
+`scale_lengths` returns the parameters for a larger or smaller world. If a cloud and the lengths of
+the parameters are multiplied by s, the signature is unchanged, and translations are multiplied by
+s. This holds for depth images approximately: the gate of their plane fit
+(`NormalParameters.plane_gate`) is both a share of 1/z and a value in 1/metres.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
-#: Versions of the file and of its semantics, for models with and without a whitening. They are part
-#: of a model's id. Raise one if code changes its signatures.
+#: Versions of the file and its semantics, for models with and without a whitening. They are part of
+#: a model's id. A version must be raised if code changes the signatures of its models.
 SCHEMA_VERSION, PSI_SCHEMA_VERSION = 3, 2
 
-#: Groups whose default parameters are omitted from files and ids. So new parameters keep the ids of
-#: existing models, but defaults must never change.
+#: Groups whose default parameters are omitted from files and ids. New parameters therefore preserve
+#: the ids of existing models, but defaults must not change.
 SPARSE = ("cloud", "validation")
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ModelParameters:
-    """Parameters of every stage, in the order of the paper."""
+    """The parameters of all stages, in the order of the paper."""
 
     depth: DepthParameters = field(default_factory=DepthParameters)
     normals: NormalParameters = field(default_factory=NormalParameters)
@@ -77,7 +77,7 @@ class ModelParameters:
 
 @dataclass(frozen=True)
 class AnswerParameters:
-    """Parameters that judge poses on a map; signatures and artifacts do not depend on them."""
+    """The parameters that evaluate poses on a map; signatures and artifacts do not use them."""
 
     map: MapParameters = field(default_factory=MapParameters)
     confidence: ConfidenceModel = field(default_factory=ConfidenceModel)
@@ -87,17 +87,17 @@ class AnswerParameters:
 class Model:
     """Projection, mixture, quantiser, compression, whitening, and the parameters of each stage.
 
-    Signatures are whitened, a few hundred bytes compared by L2. Without a whitening, they are psi
-    itself, compared by L1 as in Sec. III-C.
+    A whitened signature has a few hundred bytes and is compared by L2. Without a whitening,
+    signatures are psi, compared by L1 as in Sec. III-C.
 
     Parameters
     ----------
     name : display name; not part of the id
-    quantiser_step : one unit of a byte of psi
-    psi_unrelated_distance : median L1 distance of psi of unrelated training frames, in units of a
-        byte
+    quantiser_step : step of psi per unit of a byte
+    psi_unrelated_distance : median L1 distance between psi of unrelated training frames, in units
+        of a byte
     provenance : data and settings of the training; not part of the id
-    whitening : see Whitening; None if signatures are psi itself
+    whitening : see Whitening; None if signatures are psi
     answer : see AnswerParameters; not part of the id, so that it can change without new signatures
     """
 
@@ -119,21 +119,21 @@ class Model:
 
     @property
     def unrelated_distance(self) -> float:
-        """Return d0, the median distance of unrelated training frames; similarity = 1 - d / d0."""
+        """Return d0, the median distance of unrelated training frames, in the stored metric."""
         if self.whitening is None:
             return self.psi_unrelated_distance
         return self.whitening.unrelated_distance
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """Return the ascending levels of the hierarchy in a signature; 0 is the finest."""
+        """Return the ascending levels of the hierarchy in a signature; 0 is the finest level."""
         if self.whitening is None:
             return tuple(range(self.parameters.hierarchy.n_levels))
         return self.whitening.levels
 
     @property
     def tensors(self) -> dict[str, NDArray[np.float64] | Floats32 | Ints8]:
-        """Return the learnt arrays by their names in the file."""
+        """Return the fitted arrays by their names in the file."""
         arrays = {
             "projection.mean": self.projection.mean,
             "projection.matrix": self.projection.matrix,
@@ -150,7 +150,7 @@ class Model:
             bytes_["whitening.basis"] = self.whitening.basis
             arrays["whitening.scales"] = self.whitening.scales
             arrays["whitening.offsets"] = self.whitening.offsets
-        # C order, because safetensors writes raw memory
+        # safetensors writes raw memory, which must be in C order
         return {
             **{name: np.ascontiguousarray(array, "<f8") for name, array in arrays.items()},
             **{name: np.ascontiguousarray(array, "<f4") for name, array in small.items()},
@@ -159,7 +159,7 @@ class Model:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Return everything but the arrays that affects signatures, artifacts or their meaning."""
+        """Return all values, besides arrays, on which signatures, artifacts or answers depend."""
         header = {
             "schema_version": PSI_SCHEMA_VERSION,
             "parameters": to_mapping(self.parameters),
@@ -185,7 +185,7 @@ class Model:
 
     @property
     def label(self) -> str:
-        """Return the name and the first twelve digits of the id, for display."""
+        """Return the name and the first 12 digits of the id, for display."""
         return f"{self.name}-{self.id[:12]}"
 
     @property
@@ -195,22 +195,20 @@ class Model:
 
     @property
     def signature_bytes(self) -> int:
-        """Return the bytes of a stored signature: d of the whitening, or 25 G H of psi."""
+        """Return the number of bytes of a stored signature: d of the whitening, or 25 G H."""
         if self.whitening is None:
             return self.level_length * len(self.levels)
         return self.whitening.dimension
 
     @property
     def without_whitening(self) -> Model:
-        """Return the model without its whitening: its signatures are psi of all levels."""
+        """Return the model without its whitening, whose signatures are psi of all levels."""
         return replace(self, whitening=None)
 
 
 def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
-    """Return all parameters as JSON; of `SPARSE` groups only those that differ from the default."""
-    whole = {
-        name: group for name, group in asdict(parameters).items() if name not in SPARSE
-    }  # in the order of the stages
+    """Return parameters as JSON; `SPARSE` groups contain only values that are not the default."""
+    whole = {name: group for name, group in asdict(parameters).items() if name not in SPARSE}
     for name in SPARSE:
         group = getattr(parameters, name)
         different = differences(group)
@@ -220,14 +218,17 @@ def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
 
 
 def parse_parameters(values: Any) -> ModelParameters:
-    """Read the result of `to_mapping`.
+    """Parse the result of `to_mapping`.
 
     Raises
     ------
-    UnreadableModel : a field is missing, unknown or no number
+    UnreadableModel : If a field is missing, unknown or not a number
     """
     if not isinstance(values, dict):
-        raise UnreadableModel(f"The model's parameters are {values!r}. Fetch or train it again.")
+        raise UnreadableModel(
+            f"The model's parameters are {values!r}, not an object. Download the model again, or "
+            "train it again."
+        )
     dense = {name: value for name, value in values.items() if name not in SPARSE}
     default = ModelParameters()
     groups = {
@@ -243,21 +244,20 @@ def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
     Parameters
     ----------
     kind : class of the record
-    values : parsed JSON
     where : path of the record, for errors
-    groups : fields that are not in `values`
+    groups : further fields, which are not in `values`
 
     Raises
     ------
-    UnreadableModel : the fields are not those of `kind`
+    UnreadableModel : If `values` has other fields than `kind`
     """
     hints = get_type_hints(kind)
     names = {field.name for field in fields(kind)} - set(groups)  # type: ignore[arg-type]
     if not isinstance(values, dict) or set(values) != names:
         actual = sorted(values) if isinstance(values, dict) else values
         raise UnreadableModel(
-            f"The model's {where} should have the fields {sorted(names)}, not {actual}. "
-            "Another version of sceneprint wrote it: train it again, or use that version."
+            f"The model's {where} must have the fields {sorted(names)}, but has {actual}. Another "
+            "version of sceneprint wrote the model. Train it again, or use that version."
         )
     parsed = {
         name: from_mapping(hints[name], value, f"{where}.{name}")
@@ -269,12 +269,12 @@ def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
 
 
 def differences(record: Any, default: Any = None) -> dict[str, Any]:
-    """Return the values of a record that differ from those of another, group by group.
+    """Return the values of a record that differ from another record, by group.
 
     Parameters
     ----------
-    record : a frozen record of numbers and of other records
-    default : record of the same class; None: its defaults
+    record : frozen record of numbers and of other records
+    default : record of the same class; None selects the defaults of the class
     """
     default = type(record)() if default is None else default
     different: dict[str, Any] = {}
@@ -288,24 +288,24 @@ def differences(record: Any, default: Any = None) -> dict[str, Any]:
 
 
 def apply_changes(default: T, values: Any, where: str) -> T:
-    """Return a record with some values of a default replaced.
+    """Return a record with some of its values replaced.
 
     Parameters
     ----------
-    default : a frozen record
-    values : parsed JSON, result of `differences`
+    default : frozen record
+    values : parsed JSON of the result of `differences`
     where : path of the record, for errors
 
     Raises
     ------
-    UnreadableModel : a field is unknown, or no number
+    UnreadableModel : If a field is unknown or not a number
     """
     hints = get_type_hints(type(default))
     unknown = sorted(set(values) - set(hints)) if isinstance(values, dict) else values
     if unknown or not isinstance(values, dict):
         raise UnreadableModel(
-            f"The model's {where} has {unknown}, which this version of sceneprint does not know. "
-            "Use the version that wrote it, or a later one."
+            f"The model's {where} has the fields {unknown}, which are unknown to this version of "
+            "sceneprint. Use the version that wrote the model, or a later version."
         )
     parsed = {
         name: apply_changes(getattr(default, name), value, f"{where}.{name}")
@@ -317,16 +317,16 @@ def apply_changes(default: T, values: Any, where: str) -> T:
 
 
 def _number(kind: Any, value: Any, where: str) -> Any:
-    """Return a number or truth value, converted to the type of its field."""
+    """Return a number or truth value that is converted to the type of its field."""
     if isinstance(value, bool) is not (kind is bool) or not isinstance(value, bool | int | float):
         raise UnreadableModel(
-            f"The model's {where} is {value!r}, not a number: the file is damaged. "
-            "Fetch or train it again."
+            f"The model's {where} is {value!r}, not a number: the file is damaged. Download the "
+            "model again, or train it again."
         )
     return kind(value)
 
 
-#: Power of a metre in the unit of each parameter that has a length.
+#: Power of a metre in the units of the parameters, by class and field.
 POWERS: dict[type, dict[str, int]] = {
     DepthParameters: {"minimum_depth": 1, "maximum_depth": 1},
     CloudParameters: {
@@ -386,12 +386,12 @@ POWERS: dict[type, dict[str, int]] = {
 
 
 def scale_lengths(parameters: T, factor: float) -> T:
-    """Return a record of parameters with every length in it, and in its groups, times a factor.
+    """Return a record of parameters with all lengths in it and in its groups scaled.
 
     Parameters
     ----------
-    parameters : a frozen record, such as ModelParameters
-    factor : above 0; other powers of a length are scaled accordingly
+    parameters : frozen record, such as ModelParameters
+    factor : positive factor of lengths; other powers of a length are scaled accordingly
     """
     powers = POWERS.get(type(parameters), {})
     changes: dict[str, Any] = {}

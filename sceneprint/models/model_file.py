@@ -1,7 +1,7 @@
-"""Read and write model files, and cache the pair tables computed from them.
+"""Model files, and the cache of the pair tables that are computed from models.
 
 A model's file is safetensors with a JSON header, without pickle or code. Its pair table is built
-once per machine, then memory-mapped by every process.
+once per machine, and then memory-mapped by all processes.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from sceneprint.models.model import (
 from sceneprint.types import Floats32
 from sceneprint_client.api.maps import PRESETS
 
-#: Maximum number of components: the pair table stores 16-bit indices.
+#: Maximum number of components, because the pair table stores 16-bit indices.
 MAXIMUM_COMPONENTS = 2**15 - 1
-#: Bounds of the numbers that determine the memory and time per frame.
+#: Minimum and maximum of the numbers that determine the memory and time per frame.
 BOUNDS = {
     "bins of the table": (1, 4_000_000),
     "levels": (1, 16),
@@ -89,38 +89,41 @@ MAXIMUM_DIMENSION = 1024
 
 
 def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -> None:
-    """Check that the levels of a whitening exist, and that its signatures are short.
+    """Check the levels of a whitening and the length of its signatures.
 
     Raises
     ------
-    ValueError : a check fails
+    ValueError : If a level does not exist or the length is out of bounds
     """
     known = [level for level in range(n_levels) if level in levels]
     if not known or list(levels) != known or any(isinstance(level, bool) for level in levels):
-        raise ValueError(f"a whitening cannot have levels {list(levels)} of {n_levels}")
+        raise ValueError(
+            f"a whitening cannot use the levels {list(levels)} of a hierarchy of {n_levels}"
+        )
     if not 1 <= dimension <= MAXIMUM_DIMENSION:
-        raise ValueError(f"{dimension} bytes of a signature are not from 1 to {MAXIMUM_DIMENSION}")
+        raise ValueError(
+            f"a signature of {dimension} bytes is not in the range 1 to {MAXIMUM_DIMENSION}"
+        )
 
 
 def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> None:
-    """Check that no frame can take unbounded memory or time with these parameters.
+    """Check that parameters from a file bound the memory and time per frame.
 
     Parameters
     ----------
-    p : parameters from a file
-    n_compressed : bytes of a descriptor
+    n_compressed : number of bytes of a descriptor
 
     Raises
     ------
-    ValueError : a number is out of bounds
+    ValueError : If a number is out of bounds
     """
     if n_components > MAXIMUM_COMPONENTS:
-        raise ValueError(f"{n_components} components are more than {MAXIMUM_COMPONENTS}")
+        raise ValueError(f"{n_components} components exceed the maximum of {MAXIMUM_COMPONENTS}")
     t = p.table
     if min(t.distance_bins, t.angle_bins, t.dihedral_bins) < 1:
-        raise ValueError("every axis of the table should have bins")
+        raise ValueError("every axis of the table must have bins")
     if not (p.surroundings.scales >= 1e-3).all():
-        raise ValueError("every scale of the surroundings should have a radius and bins")
+        raise ValueError("every scale of the surroundings must have a radius and bins")
     _check_cloud(p.cloud)
     alignment, rivals = p.validation.alignment, p.validation.rivals
     sequence = alignment.sequence
@@ -129,7 +132,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
     strides += [alignment.fine_stride, alignment.score_stride]
     plan = alignment.plan
     if not (plan.cell > 0 and plan.voxel > 0 and 0 < plan.height_step <= plan.height_range < 1e6):
-        raise ValueError("cells, voxels and heights of a plan should have a size")
+        raise ValueError("cells, voxels and heights of a plan must have a positive size")
     counts = {
         "bins of the table": t.n_bins,
         "levels": p.hierarchy.n_levels,
@@ -166,25 +169,24 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
 
 
 def _check_cloud(p: CloudParameters) -> None:
-    """Check that voxels and pixels have a size, and that the range is not empty."""
     if not 1e-4 <= p.minimum_range < p.maximum_range <= 1e6:
-        raise ValueError("the range of a cloud should begin above 0 and before it ends")
+        raise ValueError("the range of a cloud must start above 0 and not be empty")
     if not (p.voxel_size > 0 and min(p.voxel_angle, p.image_angle) >= 1e-4):
-        raise ValueError("voxels and pixels of a cloud should have a size")
+        raise ValueError("voxels and pixels of a cloud must have a positive size")
     if not max(p.voxel_angle, p.image_angle) <= 0.1 or not p.same_surface > 0:
-        raise ValueError("voxels and pixels of a cloud should be small, and not flat")
+        raise ValueError("voxels and pixels of a cloud are too large, or their angles too small")
     if not min(p.seed_px, p.validation_seed_px) >= 1:
-        raise ValueError("seeds of a cloud should be as far apart as voxels")
-    if not 0 < p.range_gate <= 1:  # 1 allows neighbours at e times the range
-        raise ValueError("neighbours in a cloud should be in some range of each other")
+        raise ValueError("the distance between seeds of a cloud must be at least one voxel")
+    if not 0 < p.range_gate <= 1:  # a gate of 1 allows neighbours at e times the range
+        raise ValueError("the range gate of a cloud must be above 0 and at most 1")
 
 
-#: Maximum size of a file: a model with the most components fits.
+#: Maximum size of a file, sufficient for a model with the maximum number of components.
 MAXIMUM_BYTES = 16 << 20
 
 
 def write_model(model: Model) -> bytes:
-    """Return a model as the bytes of its file."""
+    """Return the bytes of a model's file."""
     from safetensors.numpy import save
 
     header = model.header | {
@@ -197,19 +199,19 @@ def write_model(model: Model) -> bytes:
 
 
 def save_model(model: Model, path: Path) -> None:
-    """Write a model to a file atomically; its folder must exist."""
+    """Write a model to a file atomically; the folder must exist."""
     data = write_model(model)
-    parse_model(data, str(path))  # refuse to write an unreadable file
+    parse_model(data, str(path))  # an unreadable file must not be written
     write_whole(path, data)
 
 
 def read_model(model: str | Path) -> Model:
-    """Read a preset by its name, or a model file by its path.
+    """Read a preset by its name or a model file by its path.
 
     Raises
     ------
-    UnreadableModel : the preset or file does not exist, is no model, has another schema, or its
-        content does not match the id in its header
+    UnreadableModel : If the preset or file does not exist, is not a model, has another schema, or
+        its content does not match the id in its header
     """
     if str(model) in PRESETS:
         source = resources.files("sceneprint") / "presets" / f"{model}.safetensors"
@@ -218,20 +220,20 @@ def read_model(model: str | Path) -> Model:
     try:
         if path.stat().st_size > MAXIMUM_BYTES:
             raise UnreadableModel(
-                f"{path}: {path.stat().st_size} bytes are more than any model has. "
-                "Give the path of a file that `sceneprint train` wrote."
+                f"{path}: {path.stat().st_size} bytes exceed the maximum size of a model. "
+                "Specify the path of a file that `sceneprint train` wrote."
             )
         data = path.read_bytes()
     except OSError as error:
         raise UnreadableModel(
-            f"{path}: cannot be read ({error.strerror or error}). Give one of the presets "
+            f"{path}: cannot be read ({error.strerror or error}). Specify one of the presets "
             f"({', '.join(PRESETS)}), or the path of a file that `sceneprint train` wrote."
         ) from error
     return parse_model(data, str(path))
 
 
 def parse_model(data: bytes, name: str) -> Model:
-    """Read a model from the bytes of its file.
+    """Return the model in the bytes of its file.
 
     Parameters
     ----------
@@ -239,7 +241,7 @@ def parse_model(data: bytes, name: str) -> Model:
 
     Raises
     ------
-    UnreadableModel : see `read_model`
+    UnreadableModel : If the bytes are not a valid model; see `read_model`
     """
     from safetensors.numpy import load
 
@@ -248,16 +250,17 @@ def parse_model(data: bytes, name: str) -> Model:
         metadata = json.loads(data[8 : 8 + length])["__metadata__"]
         header: dict[str, Any] = dict(json.loads(metadata["sceneprint"]))
         tensors = load(data)
-    except Exception as error:  # exceptions of safetensors, json and Python
+    except Exception as error:  # safetensors and json raise various exceptions
         raise UnreadableModel(
             f"{name}: not a model file ({type(error).__name__}: {error}). "
-            "Give the path of a file that `sceneprint train` wrote."
+            "Specify the path of a file that `sceneprint train` wrote."
         ) from error
     schema = SCHEMA_VERSION if "whitening" in header else PSI_SCHEMA_VERSION
     if header.get("schema_version") != schema:
         raise UnreadableModel(
-            f"{name}: schema {header.get('schema_version')} is not {schema}, the one this version "
-            "of sceneprint reads. Train it again, or use the version that wrote it."
+            f"{name}: the model has schema {header.get('schema_version')}, but this version of "
+            f"sceneprint reads schema {schema}. Train the model again, or use the version that "
+            "wrote it."
         )
     try:
         model, expected = _assemble(header, tensors), str(header["id"])
@@ -265,13 +268,13 @@ def parse_model(data: bytes, name: str) -> Model:
         raise UnreadableModel(f"{name}: {error}") from error
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise UnreadableModel(
-            f"{name}: a part of the model is missing or misshapen ({error}). "
-            "Fetch or train it again."
+            f"{name}: a part of the model is missing or malformed ({error}). Download the model "
+            "again, or train it again."
         ) from error
     if model.id != expected:
         raise UnreadableModel(
-            f"{name}: its content gives the id {model.id[:12]}, its header says "
-            f"{expected[:12]}: the file was damaged. Fetch or train it again."
+            f"{name}: the content has the id {model.id[:12]}, but the header has {expected[:12]}: "
+            "the file is damaged. Download the model again, or train it again."
         )
     return model
 
@@ -293,18 +296,18 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
     for name, shape in shapes.items():
         tensor, kind = tensors[name], "float32" if name.startswith("compression") else "float64"
         if tensor.shape != shape or tensor.dtype != kind or not np.isfinite(tensor).all():
-            raise ValueError(f"{name} should be finite {kind} {shape}")
+            raise ValueError(f"{name} must be finite {kind} {shape}")
     if (
         g < 1
         or (tensors["mixture.weights"] <= 0).any()
         or (tensors["mixture.variances"] <= 0).any()
     ):
-        raise ValueError("weights and variances should be positive")
+        raise ValueError("weights and variances must be positive")
     step, d0 = float(header["quantiser_step"]), float(header["unrelated_distance"])
     if not (math.isfinite(step) and step > 0 and math.isfinite(d0) and d0 > 0):
-        raise ValueError("quantiser step and unrelated distance should be positive")
+        raise ValueError("quantiser step and unrelated distance must be positive")
     if not re.fullmatch(r"[\w.-]{1,64}", str(header["name"]), re.ASCII):
-        raise ValueError("a name is up to 64 letters, digits, dots and dashes")
+        raise ValueError("a name must have 1 to 64 letters, digits, dots and dashes")
     return Model(
         name=str(header["name"]),
         parameters=parameters,
@@ -322,7 +325,7 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
 
 
 def _answer(values: Any) -> AnswerParameters:
-    """Parse the parameters of the answer; UnreadableModel or ValueError if they are invalid."""
+    """Return the parsed parameters of the answer; raise an error if they are invalid."""
     answer = apply_changes(AnswerParameters(), values, "answer")
     refinement, views = answer.map.refinement, answer.map
     counts = {
@@ -333,22 +336,22 @@ def _answer(values: Any) -> AnswerParameters:
     }
     _check_counts(counts)
     if not (views.cell > 0 and views.reach > 0 and views.around_reach > 0):
-        raise ValueError("reaches and cells of the map should have a size")
+        raise ValueError("reaches and cells of the map must be positive")
     return answer
 
 
 def _check_counts(counts: dict[str, int]) -> None:
-    """Check that numbers are within their BOUNDS; ValueError if one is not."""
+    """Raise ValueError if a number is not within its BOUNDS."""
     for name, count in counts.items():
         least, most = BOUNDS[name]
         if not least <= count <= most:
-            raise ValueError(f"{name}: {count} is not from {least} to {most}")
+            raise ValueError(f"{name}: {count} is not in the range {least} to {most}")
 
 
 def _whitening(
     header: dict[str, Any], tensors: dict[str, np.ndarray], level_length: int, n_levels: int
 ) -> Whitening | None:
-    """Return the whitening of a file; None if it has none."""
+    """Return the whitening of a file; None if the file has no whitening."""
     if "whitening" not in header:
         return None
     values, basis = header["whitening"], tensors["whitening.basis"]
@@ -362,26 +365,26 @@ def _whitening(
     for name, (kind, shape) in shapes.items():
         tensor = tensors[f"whitening.{name}"]
         if tensor.shape != shape or tensor.dtype != kind or not np.isfinite(tensor).all():
-            raise ValueError(f"whitening.{name} should be finite {kind} {shape}")
+            raise ValueError(f"whitening.{name} must be finite {kind} {shape}")
     if not (math.isfinite(d0) and d0 > 0):
-        raise ValueError("the unrelated distance of the whitening should be positive")
+        raise ValueError("the unrelated distance of the whitening must be positive")
     scales, offsets = tensors["whitening.scales"], tensors["whitening.offsets"]
     return Whitening(levels, basis, scales, offsets, d0)
 
 
 #: Version of the layout of the cached file, and part of its name.
 CACHE_VERSION = 1
-#: Bytes before the bins; a multiple of a cache line, so that the bins stay aligned.
+#: Number of bytes before the bins: a multiple of a cache line, so that the bins are aligned.
 HEAD = 64
 #: Number of bins between two reports of progress.
 CHUNK = 16_384
 
-#: Receives the number of finished bins and their total.
+#: Callback for the number of finished bins and the total number of bins.
 Progress = Callable[[int, int], None]
 
 
 def default_cache_dir() -> Path:
-    """Return the default folder of derived files: the user's cache folder."""
+    """Return the default folder of derived files, the user's cache folder."""
     return Path(platformdirs.user_cache_dir("sceneprint", appauthor=False))
 
 
@@ -390,13 +393,13 @@ def open_table(
 ) -> PairTable:
     """Return the table of a model, from the cache if possible.
 
-    Processes that build it at once each publish a whole file with the same bytes. If the cache
-    folder is not writable, the table stays in memory.
+    If several processes build it simultaneously, each publishes a complete file with the same
+    bytes. If the cache folder is not writable, the table stays in memory.
 
     Parameters
     ----------
     cache_dir : folder of derived files; created if missing
-    progress : receives the progress of building the table
+    progress : callback for the progress of building the table
     """
     folder = default_cache_dir() if cache_dir is None else cache_dir
     path = folder / f"table-v{CACHE_VERSION}-{model.id}.bin"
@@ -407,7 +410,7 @@ def open_table(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, _head(table.packed) + table.packed.tobytes())
-    except OSError:  # read-only or full: the cache is optional
+    except OSError:  # the cache is optional
         return table
     return _map_table(path, model) or table
 
@@ -422,23 +425,18 @@ def _map_table(path: Path, model: Model) -> PairTable | None:
         packed = np.memmap(path, np.float32, "r", offset=HEAD, shape=shape)
     except (OSError, ValueError):
         return None
-    # an ndarray of the same memory, because slices of a memmap are slow
+    # slices of a memmap are slow, so use an ndarray of the same memory
     return PairTable(np.asarray(packed)) if head == _head(packed) else None
 
 
 def _head(packed: Floats32) -> bytes:
-    """Return the first bytes of the file: kind, version, and a checksum (20 ms to verify)."""
+    """Return the first bytes of the file: kind, version, and a checksum (verified in 20 ms)."""
     checksum = zlib.crc32(packed.view(np.uint8).data)
     return f"sceneprint table {CACHE_VERSION} {checksum:08x}".encode().ljust(HEAD)
 
 
 def build_table(model: Model, progress: Progress | None = None) -> PairTable:
-    """Return the table of a model, computed in memory.
-
-    Parameters
-    ----------
-    progress : receives the progress
-    """
+    """Compute the table of a model in memory; `progress` is called after each chunk of bins."""
     p, n = model.parameters, model.parameters.table.n_bins
     packed = np.empty((n, WIDTH), np.float32)
     for first in range(0, n, CHUNK):

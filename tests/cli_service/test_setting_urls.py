@@ -19,14 +19,14 @@ SERVER = "postgresql+psycopg://u:hunter2@host/db"
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("BLOB_URL", "s3://key:hunter2@bucket/prefix", "come from the environment"),
-        ("BLOB_URL", "s3://bucket?secret=hunter2", "come from the environment"),
-        ("INDEX_URL", "gs://bucket/p#hunter2", "come from the environment"),
-        ("BLOB_URL", "s3://[hunter2", "come from the environment"),
-        ("BLOB_URL", "hunter2://bucket", "does not start with any of s3://, gs://, az://"),
-        ("INDEX_URL", "hunter2", "does not start with any of s3://"),
-        ("BLOB_URL", "", "does not start with any of s3://"),
-        ("BLOB_URL", "s3:///hunter2", "names no bucket"),
+        ("BLOB_URL", "s3://key:hunter2@bucket/prefix", "set credentials in the environment"),
+        ("BLOB_URL", "s3://bucket?secret=hunter2", "set credentials in the environment"),
+        ("INDEX_URL", "gs://bucket/p#hunter2", "set credentials in the environment"),
+        ("BLOB_URL", "s3://[hunter2", "set credentials in the environment"),
+        ("BLOB_URL", "hunter2://bucket", "must start with one of s3://, gs://, az://"),
+        ("INDEX_URL", "hunter2", "must start with one of s3://"),
+        ("BLOB_URL", "", "must start with one of s3://"),
+        ("BLOB_URL", "s3:///hunter2", "contains no bucket"),
     ],
 )
 def test_a_url_that_is_none_is_refused_and_not_repeated(

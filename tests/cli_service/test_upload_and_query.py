@@ -237,7 +237,7 @@ def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) ->
     first = re.match(
         r"  r1/room-0/seq-01/frame-000001\.depth\.png  [0-9a-f]{32} +1 +1\.00  accepted strong +"
         r"1\.00 +"
-        r"(\S+) (\S+) (\S+) +0\.0 +(\S+) (\S+) (\S+)  surfaces agree",
+        r"(\S+) (\S+) (\S+) +0\.0 +(\S+) (\S+) (\S+)  the surfaces agree",
         matches[0],
     )
     assert first is not None, matches[0]

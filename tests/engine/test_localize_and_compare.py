@@ -74,7 +74,7 @@ def test_what_is_not_found_says_why(full: Engine, empty: Engine, uploads: Any, i
     assert late.reason.startswith("the deadline passed before a match was accepted: 0 of 10")
     unsure = ask(validation={"ambiguous": 0.0})
     assert (unsure.status, unsure.pose) == ("ambiguous", None)
-    assert "another transform explains the frames as well" in unsure.reason
+    assert "another transform explains the frames equally well" in unsure.reason
     with pytest.raises(InvalidRequest, match="needs validated matches"):
         check_localizes(Query(stages=("retrieve", "diversify")))
 

@@ -109,9 +109,9 @@ def test_whitenings_that_are_none(small_whitened: Model, tmp_path: Path) -> None
         with_tensors(good, whitening_offsets=np.zeros(23)),
     ]  # fmt: skip
     for file in files:
-        with pytest.raises(UnreadableModel, match="missing or misshapen"):
+        with pytest.raises(UnreadableModel, match="missing or malformed"):
             parse_model(file, "a file")
-    with pytest.raises(UnreadableModel, match="schema 2 is not 3"):
+    with pytest.raises(UnreadableModel, match=r"schema 2, but .* reads schema 3"):
         parse_model(with_header(good, lambda header: header.update(schema_version=2)), "a file")
 
 
@@ -176,9 +176,9 @@ def test_damage_is_noticed(data: bytes) -> None:
 
     cases = {
         "not a model file": [b"", b"x" * 100, data[:40], data[:-5], save({"a": np.zeros(1)})],
-        "schema 9 is not 2": [with_header(data, put("schema_version", 9))],
-        "schema 1 is not 2": [with_header(data, put("schema_version", 1))],
-        "missing or misshapen": [
+        "schema 9, but .* reads schema 2": [with_header(data, put("schema_version", 9))],
+        "schema 1, but .* reads schema 2": [with_header(data, put("schema_version", 1))],
+        "missing or malformed": [
             with_header(data, drop("quantiser_step")),
             with_header(data, put("quantiser_step", 0.0)),
             with_header(data, put("unrelated_distance", float("nan"))),
@@ -194,8 +194,8 @@ def test_damage_is_noticed(data: bytes) -> None:
             with_tensors(data, compression_matrix=np.zeros((1025, 927), np.float32)),
             without_tensor(data, "compression.mean"),
         ],
-        "should have the fields": [with_header(data, put("parameters", {"depth": {}}))],
-        "was damaged": [
+        "must have the fields": [with_header(data, put("parameters", {"depth": {}}))],
+        "is damaged": [
             with_header(data, put("quantiser_step", 0.5)),
             with_tensors(data, projection_mean=np.zeros(13)),
             with_tensors(data, compression_mean=np.zeros(927, np.float32)),
@@ -248,7 +248,7 @@ def test_parameters_that_would_take_all_memory(
         assert isinstance(parameters, dict)
         parameters[stage][field] = value
 
-    with pytest.raises(UnreadableModel, match="missing or misshapen"):
+    with pytest.raises(UnreadableModel, match="missing or malformed"):
         parse_model(with_header(data, enlarge), "a file")
 
 
@@ -259,7 +259,7 @@ def test_components_beyond_what_the_table_can_name(data: bytes) -> None:
         "mixture_means": np.zeros((g, 12)),
         "mixture_variances": np.ones((g, 12)),
     }
-    with pytest.raises(UnreadableModel, match="32768 components are more than 32767"):
+    with pytest.raises(UnreadableModel, match="32768 components exceed the maximum of 32767"):
         parse_model(with_tensors(data, **tensors), "a file")
 
 
@@ -281,5 +281,5 @@ def test_paths_that_hold_no_model(tmp_path: Path) -> None:
     large = tmp_path / "large"
     with large.open("wb") as file:
         file.truncate(17 << 20)
-    with pytest.raises(UnreadableModel, match="more than any model has"):
+    with pytest.raises(UnreadableModel, match="exceed the maximum size"):
         read_model(large)

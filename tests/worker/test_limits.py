@@ -50,10 +50,10 @@ STOP = """
 import os, signal, sys
 from sceneprint.process import StopSignal
 stop = StopSignal()
-print(stop.asked)
+print(stop.requested)
 os.kill(os.getpid(), int(sys.argv[1]))
 stop.wait(1e6)
-print(stop.asked)
+print(stop.requested)
 """
 
 
