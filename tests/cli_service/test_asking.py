@@ -35,6 +35,7 @@ def maps(service_url: str, rooms: Path) -> dict[str, list[str]]:
     return found
 
 
+@pytest.mark.thorough
 def test_up_goes_with_uploads_and_queries(sceneprint: Run, service_url: str, rooms: Path) -> None:
     frame, other = (rooms / "room-0" / "seq-01" / f"frame-00000{i}.depth.png" for i in (0, 1))
     sceneprint("upload", "level", frame, "--up", "0.6,-0.8,0")

@@ -408,6 +408,7 @@ def test_an_upload_ends_at_its_timeout(sceneprint: Run, tmp_path: Path, rooms: P
         )
 
 
+@pytest.mark.thorough
 def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     sceneprint: Run, service_url: str, room_mesh: bytes, tmp_path: Path
 ) -> None:

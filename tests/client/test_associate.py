@@ -11,7 +11,6 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.errors import InvalidRequest, UnknownMap
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.sessions import Association
@@ -59,28 +58,6 @@ def test_edges_and_graphs(associated: Filled) -> None:
     assert client.graph(MAP, name, odometry=True).count("EDGE_SE3:QUAT") > len(edges)
     rows = [line.split() for line in client.graph(MAP, name, "tum").splitlines()]
     assert len([row for row in rows if row[0] != "#"]) == 6
-
-
-def test_refusals(associated: Filled) -> None:
-    client = associated.client
-    found = client.compute(Association, MAP, sessions=["a"], apart=2)
-    assert found.result is not None
-    assert found.result.frames == 3
-    of = MAP, found.job_id
-    for ask, field in (
-        (lambda: client.graph(*of, "gtsam"), "format"),  # type: ignore[arg-type]
-        (lambda: client.graph(*of, min_overlap=2.0), "min_overlap"),
-        (lambda: list(client.edges(*of, min_overlap=-0.1)), "min_overlap"),
-    ):
-        with pytest.raises(InvalidRequest) as caught:
-            ask()
-        assert [name for name, _ in caught.value.fields] == [field]
-    with pytest.raises(UnknownMap):
-        client.compute(Association, "nowhere", sessions=["a"])
-    with pytest.raises(InvalidRequest):
-        client.compute(Association, MAP, sessions=["a", "nobody"])
-    with pytest.raises(InvalidRequest):
-        client.compute(Association, MAP, sessions=["a", "a"])
 
 
 def test_graphs_and_edges_over_http(associated: Filled) -> None:

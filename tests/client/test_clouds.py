@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import InvalidRequest, UnreadableCloud
 from sceneprint.formats.dataset import find_sequences, write_pose
 from sceneprint.formats.export import write_ply
 from sceneprint.formats.points import decode_cloud
@@ -17,7 +16,6 @@ from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.pipeline import open_signer, sign
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_client import Client
-from sceneprint_client.api import FrameMeta
 
 
 @pytest.fixture(scope="module")
@@ -80,15 +78,3 @@ def test_a_folder_of_scans(client: Client, map_name: str, folder: Path, seen: li
     )  # fmt: skip
     itself = client.similarity((map_name, first.frame_id), data)
     assert itself.distance == told[first.frame_id].distance
-
-
-def test_what_is_none_is_refused_alike(client: Client, map_name: str, seen: list[Floats]) -> None:
-    client.create_map(map_name, model="depth")
-    with pytest.raises(UnreadableCloud, match="PLY"):
-        client.upload(map_name, write_ply(seen[0])[:-7], FrameMeta())
-    with pytest.raises(InvalidRequest, match="intrinsics") as caught:
-        client.query(map_name, b"\x89PNG\r\n\x1a\n", FrameMeta())
-    assert caught.value.fields[0][0] == "intrinsics"
-    with pytest.raises(TypeError, match="the bytes of a depth image need"):
-        client.upload(map_name, b"\x89PNG\r\n\x1a\n")
-    assert list(client.frames(map_name)) == []

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from sceneprint.errors import InvalidRequest, UnknownMap
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_client.api.coverage import MapCoverage
@@ -56,22 +55,3 @@ def test_a_result_with_its_frames_plan_and_changes(covered: Client, whole: MapCo
     rest = {"cursor": page["next_cursor"]}
     left = covered._http.get(f"/v1/maps/{MAP}/coverage/{whole.job_id}/frames", params=rest).json()
     assert [frame["number"] for frame in left["items"]] == [3]
-
-
-def test_refusals(covered: Client, whole: MapCoverage) -> None:
-    with pytest.raises(UnknownMap):
-        covered.compute(MapCoverage, "nowhere")
-    with pytest.raises(InvalidRequest, match="no indexed frame"):
-        covered.compute(MapCoverage, MAP, session="nobody")
-    with pytest.raises(InvalidRequest, match="every"):
-        covered.compute(MapCoverage, MAP, every=0)
-    near = covered.compute(MapCoverage, MAP)  # by default it leaves out frames within ten seconds
-    assert near.result is not None
-    assert near.result.not_found == 4
-    with pytest.raises(InvalidRequest, match="not_within_s of their requests differ"):
-        covered.coverage_changes(MAP, whole.job_id, near.job_id)
-    for path, more in (
-        ("frames", {"outcome": "lost"}), ("changes", {}),
-    ):  # fmt: skip
-        refused = covered._http.get(f"/v1/maps/{MAP}/coverage/{whole.job_id}/{path}", params=more)
-        assert refused.status_code == 422

@@ -14,9 +14,7 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import (
     FrameConflict,
     InvalidRequest,
-    UnknownJob,
     UnknownMap,
-    UnreadableArchive,
     UnreadableCloud,
 )
 from sceneprint.formats.dataset import FrameReference
@@ -136,35 +134,6 @@ def test_an_archive_gives_what_an_upload_of_the_folder_gives(
     again, items = done(client, map_name, packed(rooms), options)
     assert again.result["there"] == len(references)
     assert {one.status for one in items} == {200}
-
-
-def test_what_is_no_archive_is_refused_at_the_door(
-    client: Client, map_name: str, rooms: Path, tmp_path: Path
-) -> None:
-    client.create_map(map_name, model="depth")
-    for data, reason in (
-        (b"no archive at all", None),
-        (packed(rooms).getvalue()[:-400], "ends early"),
-    ):
-        with pytest.raises(UnreadableArchive, match=reason):
-            client.import_archive(map_name, io.BytesIO(data))
-    with pytest.raises(UnknownMap):
-        client.import_archive("nowhere", packed(rooms))
-    with pytest.raises(UnreadableArchive, match="cannot be read"):
-        client.import_archive(map_name, tmp_path / "none.zip")
-    with pytest.raises(UnknownJob):
-        next(client.import_items(map_name, "0" * 32))
-    empty = io.BytesIO()
-    tarfile.open(fileobj=empty, mode="w").close()
-    with pytest.raises(UnreadableArchive):
-        client.import_archive(map_name, empty)
-    notes = io.BytesIO()
-    with tarfile.open(fileobj=notes, mode="w") as archive:
-        archive.addfile(tarfile.TarInfo("notes.txt"))
-    notes.seek(0)
-    job, items = done(client, map_name, notes)
-    assert (job.state, items) == (JobState.FAILED, [])
-    assert job.error
 
 
 def test_a_map_that_is_one_file(

@@ -280,6 +280,7 @@ with Spool(path) as spool:
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "most"), [("large", 600), ("wide", 160), ("broken", 160)])
 def test_a_full_file_system_is_told_and_emptied_by_sync(
     remote: Client, service_url: str, map_name: str, tmp_path: Path, kind: str, most: int

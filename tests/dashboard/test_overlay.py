@@ -255,39 +255,6 @@ def test_an_ambiguous_match_has_its_rival(
     assert matrix(page).tolist() == np.eye(4).tolist()
 
 
-def test_a_camera_that_is_not_known_is_as_wide_as_what_was_seen(
-    page: Page, station: Any, settle: Any
-) -> None:
-    page.goto(station.home)
-    settle(page)
-    drawn = page.evaluate(
-        """async () => {
-          const { lens } = await import(`${location.pathname}/overlay/parts.js`);
-          const { frustum } = await import(`${location.pathname}/viewer/shapes.js`);
-          return [...frustum(lens(null, {origin: [-1, -0.5, 1], extent: [3, 1, 1]}, "depth"), 2)];
-        }"""
-    )
-    corners = np.reshape(drawn, (-1, 3))
-    far = corners[corners[:, 2] == 2][:8]  # without the mark that says which way is up
-    assert far.min(axis=0) == pytest.approx([-1, -0.5, 2])
-    assert far.max(axis=0) == pytest.approx([2, 0.5, 2])
-
-
-@pytest.mark.thorough
-def test_what_is_gone_says_so(page: Page, station: Any, answer: Any, settle: Any, axe: Any) -> None:
-    page.allowed += ["404", "409"]  # type: ignore[attr-defined]
-    gone = {"query_id": "0" * 32}
-    page.goto(address(station, gone, answer["matches"][0]))
-    settle(page)
-    assert "has expired" in text(page, "main h2")
-    bare = ask(station, 3, stages="retrieve")
-    page.goto(address(station, bare, bare["matches"][0]))
-    settle(page)
-    assert "nothing to overlay" in text(page, "main h2")
-    assert "without validation" in text(page, "main")
-    assert axe(page) == []
-
-
 @pytest.mark.thorough
 def test_without_webgl_the_numbers_are_still_there(
     open_page: Any, station: Any, answer: Any, settle: Any

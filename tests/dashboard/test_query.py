@@ -502,44 +502,6 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
 
 
 @pytest.mark.thorough
-def test_what_is_no_longer_kept_is_asked_again_where_it_can_be(station, page, ask, settle):
-    answer = ask("&k=1")
-    (station.data / "queries" / answer["query_id"]).unlink()
-    page.allowed.append("404")
-    page.goto(f"{station.home}#/queries/{answer['query_id']}")
-    settle(page)
-    assert "has expired" in page.locator("h2").first.inner_text()
-    page.get_by_role("link", name="Repeat the query").click()
-    settle(page)
-    assert shown(station, page)["matches"] == answer["matches"]
-    page.goto(f"{station.home}#/queries/{'0' * 32}")
-    settle(page)
-    assert "has expired" in page.locator("h2").first.inner_text()
-    assert page.get_by_role("link", name="Repeat the query").count() == 0
-
-
-@pytest.mark.thorough
-def test_an_answer_outlives_frames_of_its_ranking(station, page, settle, until):
-    path = station.make_map("shrinking")
-    for sent in station.frames[:6]:
-        station.client.post(f"{path}/frames", **sent.form())
-    until(lambda: station.client.get(path).json()["frames"].get("indexed") == 6)
-    answer = station.client.post(f"{path}/queries", **station.frames[6].form()).json()
-    ranks = {key(one): one["rank"] for one in answer["matches"]}
-    gone = next(one for one in answer["matches"] if one["rank"] == 2)
-    station.client.delete(f"{path}/frames/{gone['frame_id']}")
-    page.allowed.append("404")  # the picture of the frame that is gone
-    page.goto(f"{station.home}#/queries/{answer['query_id']}?why=open")
-    settle(page)
-    ranking = tiles(page, "R")
-    assert key(gone) not in {one["key"] for one in ranking}
-    assert [one["rank"] for one in ranking] == [1, 3, 4, 5, 6]
-    assert all(one["rank"] == ranks.get(one["key"], one["rank"]) for one in ranking)
-    head = page.locator("[data-row=R] .query-row-head").inner_text()
-    assert "6 of 6 compared, 5 shown" in head
-
-
-@pytest.mark.thorough
 def test_an_answer_is_kept_shared_and_released(station, open_page, settle, axe, until):
     page = open_page(permissions=["clipboard-read", "clipboard-write"])
     frame = station.frames[2].frame_id
