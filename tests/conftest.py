@@ -48,13 +48,16 @@ from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
 from sceneprint.types import DepthFrame
 from sceneprint_client.api import CameraIntrinsics
-from sceneprint_lab.cli.demo import write_building
+from sceneprint_lab.cli.demo import serving, write_building
 from sceneprint_lab.synth import KINECT, SynthRoom, synthesise_room
 from sceneprint_lab.synth.rooms import make_room
 
-#: Folders whose files share what is dear to begin, such as a service with its workers: all of one
-#: run in one process, one after another. The longest are first, and are begun first.
-TOGETHER = ("dashboard", "service", "client", "cli_service", "scenes", "ros2")
+#: Folders whose files share what is dear to begin, such as a service with its workers, and the
+#: unit that runs in one process, one file after another. The longest units are begun first.
+TOGETHER = {
+    "dashboard": "dashboard", "service": "service", "client": "clients", "cli_service": "clients",
+    "ros2": "clients", "scenes": "clients",
+}  # fmt: skip
 #: Long files in them that begin all they need themselves, and so may run beside the others.
 APART = (
     "service/test_lifecycle.py", "service/test_hostile.py",
@@ -141,14 +144,14 @@ def add_distributions(folder: Path) -> None:
 
 
 def unit_of(nodeid: str) -> str:
-    """The folder or the file whose tests run in one process."""
+    """Return the unit whose tests run in one process: of TOGETHER, or a file."""
     file = nodeid.partition("::")[0]
     folder, _, name = file.removeprefix("tests/").partition("/")
-    return f"tests/{folder}" if folder in TOGETHER and f"{folder}/{name}" not in APART else file
+    return TOGETHER[folder] if folder in TOGETHER and f"{folder}/{name}" not in APART else file
 
 
 class UnitScheduling(LoadFileScheduling):
-    """Hands out whole files, and whole folders of TOGETHER."""
+    """Hands out whole files, and whole units of TOGETHER."""
 
     def _split_scope(self, nodeid: str) -> str:
         return unit_of(nodeid)
@@ -165,15 +168,15 @@ _folder = ExitStack()
 
 @pytest.fixture(scope="session")
 def folder_stack() -> ExitStack:
-    """What is entered here ends with the last test of the folder, or of a file that is in no
-    folder of TOGETHER: services would run on beside the tests of others, and take their time.
+    """What is entered here ends with the last test of the unit: services would run on beside the
+    tests of others, and take their time.
     """
     return _folder
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """End what lasts as long as a folder."""
+    """End what lasts as long as a unit."""
     if nextitem is None or unit_of(nextitem.nodeid) != unit_of(item.nodeid):
         _folder.close()
 
@@ -190,7 +193,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long folders and files first."""
-    names = (*(f"tests/{name}" for name in TOGETHER), *LONG)
+    names = (*dict.fromkeys(TOGETHER.values()), *LONG)
     places = {name: place for place, name in enumerate(names)}
 
     def place(item: pytest.Item) -> int:
@@ -225,6 +228,20 @@ def _databases_go(request: pytest.FixtureRequest) -> Iterator[None]:
         asked = "DELETE FROM folders WHERE place = %s OR starts_with(place, %s) RETURNING name"
         for (name,) in connection.execute(asked, (place, f"{place}/")).fetchall():
             connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+
+
+@pytest.fixture(scope="session")
+def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the service at `service_url`."""
+    return tmp_path_factory.mktemp("service")
+
+
+@pytest.fixture(scope="session")
+def service_url(data_folder: Path, folder_stack: ExitStack) -> str:
+    """Start one service with one worker for all clients of it; each test uses maps of its own."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", f"{2 << 20}")
+        return folder_stack.enter_context(serving(data_folder, 1))
 
 
 @pytest.fixture(scope="session")

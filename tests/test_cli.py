@@ -202,6 +202,7 @@ def test_names_that_no_line_can_hold(model_file: Path, tmp_path: Path) -> None:
     assert "\x1b" not in done.stdout
 
 
+@pytest.mark.thorough
 def test_a_reader_that_leaves_does_not_stop_the_writing(
     rooms: Path, model_file: Path, tmp_path: Path
 ) -> None:

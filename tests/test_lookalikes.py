@@ -162,6 +162,7 @@ def recordings(data_root: Path) -> list[list[FrameReference]]:
     return [[f for s in find_sequences(data_root / name) for f in s.frames] for name in scenes]
 
 
+@pytest.mark.thorough
 def test_the_sides_of_a_lone_box_are_not_told_apart(model: Model) -> None:
     counted = outcomes_of(box_pairs(24, 31), 24, "box", model)
     assert counted.total() == 24
@@ -233,6 +234,7 @@ def test_frames_that_overlap_by_half_are_accepted(
     assert not_believed(counted) == 1.0
 
 
+@pytest.mark.thorough
 def test_frames_of_other_rooms_are_not_accepted(
     model: Model, recordings: list[list[FrameReference]]
 ) -> None:

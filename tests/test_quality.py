@@ -217,6 +217,7 @@ def test_a_roll_of_the_camera_changes_little(signer: Signer, views: list[RolledV
     assert shares.max() <= 0.35
 
 
+@pytest.mark.thorough
 def test_a_rectangular_sensor_turned_upside_down_sees_the_same(signer: Signer) -> None:
     shares = [shares_of_d0(view(i), signer, False, angles=(180,))[0] for i in range(4)]
     assert max(shares) <= 1 / 3

@@ -64,6 +64,7 @@ def unseen(room_views: Callable[..., SynthRoom]) -> list[DepthFrame]:
     return [room_views(99, i, 1).frames[0] for i in range(8)]
 
 
+@pytest.mark.thorough
 def test_quantiser_and_d0_fit_new_rooms(
     trained: tuple[Model, object], unseen: list[DepthFrame]
 ) -> None:
@@ -78,6 +79,7 @@ def test_quantiser_and_d0_fit_new_rooms(
     assert stored.astype(int).std() > 10  # the bytes are used
 
 
+@pytest.mark.thorough
 def test_descriptors_are_learnt_from_the_rooms(
     trained: tuple[Model, object], unseen: list[DepthFrame]
 ) -> None:
@@ -96,6 +98,7 @@ def test_descriptors_are_learnt_from_the_rooms(
     assert ((left @ random.T) ** 2).sum() / (left**2).sum() < 0.2
 
 
+@pytest.mark.thorough
 def test_provenance_says_what_it_saw(trained: tuple[Model, object]) -> None:
     seen = trained[0].provenance
     assert (seen["frames_used"], seen["own_frames"]) == (8, 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +10,8 @@ import pytest
 
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.types import DepthFrame
-from sceneprint_lab.cli.demo import serving
 
 Run = Callable[..., Any]
-
-
-@pytest.fixture(scope="session")
-def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("service")
-
-
-@pytest.fixture(scope="session")
-def service_url(data_folder: Path, folder_stack: ExitStack) -> str:
-    """One service with one worker for all tests; each uses maps of its own."""
-    return folder_stack.enter_context(serving(data_folder, 1))
 
 
 @pytest.fixture

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import (
     Camera,
     FrameReference,
@@ -31,36 +26,6 @@ from sceneprint.types import DepthFrame
 from sceneprint_client import Client, http
 from sceneprint_client.api import FrameMeta
 from sceneprint_lab.synth import SynthRoom
-
-#: Largest body the service of these tests takes, bytes.
-UPLOAD_BYTES = 2 << 20
-
-
-@pytest.fixture(scope="session")
-def service_url(tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack) -> str:
-    """One service with one worker for all tests; each uses maps of its own."""
-    return folder_stack.enter_context(_serving(tmp_path_factory.mktemp("service")))
-
-
-@contextmanager
-def _serving(data: Path) -> Iterator[str]:
-    with (data / "log").open("wb") as log:
-        arguments = ["serve", "--port", "0", "--data", str(data), "--workers", "1"]
-        process = subprocess.Popen(
-            [sys.executable, "-m", "sceneprint", *arguments],
-            env={**os.environ, "SCENEPRINT_MAX_UPLOAD_BYTES": str(UPLOAD_BYTES)},  # its alone
-            stdout=subprocess.PIPE,
-            stderr=log,
-        )
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline().decode()
-            assert line.startswith("sceneprint: serving http://"), (data / "log").read_text()
-            yield line.split()[-1]
-        finally:
-            process.terminate()
-            process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0
 
 
 @pytest.fixture

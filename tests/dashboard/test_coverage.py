@@ -57,6 +57,7 @@ def measured(
     return {**told, "frames": frames}
 
 
+@pytest.mark.thorough
 def test_a_result_is_begun_shown_and_explained(
     station: Any, page: Page, settle: Settle, measured: dict[str, Any],
     axe: Callable[[Page], list[str]],

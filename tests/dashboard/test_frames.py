@@ -338,6 +338,7 @@ def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
     until(lambda: station.client.get(mine).json()["state"] == "indexed")
 
 
+@pytest.mark.thorough
 def test_frames_are_found_selected_changed_and_restored(
     page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any],
     axe: Callable[[Page], list[str]],

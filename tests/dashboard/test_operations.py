@@ -199,6 +199,7 @@ def test_a_key_for_one_map_is_told_of_that_and_what_it_may_not_see(station, open
     assert page.get_by_role("button", name="Retry all dead").count() == 0  # it may read
 
 
+@pytest.mark.thorough
 def test_keys_are_made_shown_once_and_withdrawn(station, page, settle, axe):
     page.goto(f"{station.home}#/operations?tab=keys")
     settle(page)

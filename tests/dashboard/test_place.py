@@ -81,6 +81,7 @@ def highest(built: dict[str, Any]) -> Any:
     return built["cells"][min(free, key=lambda i: float(np.linalg.norm(flat[i] - middle)))]
 
 
+@pytest.mark.thorough
 def test_a_spot_names_the_frames_that_saw_it(
     page: Page, station: Any, built: dict[str, Any], settle: Any, axe: Any, until: Any
 ) -> None:

@@ -133,7 +133,6 @@ def test_the_rows_are_the_answer(station, page, ask, axe):
     [
         ("", "found", "Found, 99."),
         ("&ambiguous=0&confidence=0.999", "ambiguous", "Ambiguous, "),
-        ("&residual_m=0.00001&candidates=3", "not_found", "Not found."),
         ("&stages=retrieve", "unvalidated", "Not validated."),
         ("&session=nobody", "not_found", "Not found."),
     ],
@@ -343,6 +342,7 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
     assert run("m.parts(given[0])", "no match") == {"why": "No match.", "next": None}
 
 
+@pytest.mark.thorough
 def test_a_control_asks_again(station, page, ask, settle):
     first = ask()
     sent = []

@@ -232,6 +232,7 @@ def test_points_are_read_as_they_were_written(stage: Page) -> None:
         assert said in stage.evaluate(why, base64.b64encode(wrong).decode())
 
 
+@pytest.mark.thorough
 def test_points_lie_where_they_are_projected(stage: Page) -> None:
     at = [(0.0, 0.0, 0.0), (0.5, 0.25, 0.0), (-0.6, -0.3, 0.5), (0.9, 0.0, 1.5)]
     normals = np.array([(0, 0, -1), (1, 0, 0), (0, -1, 0), (0.6, 0, -0.8)], float)
@@ -348,6 +349,7 @@ def test_lines_and_triangles(stage: Page) -> None:
     assert (ring[6:, 2] == 0).all()
 
 
+@pytest.mark.thorough
 def test_nothing_is_drawn_unless_something_changed(stage: Page) -> None:
     cloud(stage, encode_points(np.array([(0.0, 0, 0)])))
     stage.evaluate(
@@ -370,6 +372,7 @@ def test_nothing_is_drawn_unless_something_changed(stage: Page) -> None:
     assert "#" + bytes(dark).hex() == told.strip()
 
 
+@pytest.mark.thorough
 def test_hands_on_it(stage: Page) -> None:
     before = stage.evaluate("view.camera")
     stage.locator("canvas").last.focus()
@@ -404,6 +407,7 @@ def test_hands_on_it(stage: Page) -> None:
     assert stage.evaluate("view.camera.target")[0] == pytest.approx(5.5, abs=0.3)
 
 
+@pytest.mark.thorough
 def test_a_lost_context_comes_back_as_it_was(stage: Page) -> None:
     rng = np.random.default_rng(4)
     cloud(stage, encode_points(rng.uniform(-0.5, 0.5, (200, 3)), patches=np.arange(200)),

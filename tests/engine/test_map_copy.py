@@ -183,6 +183,7 @@ with Client.embedded(service) as client, closing(store):
 """
 
 
+@pytest.mark.thorough
 def test_a_killed_pull_leaves_the_copy_and_goes_on(
     robot: Robot, walk: tuple[DepthFrame, ...], tmp_path: Path
 ) -> None:

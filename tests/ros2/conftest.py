@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -20,7 +19,6 @@ import pytest
 from sceneprint.formats.dataset import decode_png, find_sequences
 from sceneprint_client import Client
 from sceneprint_client.frame_files import meta_of
-from sceneprint_lab.cli.demo import serving
 
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "sceneprint_ros"
 #: Frames of the room, of which every second is in the map; and seconds from one to the next.
@@ -39,19 +37,16 @@ def room(building: Path) -> tuple[Any, ...]:
 
 
 @pytest.fixture(scope="session")
-def service_url(
-    room: tuple[Any, ...], tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack
-) -> str:
-    """A service with a map `room`."""
-    url = folder_stack.enter_context(serving(tmp_path_factory.mktemp("service"), 1))
-    with Client(url) as client:
+def service_url(service_url: str, room: tuple[Any, ...]) -> str:
+    """Return the service of all clients, with a map `room`."""
+    with Client(service_url) as client:
         client.create_map("room", model="depth")
         added = [
             client.upload("room", one, meta_of(one, session="s", parent_frame="site"))
             for one in room[::2]
         ]
         client.wait([one.job_id for one in added])
-    return url
+    return service_url
 
 
 @pytest.fixture(scope="session")

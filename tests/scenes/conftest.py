@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from sceneprint.formats.dataset import (
 )
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client, meta_of
-from sceneprint_lab.cli.demo import serving
 from sceneprint_viewers.scene import Moment, SceneEntity
 
 MAP, WALK = "rooms", 8
@@ -91,11 +89,6 @@ class ListWriter:
     def contents(self, moment: int = -1) -> dict[str, Any]:
         """Contents of a moment by path."""
         return {"/".join(one.path): one.content for one in self.moments[moment].entities}
-
-
-@pytest.fixture(scope="session")
-def service_url(tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack) -> str:
-    return folder_stack.enter_context(serving(tmp_path_factory.mktemp("service"), 1))
 
 
 @pytest.fixture(scope="session")

@@ -209,6 +209,7 @@ def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shot
     assert kept.log("worker died") == []
 
 
+@pytest.mark.thorough
 def test_two_services_on_one_folder(kept, begin, small_shots):
     """What was taken by one is found by the other, though neither tells it."""
     other = begin("--workers", "0", folder=kept.folder)

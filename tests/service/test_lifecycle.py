@@ -49,6 +49,7 @@ def test_told_to_stop_it_finishes_the_frame_in_hand(
     assert server.log("worker died") == []
 
 
+@pytest.mark.thorough
 def test_to_interrupt_all_of_it_at_once_is_to_stop(begin):
     server = begin()
     server.ready()
@@ -66,6 +67,7 @@ def test_workers_whose_service_was_killed_leave_by_themselves(begin):
     server.gone()
 
 
+@pytest.mark.thorough
 def test_a_worker_that_dies_is_replaced_and_its_frame_signed(
     begin, make_map, shots, until, signing
 ):
