@@ -205,6 +205,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         apart = f"{item.path.parent.name}/{item.path.name}" in APART
         if apart and "folder_stack" in getattr(item, "fixturenames", ()):
             raise pytest.UsageError(f"{item.nodeid} is of APART, and needs what its folder shares")
+    for item in items if not ON_POSTGRES else ():
+        params = getattr(getattr(item, "callspec", None), "params", {})
+        if (
+            item.path.parent.name in ("engine", "service")
+            and params.get("store_url") == "postgresql"
+        ):
+            item.add_marker(pytest.mark.thorough)  # tests/store holds both databases to the same
     for item in items:
         if item.get_closest_marker("thorough") is not None:
             item.add_marker(pytest.mark.timeout(THOROUGH_S))

@@ -97,6 +97,7 @@ def test_demo_draws_a_match_of_its_building(
         assert (picture.format, picture.width) == ("PNG", 992)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("stage", "number"),
     [

@@ -422,6 +422,7 @@ def check_kidnapping(site: Building, runs: list[list[Seen]]) -> None:
             assert any(state.status == "lost" for state, _ in part[:fixed])
 
 
+@pytest.mark.thorough
 def test_it_tracks_and_is_found_again_after_a_kidnapping(
     building: Callable[[Intrinsics], Building], walked: Callable[..., tuple[list[Seen], list[Seen]]]
 ) -> None:

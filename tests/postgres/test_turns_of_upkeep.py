@@ -21,7 +21,6 @@ from sceneprint.settings import Settings
 from sceneprint.store import open_store
 from sceneprint.store.deletion import DAY_S, doom, doomed_blobs
 from sceneprint.store.events import EventFilter
-from sceneprint.store.maps import find_map, map_usage
 from sceneprint.store.postgres.connection import LOCKS, TURN
 from sceneprint_client.api import JobState, NewMap
 from tests.whole_engine import Engine
@@ -55,12 +54,6 @@ def turns(engine: Engine) -> Iterator[Counter[str]]:
         yield found
     finally:
         event.remove(of, "before_cursor_execute", note)
-
-
-def used_bytes(engine: Engine) -> int:
-    """Bytes that the map is counted to hold."""
-    with engine.store.database.read() as connection:
-        return map_usage(connection, find_map(connection, "hall").number).bytes
 
 
 def test_writers_of_two_maps_may_doom_the_same_blobs(
