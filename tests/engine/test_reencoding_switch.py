@@ -361,6 +361,7 @@ while True:
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("module", "step", "call", "when", "switched"),
     [
