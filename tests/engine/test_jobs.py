@@ -12,7 +12,7 @@ from sqlalchemy import update
 
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
-from sceneprint.errors import CannotRetry, InvalidRequest, JobOver, UnknownJob
+from sceneprint.errors import CannotRetry, JobOver, UnknownJob
 from sceneprint.store import queue
 from sceneprint.store.queue import read_clock
 from sceneprint.store.tables import JobRow, jobs
@@ -259,28 +259,6 @@ def test_only_what_nobody_raised_on_purpose_makes_a_process_unsound(
 
     assert empty.run(claimed(empty), note) == JobState.QUEUED
     assert unsound == ["KeyError: 0"]
-
-
-def test_jobs_are_listed_newest_first(empty: Engine, uploads: Any, work_off: WorkOff) -> None:
-    added = [empty.add_frame("hall", one.data, one.meta)[0] for one in uploads[:5]]
-    cancel(empty.store, added[1].job_id)
-    ids = [one.job_id for one in reversed(added)]
-    page = list_jobs(empty.store)
-    assert ([job.job_id for job in page.items], page.next_cursor) == (ids, None)
-    assert page.items[0] == empty.get_job(ids[0])
-    assert [job.frame_id for job in page.items] == [one.frame_id for one in reversed(added)]
-    seen, cursor = [], None
-    for size in (2, 2, 1):
-        page = list_jobs(empty.store, cursor=cursor, limit=2)
-        assert len(page.items) == size
-        seen += [job.job_id for job in page.items]
-        cursor = page.next_cursor
-    assert (seen, cursor) == (ids, None)
-    found = list_jobs(empty.store, JobState.CANCELLED).items
-    assert [job.job_id for job in found] == [added[1].job_id]
-    assert list_jobs(empty.store, JobState.DEAD).items == []
-    with pytest.raises(InvalidRequest, match="is not valid"):
-        list_jobs(empty.store, cursor="x")
 
 
 def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
