@@ -108,6 +108,7 @@ def example(
     return run
 
 
+@pytest.mark.thorough
 def test_a_bag_becomes_live_poses(
     drives: Path, tmp_path: Path, example: Callable[..., str]
 ) -> None:

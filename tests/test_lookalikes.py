@@ -170,6 +170,7 @@ def test_the_sides_of_a_lone_box_are_not_told_apart(model: Model) -> None:
     assert counted["ambiguous"] >= 20  # and not for want of a transform
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("n", [12, pytest.param(24, marks=pytest.mark.thorough)])
 def test_the_doors_of_a_corridor_are_not_told_apart(model: Model, n: int) -> None:
     counted = outcomes_of(corridor_pairs(n, 31), n, "corridor", model)

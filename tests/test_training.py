@@ -150,6 +150,7 @@ def test_a_whitening_is_learnt_from_more_rooms(
     assert whitened_model.unrelated_distance == pytest.approx(2 * 26**2 * 12, rel=0.3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -136,6 +136,7 @@ def test_an_archive_gives_what_an_upload_of_the_folder_gives(
     assert {one.status for one in items} == {200}
 
 
+@pytest.mark.thorough
 def test_a_map_that_is_one_file(
     client: Client, map_name: str, room_mesh: bytes, tmp_path: Path
 ) -> None:

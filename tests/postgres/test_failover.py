@@ -90,6 +90,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -
         standby.kill()
 
 
+@pytest.mark.thorough
 def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
     fleet: Fleet, small: list[Any], until: Callable[..., Any]
 ) -> None:

@@ -146,6 +146,7 @@ def recovered(place: Path, data: Path, moment: str) -> Iterator[Server]:
         subprocess.run([*of_nobody(), *stopping], check=True, capture_output=True, cwd="/")
 
 
+@pytest.mark.thorough
 def test_a_map_that_was_deleted_by_mistake_is_brought_back(
     primary: Server, place: Path, tmp_path: Path, small: list[Any], until: Until
 ) -> None:

@@ -56,6 +56,7 @@ def pose_of(x: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@pytest.mark.thorough
 def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: Any) -> None:
     do, client, hall = recorder.do, recorder._client, {"map_name": "hall"}
 
@@ -121,6 +122,7 @@ def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: 
     do("delete_map", ["map.deleted"], hall)
 
 
+@pytest.mark.thorough
 def test_each_change_of_a_job_has_its_line(
     begin: Any, recorder: Recorder, small_shots: Any
 ) -> None:
@@ -152,6 +154,7 @@ def test_each_change_of_a_job_has_its_line(
     recorder.tried |= idle.tried
 
 
+@pytest.mark.thorough
 def test_no_operation_was_left_out(recorder: Recorder) -> None:
     changing = {name for name, (method, _) in recorder.operations.items() if method != "GET"}
     assert changing - READING - recorder.tried == set()

@@ -178,6 +178,7 @@ def test_a_port_that_is_taken_is_refused_in_one_line(begin, tmp_path):
             assert address == asking.getsockname()
 
 
+@pytest.mark.thorough
 def test_service_and_worker_alone_do_the_job_together(begin, make_map, small_shots, tmp_path):
     given = {"data_dir": tmp_path, "port": 0, "workers": 1}
     service = begin(command=(sys.executable, "-m", "service"), **given)
