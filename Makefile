@@ -15,8 +15,9 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 # Bytecode is stored, since the tests start hundreds of processes that import the same modules.
 unexport PYTHONDONTWRITEBYTECODE
-# Tests spend half of their time waiting for other processes, so two run per processor.
-export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$((2 * $$(env -u OMP_NUM_THREADS nproc))))
+# Tests spend part of their time waiting for other processes, so three run on two processors. Each
+# costs its imports, kernels and servers, fifteen seconds of processor.
+export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$(((3 * $$(env -u OMP_NUM_THREADS nproc) + 1) / 2)))
 
 .PHONY: help demo test pytest test-thorough test-portable test-postgres lint kernels bytecode goldens format bench \
 	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean

@@ -1,4 +1,4 @@
-"""Tests that the rows of `make bench` compare equal work."""
+"""Test that signing stays within its memory, as `make bench` measures it."""
 
 from __future__ import annotations
 

@@ -70,11 +70,3 @@ def test_rows_of_five_are_named_or_refused(sceneprint: Run, scans: Path, tmp_pat
     assert "--row is for .bin files, and walk has others" in done.stderr
     done = sceneprint("upload", "rows", scans / "1.ply", "--as-map", "--row", "x,y,z", expect=2)
     assert "--row is for .bin files, not for maps" in done.stderr
-
-
-def test_scans_are_signed_where_they_lie(sceneprint: Run, scans: Path) -> None:
-    done = sceneprint("sign", scans, "--preset", "depth", expect=2)
-    lines = done.stdout.splitlines()
-    assert [line.split()[0] for line in lines if line.startswith("walk/")][:2] \
-        == ["walk/0", "walk/1"]  # fmt: skip
-    assert "2 of 3 frames signed" in done.stderr

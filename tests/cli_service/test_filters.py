@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,43 +9,8 @@ from typing import Any
 import pytest
 
 from sceneprint.cli.options import add_filter_options, filter_of
-from sceneprint_client import Client
 
 Run = Callable[..., Any]
-
-
-def test_a_query_names_what_it_looks_among(sceneprint: Run, service_url: str, rooms: Path) -> None:
-    for room, tags in (("room-0", ["--tag", "a"]), ("room-1", ["--tag", "a", "--tag", "b"])):
-        sceneprint("upload", "sorted", rooms / room, "--robot", room, *tags)
-    frame = rooms / "room-0" / "seq-01" / "frame-000000.depth.png"
-    ask = ("query", "sorted", frame, "--stages", "retrieve")
-    with Client(service_url) as client:
-        ids = {one.frame_id: one.robot for one in client.frames("sorted")}
-    box = "--region=-99,-99,-99,99,99,99"
-    for options, robots in (
-        (["--robot", "room-1"], {"room-1"}),
-        (["--robot", "room-1", "--robot", "room-0"], {"room-0", "room-1"}),
-        (["--session", "room-0/seq-01"], {"room-0"}),
-        (["--tag", "a", "--tag", "b"], {"room-1"}),
-        ([box, "--region-frame", "room-1/room-1"], {"room-1"}),
-        (["--exclude", *[i for i, robot in ids.items() if robot == "room-0"][:1]],
-         {"room-0", "room-1"}),
-        (["--after", "2020-01-01T00:00:00Z"], set()),
-    ):  # fmt: skip
-        told = json.loads(sceneprint(*ask, "--json", *options).stdout)
-        assert {ids[match["frame_id"]] for match in told["matches"]} == robots
-    line = sceneprint(*ask, "--robot", "room-1").stdout.splitlines()[0]
-    assert "3 ranked of 3 that pass the filter, of 6 frames" in line
-    assert "6 ranked of 6 frames" in sceneprint(*ask).stdout
-    for options, text in (
-        (["--not-within", "5"], "no captured_at"),
-        (["--not-within", "-5"], "filter.not_within_s: Input should be greater than 0"),
-        (["--before", "yesterday"], "filter.captured_before"),
-        ([box], "Specify --region and --region-frame together"),
-    ):
-        said = sceneprint(*ask, *options, expect=2)
-        assert text in said.stderr
-        assert said.stderr.count("\n") == 1
 
 
 def test_options_are_a_filter() -> None:

@@ -12,15 +12,12 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import (
     CannotRetry,
     FrameConflict,
-    InvalidIntrinsics,
     InvalidRequest,
     JobOver,
     MapExists,
     UnknownFrame,
     UnknownJob,
     UnknownMap,
-    UnreadableFrame,
-    UselessFrame,
 )
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
@@ -180,55 +177,6 @@ def test_what_is_not_there(client: Client, map_name: str) -> None:
     with pytest.raises(UnknownMap):
         client.frames("nobody")
     assert client.map(map_name).name == map_name
-
-
-def test_frames_that_cannot_be_taken(
-    client: Client, map_name: str, references: tuple[FrameReference, ...]
-) -> None:
-    client.create_map(map_name)
-    meta = meta_of(references[0])
-    with pytest.raises(UnreadableFrame):
-        client.upload(map_name, b"no image", meta)
-    data = references[0].path.read_bytes()
-    lens = meta.intrinsics.model_copy(update={"width": 320})
-    with pytest.raises(InvalidIntrinsics, match="the intrinsics are of 320 x 480"):
-        client.upload(map_name, data, meta.model_copy(update={"intrinsics": lens}))
-    size = (references[0].camera.intrinsics.height, references[0].camera.intrinsics.width)
-    empty = Path(references[0].path.parent / "empty.npy")
-    np.save(empty, np.zeros(size, np.float16))
-    with pytest.raises(UselessFrame, match="All 307200 samples are missing"):
-        client.query(map_name, empty.read_bytes(), meta)
-    empty.unlink()
-    with pytest.raises(UnknownMap, match="nobody"):
-        client.upload("nobody", data, meta)
-    with pytest.raises(TypeError, match="meta"):
-        client.upload(map_name, data)
-    assert list(client.frames(map_name)) == []
-
-
-def test_requests_that_make_no_sense(
-    client: Client, map_name: str, references: tuple[FrameReference, ...], bare_wall: Path
-) -> None:
-    with pytest.raises(InvalidRequest, match="name: must be 1 to 63") as told:
-        client.create_map("Big Hall")
-    assert [place for place, _ in told.value.fields] == ["name"]
-    with pytest.raises(InvalidRequest, match="model: Input should be 'depth', 'lidar' or"):
-        client.create_map(map_name, model="huge")
-    client.create_map(map_name)
-    with pytest.raises(InvalidRequest, match="less than or equal to 50") as told:
-        client.query(map_name, references[0], k=51)
-    assert [place for place, _ in told.value.fields] == ["k"]
-    with pytest.raises(InvalidRequest, match="stages: every query starts with retrieve"):
-        client.query(map_name, references[0], stages=["validate"])
-    with pytest.raises(TypeError, match="either"):
-        client.query(map_name)
-    rejected = client.upload(map_name, bare_wall, wait_s=PATIENCE_S)
-    assert rejected.state is FrameState.REJECTED
-    with pytest.raises(InvalidRequest, match="is rejected: The frame cannot be signed") as told:
-        client.query(map_name, frame_id=rejected.frame_id)
-    assert told.value.fields == (("frame_id", "is rejected"),)
-    with pytest.raises(UnknownFrame, match="nobody"):
-        client.query(map_name, frame_id="nobody")
 
 
 def test_threads_share_a_client(

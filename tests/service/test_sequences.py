@@ -53,23 +53,3 @@ def test_what_is_no_sequence_is_refused(served, path, shots, count, poses, more,
     assert answer.status_code == 422, answer.text
     assert told in answer.text
     assert answer.headers["content-type"] == "application/problem+json"
-
-
-def test_the_client_sends_a_sequence(served, path, shots):
-    from sceneprint_client import Client
-    from sceneprint_client.api import FrameMeta
-    from sceneprint_client.errors import InvalidRequest
-
-    frames, metas = [], []
-    for shot in (shots[1], shots[0]):
-        form = shot.form(pose=odometry(shot.pose))
-        frames.append(form["files"]["frame"][1])
-        metas.append(FrameMeta.model_validate_json(form["data"]["meta"]))
-    name = path.rpartition("/")[2]
-    with Client(served.url) as client:
-        there = client.localize_sequence(name, frames, metas, keep=False)
-        assert there.status == "found"
-        assert there.pose is not None
-        np.testing.assert_allclose(there.pose.matrix, shots[0].pose, atol=0.03)
-        with pytest.raises(InvalidRequest, match="Pass one for each"):
-            client.localize_sequence(name, frames, metas[:1])
