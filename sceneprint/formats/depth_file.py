@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -490,9 +491,9 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
         )
     with np.errstate(all="ignore"):  # what overflows float32 is missing
         if samples.dtype.kind == "u" and samples.dtype.itemsize == 2:
-            values = np.arange(_MISSING + 1, dtype=np.uint16)
-            if samples.size > values.size:  # fewer values than samples: each is divided once
-                return np.ascontiguousarray(_metres(values[None], depth_scale)[0][samples])
+            if samples.size > _MISSING + 1:  # fewer values than samples: each is divided once
+                taken: Floats32 = np.take(_metres_of_values(depth_scale), samples)
+                return taken
             depth = (samples / depth_scale).astype(np.float32)
             depth[samples == _MISSING] = 0.0
         elif samples.dtype.kind == "f":
@@ -504,6 +505,12 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
             )
         depth[~(np.isfinite(depth) & (depth > 0.0))] = 0.0
     return depth
+
+
+@lru_cache(maxsize=4)
+def _metres_of_values(depth_scale: float) -> Floats32:
+    """Return the metres (65536,) of every value of a 16-bit sample."""
+    return _metres(np.arange(_MISSING + 1, dtype=np.uint16)[None], depth_scale).ravel()
 
 
 # The size of a depth image by its header.
