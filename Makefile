@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 export PYTEST_XDIST_AUTO_NUM_WORKERS ?= $(shell echo $$(((3 * $$(env -u OMP_NUM_THREADS nproc) + 1) / 2)))
 
 .PHONY: help demo test pytest test-thorough test-portable test-postgres lint kernels bytecode goldens format bench \
-	screenshots docs docs-serve soak siege fleet models lock sbom advisories dist clean
+	screenshots docs docs-serve soak faults siege fleet models lock sbom advisories dist clean
 
 help:
 	@echo "make demo    localize frames in a demo map, and draw a match, into demo/ [DATASET=folder]"
@@ -35,6 +35,7 @@ help:
 	@echo "make docs    documentation site, into out/site; a dead link is an error"
 	@echo "make docs-serve  documentation site at http://127.0.0.1:8009, rebuilt after changes"
 	@echo "make soak    robots on SQLite, 100 kills, a full disk; updates docs/fault_injection.md"
+	@echo "make faults  a fault at every call that writes, on both databases; updates the same page"
 	@echo "make siege   broken uploads, every operation, attacking tenants; updates the same page"
 	@echo "make fleet   robots on PostgreSQL with a standby, and kills; updates the same page"
 	@echo "make models  train the presets that ship with the package (minutes)"
@@ -127,6 +128,9 @@ soak: $(STAMP) kernels
 
 siege: $(STAMP) kernels
 	$(SOAK) siege
+
+faults: $(STAMP) kernels
+	$(BIN)/python -m tests.faults --page docs/fault_injection.md
 
 fleet: $(STAMP) kernels
 	$(SOAK) fleet fleet-asynchronous fleet-delays fleet-crowd

@@ -1,0 +1,70 @@
+"""`python -m tests.faults`: try a fault at every call of every operation, and write the report."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from tqdm import tqdm
+
+from benchmarks.machine import measured_on
+from benchmarks.postgres import Server
+from tests.faults.enumeration import Enumeration, Trials, report
+from tests.faults.injection import FAULTS
+from tests.faults.operations import OPERATIONS, small_uploads
+
+
+def main() -> int:
+    """Run the command; return 1 if an invariant was broken."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("operation", nargs="*", help=f"of {', '.join(OPERATIONS)} (default: all)")
+    parser.add_argument("--fault", action="append", choices=FAULTS, help="only these faults")
+    parser.add_argument("--store", action="append", choices=("sqlite", "postgresql"))
+    parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
+    options = parser.parse_args()
+    lines, broken = [measured_on("`make faults`"), ""], 0
+    for store in options.store or ("sqlite", "postgresql"):
+        start = time.monotonic()
+        trials = _enumerate(
+            store, options.operation or list(OPERATIONS), options.fault or [*FAULTS]
+        )
+        found = [one for each in trials.values() for one in each.violations]
+        broken += len(found)
+        lines += [f"**{store}**, {time.monotonic() - start:.0f} s:", "", *report(trials), ""]
+        lines += [*(f"* {one}" for one in found), ""] if found else []
+    text = "\n".join(lines)
+    sys.stdout.write(f"{text}\n")
+    if options.page is not None:
+        begin, end = "<!-- faults:begin -->", "<!-- faults:end -->"
+        head, rest = options.page.read_text().split(begin)
+        options.page.write_text(f"{head}{begin}\n{text}{end}" + rest.split(end)[1])
+    return 1 if broken else 0
+
+
+def _enumerate(
+    store: str, operations: list[str], faults: list[str]
+) -> dict[tuple[str, str], Trials]:
+    with ExitStack() as stack:
+        work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sceneprint-faults-")))
+        server = None
+        if store == "postgresql":
+            server = Server(work / "server")
+            server.start()
+            stack.callback(server.stop)
+        enumeration = Enumeration(work / "stores", small_uploads(), server)
+        progress = stack.enter_context(tqdm(total=len(operations) * len(faults), unit="run"))
+        found = {}
+        for operation in operations:
+            for fault in faults:
+                progress.set_description(f"{store}: {operation}, {fault}")
+                found[operation, fault] = enumeration.run(operation, fault)
+                progress.update()
+        return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())

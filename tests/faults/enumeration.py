@@ -1,0 +1,183 @@
+"""Run an operation with a fault at its first call, its second, and so on, and check each store."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.postgres import Server
+from sceneprint.engine.ingest.uploads import Upload
+from sceneprint.errors import SceneprintError
+from tests.faults.injection import FAULTS, Injector
+from tests.faults.operations import (
+    ACKNOWLEDGED,
+    OPERATIONS,
+    Store,
+    contents,
+    fill,
+    violations,
+)
+from tests.whole_engine import Engine
+
+#: Seconds for one child, which no load reaches.
+PATIENCE_S = 300.0
+
+
+@dataclass
+class Trials:
+    """The trials of one operation with one fault.
+
+    Parameters
+    ----------
+    calls : number of calls at which the fault was tried
+    violations : broken invariants, with the call that failed
+    """
+
+    calls: int = 0
+    violations: list[str] = field(default_factory=list)
+
+
+class Child:
+    """A forked process that says lines, and ends.
+
+    Its memory holds all imports of its parent, which makes many deaths affordable.
+    """
+
+    def __init__(self, work: Callable[[Callable[[str], None]], None]) -> None:
+        read, write = os.pipe()
+        pid = os.fork()
+        if pid == 0:
+            os.close(read)
+            code = 1
+            try:
+                work(lambda line: _say(write, line))
+                code = 0
+            except BaseException:
+                traceback.print_exc()
+                _say(write, f"! {traceback.format_exc().splitlines()[-1]}")
+            os._exit(code)
+        os.close(write)
+        self.lines, self.is_alive = list[str](), True
+        until = time.monotonic() + PATIENCE_S
+        with os.fdopen(read) as said:
+            self.lines = [line.rstrip("\n") for line in said]
+        while not (done := os.waitpid(pid, os.WNOHANG))[0]:
+            if time.monotonic() > until:
+                os.kill(pid, signal.SIGKILL)
+            time.sleep(0.001)
+        self.status = done[1]
+
+
+def _say(pipe: int, line: str) -> None:
+    os.write(pipe, f"{line}\n".encode())
+
+
+class Enumeration:
+    """Prepared stores of each operation, copied for every trial.
+
+    Parameters
+    ----------
+    work : empty folder
+    uploads : frames to send
+    server : server of the databases; None for SQLite
+    """
+
+    def __init__(self, work: Path, uploads: Sequence[Upload], server: Server | None = None) -> None:
+        self._work, self._uploads, self._server = work, uploads, server
+        self._count = 0
+        base = self._store("base", None)
+        fill(base)  # in this process, which compiles and imports what its children need
+        self._before = contents(base)
+        if threading.active_count() > 1:
+            raise RuntimeError(f"threads outlive the store: {threading.enumerate()}")
+        for name, operation in OPERATIONS.items():
+            prepared = self._store(name, "base")
+            with Engine(prepared.settings) as engine:
+                operation.prepare(engine, prepared)
+
+    def _store(self, name: str, template: str | None) -> Store:
+        folder = self._work / name
+        if template is None:
+            folder.mkdir(parents=True)
+        else:
+            shutil.copytree(self._work / template, folder, symlinks=True)
+        url = None if self._server is None else self._server.create(name, template)
+        return Store(folder, url, self._uploads)
+
+    def run(
+        self, operation: str, fault: str, *, first: int = 1, step: int = 1,
+        until: Callable[[], bool] = lambda: False,
+    ) -> Trials:  # fmt: skip
+        """Try a fault at calls `first`, `first + step` and so on, to the end of the operation."""
+        trials, at = Trials(), first
+        while not until():
+            failed, broken = self._try(operation, fault, at)
+            if not failed:
+                break
+            trials.calls += 1
+            where = f"{operation}, {fault} at call {at} ({failed})"
+            trials.violations += [f"{where}: {one}" for one in broken]
+            at += step
+        return trials
+
+    def _try(self, operation: str, fault: str, at: int) -> tuple[str, list[str]]:
+        """Return the call that failed, or "" if the operation has fewer, and what is wrong."""
+        self._count += 1
+        store = self._store(f"trial-{self._count}", operation)
+
+        def act(say: Callable[[str], None]) -> None:
+            with Engine(store.settings) as engine:
+                injector = Injector(store.folder, fault, at)
+                injector.arm()
+                try:
+                    OPERATIONS[operation].act(engine, store, say)
+                except (SceneprintError, OSError) as error:
+                    say(f"error {type(error).__name__}")
+                injector.disarm()
+                say(f"failed {injector.failed}" if injector.failed else "finished")
+
+        child = Child(act)
+        broken = [line[2:] for line in child.lines if line.startswith("! ")]
+        killed = os.WIFSIGNALED(child.status) and os.WTERMSIG(child.status) == signal.SIGKILL
+        failed = "killed" if killed else ""
+        for line in child.lines:
+            if line.startswith("failed "):
+                failed = line.removeprefix("failed ")
+        if failed or broken:
+            failed = failed or "unknown"
+            said = [one for one in child.lines if one.split(" ")[0] in ACKNOWLEDGED]
+
+            def check(say: Callable[[str], None]) -> None:
+                for one in violations(store, operation, said, self._before):
+                    say(one)
+
+            checked = Child(check)
+            broken += [line.removeprefix("! ") for line in checked.lines]
+        shutil.rmtree(store.folder)
+        if self._server is not None:
+            self._server.drop(store.folder.name)
+        return failed, broken
+
+
+def report(trials: dict[tuple[str, str], Trials]) -> Iterator[str]:
+    """Yield the rows of a table: calls tried for each operation, and violations."""
+    totals = Counter[str]()
+    yield "| operation | " + " | ".join(FAULTS) + " | violations |"
+    yield "|---|" + "--:|" * (len(FAULTS) + 1)
+    for operation in dict.fromkeys(name for name, _ in trials):
+        own = {fault: trials[operation, fault] for fault in FAULTS}
+        totals.update({fault: one.calls for fault, one in own.items()})
+        broken = sum(len(one.violations) for one in own.values())
+        totals["violations"] += broken
+        counts = " | ".join(str(one.calls) for one in own.values())
+        yield f"| {operation} | {counts} | {broken} |"
+    counts = " | ".join(str(totals[name]) for name in (*FAULTS, "violations"))
+    yield f"| all | {counts} |"

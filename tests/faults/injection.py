@@ -1,0 +1,120 @@
+"""Inject a fault at the n-th call of this process that changes a folder or its database.
+
+Calls of Python that open a file for writing, rename, link or remove are seen by an audit hook.
+`os.write`, `os.fsync` and the statements and commits of the database are wrapped. A hook cannot be
+removed: inject in a process that ends afterwards.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sqlite3
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy.engine.default import DefaultDialect
+
+#: Faults by name: the error of a call on files, and SQLite's message; None kills the process.
+FAULTS: dict[str, tuple[int, str] | None] = {
+    "full disk": (errno.ENOSPC, "database or disk is full"),
+    "input/output error": (errno.EIO, "disk I/O error"),
+    "no descriptors": (errno.EMFILE, "unable to open database file"),
+    "kill": None,
+}
+#: Audit events of calls that change a folder, and how many of their first arguments are paths.
+_EVENTS = {
+    "open": 1, "os.rename": 2, "os.link": 2, "os.remove": 1, "os.mkdir": 1, "os.rmdir": 1,
+    "os.truncate": 1,
+}  # fmt: skip
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+#: First words of statements that change the database or hold a turn to do so.
+_STATEMENTS = ("BEGIN IMMEDIATE", "INSERT", "UPDATE", "DELETE", "CREATE", "COMMIT")
+
+
+class Injector:
+    """Counts the calls on a folder and its database, and lets one of them fail.
+
+    Parameters
+    ----------
+    root : folder whose files count
+    fault : one of FAULTS
+    at : number of the call that fails, from 1
+    """
+
+    def __init__(self, root: Path, fault: str, at: int) -> None:
+        self._root, self._error, self._at = str(root), FAULTS[fault], at
+        self._only_opens = fault == "no descriptors"
+        self.calls, self.failed, self._is_armed = 0, "", False
+
+    def arm(self) -> None:
+        """Begin to count."""
+        sys.addaudithook(self._audit)
+        for name in ("write", "pwrite", "fsync", "fdatasync"):
+            setattr(os, name, self._on_descriptor(name, getattr(os, name)))
+        dialect: Any = DefaultDialect
+        for name in ("do_execute", "do_executemany", "do_commit"):
+            setattr(dialect, name, self._on_database(name, getattr(dialect, name)))
+        self._is_armed = True
+
+    def disarm(self) -> None:
+        """Stop counting."""
+        self._is_armed = False
+
+    def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if not self._is_armed or event not in _EVENTS:
+            return
+        if event == "open" and not (arguments[2] or 0) & _WRITING:
+            return
+        if any(self._is_inside(path) for path in arguments[: _EVENTS[event]]):
+            self._count(event, is_open=event == "open")
+
+    def _is_inside(self, path: object) -> bool:
+        if isinstance(path, int):
+            return self._holds(path)
+        return isinstance(path, str | os.PathLike) and os.fspath(path).startswith(self._root)
+
+    def _holds(self, descriptor: int) -> bool:
+        try:
+            return str(Path(f"/proc/self/fd/{descriptor}").readlink()).startswith(self._root)
+        except OSError:
+            return False
+
+    def _on_descriptor(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(descriptor: int, *more: Any) -> Any:
+            if self._is_armed and self._holds(descriptor):
+                self._count(f"os.{name}")
+            return call(descriptor, *more)
+
+        return wrapped
+
+    def _on_database(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(dialect: Any, cursor: Any, statement: str = "COMMIT", *more: Any) -> Any:
+            if self._is_armed and statement.lstrip().startswith(_STATEMENTS):
+                self._count(" ".join(statement.split()[:3]), cursor=cursor)
+            if name == "do_commit":
+                return call(dialect, cursor)
+            return call(dialect, cursor, statement, *more)
+
+        return wrapped
+
+    def _count(self, call: str, *, is_open: bool = False, cursor: Any = None) -> None:
+        if self._only_opens and not is_open:
+            return
+        self.calls += 1
+        if self.calls != self._at:
+            return
+        self.failed = call
+        if self._error is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+            return
+        number, message = self._error
+        if cursor is None:
+            raise OSError(number, os.strerror(number))
+        connection = getattr(cursor, "connection", cursor)
+        if isinstance(connection, sqlite3.Connection):
+            raise sqlite3.OperationalError(message)
+        connection.close()  # the call itself fails then, as if the server had gone

@@ -1,0 +1,311 @@
+"""The operations whose calls fail one after another, and the checks of a store afterwards."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import SecretStr
+from sqlalchemy import select, update
+
+from benchmarks.soak.recordings import recordings, walks
+from sceneprint.bundle.backup import take_backup
+from sceneprint.bundle.place import BundlePlace
+from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
+from sceneprint.engine.ingest.uploads import Upload
+from sceneprint.errors import SceneprintError
+from sceneprint.maintenance.fsck.check import fsck
+from sceneprint.settings import Settings
+from sceneprint.store.events import number_events
+from sceneprint.store.tables import events, frames, jobs, signatures
+from sceneprint_client.api import FrameState, NewMap, Query
+from sceneprint_client.api.frames import ImportOptions
+from tests.whole_engine import Engine
+
+#: Frames of the map before an operation; others are uploaded or imported by it.
+STORED = 4
+#: Name of the map, and of the folder of bundles within the data folder.
+MAP, BUNDLES = "hall", "bundles"
+#: Findings of `fsck` that a repair removes without loss: files that nothing refers to.
+_LEFTOVERS = {"unreferenced-file"}
+
+#: First words of lines by which an operation acknowledges; an id or a name follows.
+ACKNOWLEDGED = ("added", "deleted", "bundle")
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Store:
+    """A store under test.
+
+    Parameters
+    ----------
+    folder : data folder
+    url : URL of a PostgreSQL database; None for SQLite in the folder
+    uploads : frames to send, the first STORED of which the map holds
+    """
+
+    folder: Path
+    url: str | None
+    uploads: Sequence[Upload]
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of a process that works on the store."""
+        return Settings(
+            data_dir=self.folder, database_url=None if self.url is None else SecretStr(self.url),
+            index_dir=None, undo_window_s=0, unindexed_frames=1, decoders=0,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operation on a store.
+
+    Parameters
+    ----------
+    prepare : brings the store to the state before it
+    act : does it, and says what it acknowledges, see ACKNOWLEDGED
+    """
+
+    prepare: Callable[[Engine, Store], None]
+    act: Callable[[Engine, Store, Say], None]
+
+
+def fill(store: Store) -> None:
+    """Create a map with STORED signed frames."""
+    with Engine(store.settings) as engine:
+        engine.create_map(NewMap(name=MAP, model="depth"))
+        for one in store.uploads[:STORED]:
+            engine.add_frame(MAP, one.data, one.meta)
+        work_off(engine)
+        engine.publish_due()
+
+
+def work_off(engine: Engine) -> None:
+    """Do all jobs, also those that wait for another attempt or for the end of a lease."""
+    for _ in range(20):
+        with engine.store.database.write() as connection:
+            connection.execute(update(jobs).values(run_after=0.0))
+            leased = jobs.c.leased_until.is_not(None)
+            connection.execute(update(jobs).where(leased).values(leased_until=1.0))
+        work = engine.claim("w")
+        if work is None:
+            return
+        engine.run(work)
+    raise AssertionError("the queue does not become empty")
+
+
+def _nothing(engine: Engine, store: Store) -> None:
+    """Leave a store as it is."""
+
+
+def _upload(engine: Engine, store: Store, say: Say) -> None:
+    one = store.uploads[STORED]
+    say(f"added {engine.add_frame(MAP, one.data, one.meta)[0].frame_id}")
+
+
+def _wait_for_signature(engine: Engine, store: Store) -> None:
+    _upload(engine, store, lambda _: None)
+
+
+def _sign(engine: Engine, store: Store, say: Say) -> None:
+    work = engine.claim("w")
+    assert work is not None
+    engine.run(work)
+
+
+def _publish(engine: Engine, store: Store, say: Say) -> None:
+    engine.rebuild_index(MAP)
+
+
+def _delete(engine: Engine, store: Store, say: Say) -> None:
+    name = _first_frame(engine)
+    engine.delete_frame(MAP, name)
+    say(f"deleted {name}")
+
+
+def _delete_first(engine: Engine, store: Store) -> None:
+    engine.delete_frame(MAP, _first_frame(engine))
+
+
+def _first_frame(engine: Engine) -> str:
+    with engine.store.database.read() as connection:
+        found = select(frames.c.id).where(frames.c.state == FrameState.INDEXED)
+        return str(connection.execute(found.order_by(frames.c.number)).scalars().first())
+
+
+def _purge(engine: Engine, store: Store, say: Say) -> None:
+    engine.purging.now()
+
+
+def _back_up(engine: Engine, store: Store, say: Say) -> None:
+    bundle = take_backup(store.settings, str(store.folder / BUNDLES))
+    say(f"bundle {bundle.manifest.name}")
+
+
+def _back_up_once(engine: Engine, store: Store) -> None:
+    _back_up(engine, store, lambda _: None)
+
+
+def _restore(engine: Engine, store: Store, say: Say) -> None:
+    restore_to_folder(str(store.folder / BUNDLES), store.folder / "restored")
+
+
+def _import(engine: Engine, store: Store, say: Say) -> None:
+    with engine.imports.receive(MAP, ImportOptions()) as receiver:
+        receiver.write(_archive(store.uploads[STORED : STORED + 2]))
+        archive = receiver.end()
+    engine.imports.begin(MAP, archive, ImportOptions())
+    while (work := engine.claim("w")) is not None:
+        engine.run(work)
+
+
+def _archive(uploads: Sequence[Upload]) -> bytes:
+    packed, camera = io.BytesIO(), uploads[0].meta.intrinsics
+    assert camera is not None
+    members = {
+        "run/intrinsics.json": json.dumps(camera.model_dump(exclude={"distortion"})).encode()
+    }
+    members |= {f"run/{i}.png": one.data for i, one in enumerate(uploads)}
+    with tarfile.open(fileobj=packed, mode="w") as archive:
+        for name, data in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+    return packed.getvalue()
+
+
+OPERATIONS = {
+    "upload": Operation(_nothing, _upload),
+    "signature": Operation(_wait_for_signature, _sign),
+    "publication": Operation(_nothing, _publish),
+    "deletion": Operation(_nothing, _delete),
+    "purge": Operation(_delete_first, _purge),
+    "import": Operation(_nothing, _import),
+    "backup": Operation(_nothing, _back_up),
+    "restore": Operation(_back_up_once, _restore),
+}
+
+
+def small_uploads() -> tuple[Upload, ...]:
+    """Return small frames of a synthetic room."""
+    with recordings(None, 1) as folder:
+        shots = walks(folder, 1, STORED + 2)[0]
+    return tuple(Upload(one.png, one.meta) for one in shots)
+
+
+def contents(store: Store) -> dict[str, tuple[bytes, bytes]]:
+    """Return the upload and the signature of each frame by id."""
+    with Engine(store.settings) as engine, engine.store.database.read() as connection:
+        rows = connection.execute(
+            select(frames.c.id, frames.c.blob, signatures.c.vector)
+            .join(signatures, signatures.c.frame_number == frames.c.number)
+        )  # fmt: skip
+        return {row.id: (engine.store.blobs.get(row.blob), bytes(row.vector)) for row in rows}
+
+
+def violations(
+    store: Store,
+    operation: str,
+    acknowledged: Sequence[str],
+    before: dict[str, tuple[bytes, bytes]],
+) -> Iterator[str]:
+    """Start again after a fault, finish what was begun, and yield each broken invariant.
+
+    Parameters
+    ----------
+    acknowledged : what the operation said before the fault
+    before : upload and signature of each frame that the store held
+    """
+    said = dict(line.split(" ", 1) for line in acknowledged)
+    with Engine(store.settings) as engine:
+        work_off(engine)
+        engine.publish_due()
+        engine.purging.now()
+        if operation in ("upload", "import"):  # a robot that got no answer sends it again
+            OPERATIONS[operation].act(engine, store, lambda _: None)
+            work_off(engine)
+            engine.publish_due()
+        yield from _wrong_frames(engine, operation, said, before)
+        yield from _wrong_events(engine)
+        gone = before.keys() - _states(engine).keys()
+    yield from _remains(store, [part for name in gone for part in before[name]])
+    yield from _wrong_bundles(store, operation, said)
+    kinds = Counter(one.kind for one in fsck(store.settings, repair=True, grace_s=0))
+    yield from (f"fsck: {kind}" for kind in kinds.keys() - _LEFTOVERS)
+    yield from (f"not repaired: {one.what}" for one in fsck(store.settings, grace_s=0))
+
+
+def _states(engine: Engine) -> dict[str, FrameState]:
+    return {one.frame_id: one.state for one in engine.list_frames(MAP).items}
+
+
+def _wrong_frames(
+    engine: Engine, operation: str, said: dict[str, str], before: dict[str, Any]
+) -> Iterator[str]:
+    states = _states(engine)
+    most = len(before) + {"upload": 1, "signature": 1, "import": 2, "purge": -1}.get(operation, 0)
+    least = most - (operation == "deletion")
+    most -= "deleted" in said
+    if not least <= len(states) <= most:
+        yield f"{len(states)} frames, not {least} to {most}"
+    if said.get("added", next(iter(states))) not in states:
+        yield "an acknowledged frame is missing"
+    if said.get("deleted") in states:
+        yield "a deleted frame is there"
+    yield from (f"frame {name} is {state}" for name, state in states.items() if state != "indexed")
+    wanted = Query(k=50, candidates=50, keep=False, record=False, stages=["retrieve"])
+    first = min(states)
+    matches = engine.query_frame(MAP, first, wanted).matches
+    if {first, *(one.frame_id for one in matches)} != states.keys():
+        yield "a search does not find each frame"
+
+
+def _wrong_events(engine: Engine) -> Iterator[str]:
+    number_events(engine.store.database)
+    with engine.store.database.read() as connection:
+        told = Counter(
+            tuple(row) for row in connection.execute(select(events.c.kind, events.c.frame_id))
+        )
+        rows = list(connection.execute(select(frames.c.id, frames.c.state)))
+    for name, state in rows:
+        for kind in ("received", state):
+            if told["frame." + kind, name] != 1:
+                yield f"frame {name} has {told['frame.' + kind, name]} events {kind}"
+
+
+def _remains(store: Store, parts: Sequence[bytes]) -> Iterator[str]:
+    for path in store.folder.rglob("*"):
+        inside = path.is_file() and BUNDLES not in path.parts and "restored" not in path.parts
+        data = path.read_bytes() if inside else b""
+        if any(part in data for part in parts):
+            yield f"{path.name} holds bytes of a deleted frame"
+
+
+def _wrong_bundles(store: Store, operation: str, said: dict[str, str]) -> Iterator[str]:
+    if operation not in ("backup", "restore"):
+        return
+    place = str(store.folder / BUNDLES)
+    names = []
+    with suppress(SceneprintError):
+        names = list(BundlePlace.open(place).names())
+    if "bundle" in said and said["bundle"] not in names:
+        yield "an acknowledged bundle is missing"
+    for name in names:
+        if verify_bundle(place, name).lost:
+            yield f"bundle {name} lacks blobs"
+    take_backup(store.settings, place)
+    restored = store.folder / "restored"
+    if not (restored / "sceneprint.db").exists():
+        restore_to_folder(place, restored)
+    if len(contents(Store(restored, None, store.uploads))) != STORED:
+        yield "the restored store lacks frames"
