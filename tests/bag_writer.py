@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sceneprint.types import Floats
 from sceneprint_client.poses import quaternion_of, rotation_of
 
-#: Of all stamps in seconds: a date, so that frames get `captured_at`.
+#: Offset of all stamps, seconds: a date, so that frames get `captured_at`.
 START = 1_700_000_000
 CONTAINERS = ("mcap", "sqlite3", "ros1")
 K = (70.0, 71.0, 39.5, 29.5)
@@ -33,17 +33,17 @@ def transform(x: float, y: float, z: float, *quaternion: float) -> Floats:
     return T
 
 
-#: A camera that looks ahead and a little down, before the base and above it.
+#: Pose of a camera that looks ahead and slightly down, in front of the base and above it.
 T_BASE_CAMERA = transform(0.21, -0.05, 0.93, -0.53, 0.49, -0.47, 0.51)
 
 
 class BagWriter:
-    """Messages of ROS 1 or 2, written by rosbags."""
+    """Writer of ROS 1 or ROS 2 messages with rosbags."""
 
     def __init__(self, writer: Any, *, ros1: bool) -> None:
         self.ros1, self.writer = ros1, writer
         self.types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-        if ros1:  # rosbags has it of ROS 2 alone
+        if ros1:  # rosbags supports it only for ROS 2
             of_tf = "geometry_msgs/TransformStamped[] transforms"
             self.types.register(get_types_from_msg(of_tf, "tf2_msgs/msg/TFMessage"))
         self.connections: dict[str, Any] = {}
@@ -79,13 +79,13 @@ class BagWriter:
             self.connections[topic], START * 10**9 + round((t + self.late) * 1e9), data
         )
 
-    # What robots record.
+    # Messages that robots record.
 
     def transforms(
         self, t: float, edges: dict[tuple[str, str], Floats], topic: str = "/tf", *,
         length: float = 1.0,
     ) -> None:  # fmt: skip
-        """Transforms, whose quaternions have this length."""
+        """Write transforms with quaternions of a given length."""
         made = []
         for (parent, child), T in edges.items():
             x, y, z, w = quaternion_of(T[:3, :3]) * length
@@ -172,7 +172,7 @@ class BagWriter:
         topic: str = "/camera/depth/image_raw", *, frame: str = "camera", padding: int = 0,
         big: bool = False,
     ) -> None:  # fmt: skip
-        """An image; its rows may be padded, and its samples big-endian."""
+        """Write an image, optionally with padded rows or big-endian samples."""
         kind = np.dtype({"32FC1": "f4", "rgb8": "u1"}.get(encoding, "u2"))
         data = np.asarray(samples).astype(kind.newbyteorder(">" if big else "<"))
         rows = data.view(np.uint8).reshape(len(data), -1)
@@ -190,8 +190,8 @@ class BagWriter:
         topic: str = "/camera/depth/image_raw/compressedDepth", *, a: float = 0.0, b: float = 0.0,
         form: str | None = None, frame: str = "camera",
     ) -> None:  # fmt: skip
-        """An image of compressed_depth_image_transport: a header of 12 bytes before the PNG; of
-        another form the PNG alone.
+        """Write depth of compressed_depth_image_transport: a header of 12 bytes and a PNG, or
+        only the PNG in other forms.
         """
         file = io.BytesIO()
         Image.fromarray(np.asarray(samples, np.uint16)).save(file, "PNG")
@@ -210,7 +210,7 @@ class BagWriter:
         self, t: float, rows: np.ndarray, topic: str = "/points", *, frame: str = "lidar",
         height: int = 1, padding: int = 0, big: bool = False, **more: Any,
     ) -> None:  # fmt: skip
-        """Points of a structured array, its fields as they lie in it."""
+        """Write the points of a structured array with the layout of its fields."""
         numbers = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
         fields = [
             self.make(
@@ -253,7 +253,7 @@ def open_writer(folder: Path, container: str, name: str, compression: str) -> It
 
 
 def path_of(folder: Path, container: str, name: str) -> Path:
-    """What a user names: the file of an MCAP, the folder of a rosbag2 database."""
+    """Return the path of a bag: the file of an MCAP, or the folder of a rosbag2 database."""
     if container == "ros1":
         return folder / f"{name}.bag"
     return folder / name / f"{name}.mcap" if container == "mcap" else folder / name
@@ -263,7 +263,7 @@ def write(
     folder: Path, fill: Callable[[BagWriter], None], container: str = "mcap", name: str = "run",
     compression: str = "",
 ) -> Path:  # fmt: skip
-    """A bag that `fill` writes."""
+    """Write a bag with the messages of `fill`."""
     folder.mkdir(parents=True, exist_ok=True)
     with open_writer(folder, container, name, compression) as writer:
         fill(writer)
@@ -271,7 +271,7 @@ def write(
 
 
 class MessageWriter(BagWriter):
-    """Messages of ROS 2 as they come out of their bytes; in no bag."""
+    """Writer that serialises and decodes ROS 2 messages without a bag."""
 
     def __init__(self) -> None:
         super().__init__(None, ros1=False)
@@ -281,5 +281,5 @@ class MessageWriter(BagWriter):
         self.written.append((topic, name, self.types.deserialize_cdr(data, name)))
 
     def last(self) -> Any:
-        """The message written last."""
+        """Return the last message."""
         return self.written[-1][2]

@@ -52,13 +52,13 @@ from sceneprint_lab.cli.demo import serving, write_building
 from sceneprint_lab.synth import KINECT, SynthRoom, synthesise_room
 from sceneprint_lab.synth.rooms import make_room
 
-#: Folders whose files share what is dear to begin, such as a service with its workers, and the
-#: unit that runs in one process, one file after another. The longest units are begun first.
+#: Folders whose files share fixtures such as a service, and the unit of folders that runs in one
+#: process. The longest units start first.
 TOGETHER = {
     "dashboard": "dashboard", "service": "service", "client": "clients", "cli_service": "clients",
     "ros2": "clients", "scenes": "clients",
 }  # fmt: skip
-#: Long files in them that begin all they need themselves, and so may run beside the others.
+#: Long files in these folders that share nothing and run beside the others.
 APART = (
     "service/test_lifecycle.py", "service/test_hostile.py",
     "service/test_kill.py", "service/test_connections.py",
@@ -66,7 +66,7 @@ APART = (
     "service/test_hostile_files.py", "service/test_faults.py", "client/test_tracker.py",
     "client/test_keyed.py",
 )  # fmt: skip
-#: Files that are begun next: no process is left alone with one of them in the end.
+#: Long files that start next, so that no process ends up alone with one of them.
 LONG = (
     "test_shared_index.py", "test_lifecycle.py", "test_survival.py", "test_surfaces.py",
     "test_commands.py", "test_kill.py", "test_quality.py", "test_map_copy.py", "test_sequences.py",
@@ -77,28 +77,28 @@ LONG = (
 )  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Seconds for a test that takes long by its nature; `timeout` of pyproject.toml is for all others.
+#: Timeout of slow tests, seconds; `timeout` of pyproject.toml applies to all others.
 THOROUGH_S = 1800
 #: Whether Settings without a database mean PostgreSQL: `make test-postgres`.
 ON_POSTGRES = os.environ.get("SCENEPRINT_TEST_DATABASE") == "postgresql"
-#: The database that new ones of a test are copied from.
+#: Name of the database that is copied for tests.
 TEMPLATE = "sceneprint_template"
-#: Property tests draw the same examples every time, and have no deadline that load can reach.
+#: Property tests use the same examples in every run, without a deadline.
 hypothesis.settings.register_profile(
     "suite", derandomize=True, deadline=None,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )  # fmt: skip
 hypothesis.settings.load_profile("suite")
-#: What makes a folder of that name by calling that function.
+#: Function that creates a folder by name by calling a function, once per run.
 Once = Callable[[str, Callable[[Path], object]], Path]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin the server that the whole run is on, where it is; see tests/on_postgres."""
-    # of processes that tests begin, too: a job that nobody asked for would be counted
+    """Start the database server of the run, if there is one; see tests/on_postgres."""
+    # Also for child processes: automatic jobs would change counts.
     os.environ.setdefault("SCENEPRINT_BUILD_SURFACES", "on_request")
     os.environ.setdefault("SCENEPRINT_JOIN_SESSIONS", "on_request")
-    # a second of processor time each; tests of decoders and the service's say otherwise
+    # Decoder processes cost a second each, so only their own tests use them.
     os.environ.setdefault("SCENEPRINT_DECODERS", "0")
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
@@ -114,13 +114,14 @@ def pytest_configure(config: pytest.Config) -> None:
         server.start()
         open_database(server.create(TEMPLATE)).close()
         server.execute("CREATE TABLE folders (name text, place text)")
-        # for this process, those of xdist and all that tests begin
+        # For this process, those of xdist and all child processes.
         os.environ["SCENEPRINT_TEST_SERVER"] = server.url("")
 
 
 def add_distributions(folder: Path) -> None:
-    """Let this process and its children find the entry points of the lab and the viewers, as in an
-    environment that has them; `folder` gets their metadata.
+    """Add the entry points of the lab and the viewers to this process and its children.
+
+    Their metadata is written to `folder`.
     """
     for name in ("lab", "viewers"):
         project = tomllib.loads((ROOT / name / "pyproject.toml").read_text())["project"]
@@ -153,7 +154,7 @@ class UnitScheduling(LoadFileScheduling):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> UnitScheduling | None:
-    """With `--dist loadfile`, keep folders together that share a service."""
+    """Keep folders with a shared service together, with `--dist loadfile`."""
     return UnitScheduling(config, log) if config.getoption("dist") == "loadfile" else None
 
 
@@ -177,7 +178,7 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Let the collector look at what tests make, and at nothing older, which all stays."""
+    """Exclude objects from before the collection from garbage collection."""
     gc.disable()
     found = yield
     gc.freeze()
@@ -216,7 +217,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def _databases_go(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Where the run is on PostgreSQL, the databases of a test's own folders go with it."""
+    """On PostgreSQL, drop the databases of a test's folders after the test."""
     if not ON_POSTGRES or "tmp_path" not in request.fixturenames:
         yield
         return
@@ -247,7 +248,7 @@ def service_url(data_folder: Path, folder_stack: ExitStack) -> str:
 
 @pytest.fixture(scope="session")
 def until() -> Callable[..., Any]:
-    """Wait for the first true value of a condition, as `benchmarks.waiting.until` does."""
+    """The function `benchmarks.waiting.until`, which waits for a true value of a condition."""
     return wait_until
 
 
@@ -255,7 +256,7 @@ def until() -> Callable[..., Any]:
 def once(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str, Callable[[Path], object]], Path]:
-    """Makes a folder that all processes of this run read; the first that needs it makes it."""
+    """A function that creates a read-only folder once for all processes of the run."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
@@ -273,13 +274,13 @@ def once(
 
 @pytest.fixture(scope="session")
 def building(once: Once) -> Path:
-    """A room of the demo: 30 frames of a walk for the map, 20 to look up. Only to be read."""
+    """A read-only room of the demo with 30 map frames and 20 query frames of a walk."""
     return once("building", lambda folder: list(write_building(folder, 1)))
 
 
 @pytest.fixture(scope="session")
 def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A PostgreSQL server of this process; `TEMPLATE` in it has the schema and no rows."""
+    """A PostgreSQL server of this process; its `TEMPLATE` has the schema and no rows."""
     try:
         server = Server(tmp_path_factory.mktemp("postgres"))
     except NoServer as error:
@@ -289,19 +290,19 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         open_database(server.create(TEMPLATE)).close()
         yield server
     finally:
-        server.stop("immediate")  # nobody looks at its data again
-        shutil.rmtree(server.folder, ignore_errors=True)  # it is large
+        server.stop("immediate")  # its data is not needed any more
+        shutil.rmtree(server.folder, ignore_errors=True)  # the folder is large
 
 
 @pytest.fixture(scope="session")
 def _clean(postgres: Server) -> list[str]:
-    """Databases that are as new: to make one takes twenty times as long as to clean it."""
+    """Clean databases to reuse, since cleaning is twenty times as fast as creating."""
     return []
 
 
 @pytest.fixture
 def postgres_url(postgres: Server, _clean: list[str]) -> Iterator[str]:
-    """URL of a database with the schema of this version and no rows, like a new one."""
+    """URL of an empty database with the schema of this version."""
     if _clean:
         name = _clean.pop()
     else:
@@ -315,7 +316,7 @@ def postgres_url(postgres: Server, _clean: list[str]) -> Iterator[str]:
         postgres.drop(name)
 
 
-#: What of a database a test may have changed beside its rows.
+#: Query for parts of a database, other than rows, that a test may change.
 _SHAPE = """
 SELECT md5(concat(
     (SELECT string_agg(concat_ws(' ', c.relname, c.relkind, a.attname, a.atttypid, a.attnotnull,
@@ -343,7 +344,7 @@ def _shape_of_new(server: Server) -> list[tuple[object, ...]]:
 
 
 def _cleaned(server: Server, name: str) -> bool:
-    """Let a database be as if it were new; False where more than its rows was changed."""
+    """Clean a database; return False if more than its rows was changed."""
     import psycopg
 
     with psycopg.connect(server.url(name).replace("+psycopg", ""), autocommit=True) as connection:
@@ -362,7 +363,7 @@ def _cleaned(server: Server, name: str) -> bool:
 
 @pytest.fixture(scope="session")
 def truth() -> Callable[[Path], AbstractContextManager[Connection]]:
-    """A transaction on the database of a data folder, past all that is ours."""
+    """A function that opens a transaction on the database of a data folder, bypassing our code."""
 
     @contextmanager
     def opened(folder: Path) -> Iterator[Connection]:
@@ -379,7 +380,7 @@ def truth() -> Callable[[Path], AbstractContextManager[Connection]]:
 def rows(
     truth: Callable[[Path], AbstractContextManager[Connection]],
 ) -> Callable[[Path, str], list[tuple[Any, ...]]]:
-    """What the database of a data folder answers to a question."""
+    """A function that returns the rows of a query on the database of a data folder."""
 
     def ask(folder: Path, asked: str) -> list[tuple[Any, ...]]:
         with truth(folder) as connection:
@@ -390,14 +391,14 @@ def rows(
 
 @pytest.fixture(scope="session")
 def object_server() -> Iterator[ObjectServer]:
-    """A server of the S3 protocol, of this process."""
+    """An S3 server of this process."""
     with ObjectServer() as server:
         yield server
 
 
 @pytest.fixture
 def bucket(object_server: ObjectServer, monkeypatch: pytest.MonkeyPatch) -> str:
-    """URL of a new bucket; the environment says where it is, also to child processes."""
+    """URL of a new bucket, with its server in the environment."""
     for name, value in object_server.env.items():
         monkeypatch.setenv(name, value)
     return object_server.bucket(f"t{secrets.token_hex(6)}")
@@ -405,7 +406,7 @@ def bucket(object_server: ObjectServer, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """URL of a new database: the test runs once on each of the two."""
+    """URL of a new database; the test runs with each of the two kinds."""
     if request.param == "postgresql":
         return str(request.getfixturevalue("postgres_url"))
     return f"sqlite:///{tmp_path / 'sceneprint.db'}"
@@ -413,7 +414,7 @@ def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 @pytest.fixture(scope="session")
 def data_root() -> Path:
-    """Folder of the real recordings; tests that need them skip where it is absent."""
+    """Folder of the real recordings; tests that need them are skipped without it."""
     root = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
     if not root.is_dir():
         pytest.skip(f"no real recordings at {root} (set SCENEPRINT_DATA)")
@@ -422,12 +423,12 @@ def data_root() -> Path:
 
 @pytest.fixture(scope="session")
 def ros() -> SimpleNamespace:
-    """How messages of ROS and bags of them are written, and what most of them have in common."""
+    """Functions that write ROS messages and bags."""
     spec = util.spec_from_file_location("bag_writer", ROOT / "tests" / "bag_writer.py")
     assert spec is not None
     assert spec.loader is not None
     module = util.module_from_spec(spec)
-    spec.loader.exec_module(module)  # rosbags takes half a second
+    spec.loader.exec_module(module)  # importing rosbags takes half a second
     return SimpleNamespace(
         write=module.write, transform=module.transform, camera=module.T_BASE_CAMERA,
         start=module.START, k=module.K, size=(module.WIDTH, module.HEIGHT),
@@ -437,7 +438,7 @@ def ros() -> SimpleNamespace:
 
 @pytest.fixture(scope="session")
 def with_open3d() -> None:
-    """Skips where Open3D's system libraries are missing: only reconstructions need them."""
+    """Skip a test if Open3D's system libraries are missing."""
     done = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
     if done.returncode != 0:
         pytest.skip(f"Open3D cannot be imported: {done.stderr.strip().splitlines()[-1]}")
@@ -445,11 +446,11 @@ def with_open3d() -> None:
 
 @pytest.fixture(scope="session")
 def small_model() -> Model:
-    """Eight components, two levels: quick to open, and signs like a real one."""
+    """A model with eight components and two levels, which is fast to load."""
     rng = np.random.default_rng(5)
     bins = PatchDescriptorParameters().dimension
     axes = np.linalg.qr(rng.normal(size=(bins, 16)))[0].T.astype(np.float32)
-    matrix = np.asfortranarray(rng.normal(size=(12, 13)) / 3)  # as scikit-learn returns them
+    matrix = np.asfortranarray(rng.normal(size=(12, 13)) / 3)  # as in scikit-learn
     return Model(
         name="small",
         parameters=ModelParameters(
@@ -468,7 +469,7 @@ def small_model() -> Model:
 
 @pytest.fixture(scope="session")
 def small_whitened(small_model: Model) -> Model:
-    """The small model with signatures of 24 bytes, of its coarse level."""
+    """The small model with whitened signatures of 24 bytes."""
     rng = np.random.default_rng(6)
     basis = rng.integers(-127, 128, (24, small_model.level_length)).astype(np.int8)
     own = Whitening((1,), basis, np.full(24, 1e-6), np.zeros(24), 500_000.0)
@@ -482,7 +483,7 @@ def small_signer(small_model: Model) -> Signer:
 
 @pytest.fixture(scope="session")
 def room_views(once: Once) -> Callable[..., SynthRoom]:
-    """As `synthesise_room` with noise; each is rendered once for all processes of the run."""
+    """The function `synthesise_room` with noise, cached for all processes of the run."""
 
     def views(
         seed: int, index: int, n: int, *, along_path: bool = False, step: int = 1
@@ -520,7 +521,7 @@ def room_frames(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
 def small_image(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[DepthFrame, int, int], tuple[bytes, CameraIntrinsics]]:
-    """Makes an image of every fourth sample of a frame, from a row and column on."""
+    """A function that returns every fourth sample of a frame as an image, with an offset."""
     path = tmp_path_factory.mktemp("png") / "small.png"
 
     def make(frame: DepthFrame, y: int, x: int) -> tuple[bytes, CameraIntrinsics]:
@@ -535,7 +536,7 @@ def small_image(
 
 
 class Said(NamedTuple):
-    """What a command printed."""
+    """Output of a command."""
 
     stdout: str
     stderr: str
@@ -543,7 +544,7 @@ class Said(NamedTuple):
 
 @pytest.fixture
 def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
-    """Runs a command in this process and checks its exit code."""
+    """A function that runs a command in this process and checks its exit code."""
 
     def run(*arguments: object, expect: int = 0) -> Said:
         capsys.readouterr()
@@ -557,6 +558,6 @@ def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
 
 @pytest.fixture(scope="session")
 def room_mesh() -> bytes:
-    """The mesh of a furnished room as a PLY file, in metres, z up."""
+    """Mesh of a furnished room as a PLY file, in metres, z up."""
     room = make_room(np.random.default_rng(3))
     return write_ply(room.vertices, faces=room.faces)

@@ -55,7 +55,7 @@ from sceneprint_client.api.listing import FrameListing
 
 
 class Engine:
-    """Each concern by its name, and short forms of the calls that most tests need."""
+    """All parts of the engine by name, with short forms of common calls."""
 
     def __init__(self, settings: Settings, context: Context | None = None) -> None:
         self._stack = ExitStack()
@@ -110,7 +110,7 @@ class Engine:
             return stored_maps.find_map(connection, map_name)
 
     def view(self, map_name: str) -> tuple[MapRow, Model, IndexView]:
-        """A map with its model and its signatures."""
+        """Return a map with its model and its signatures."""
         row = self.row(map_name)
         model = self.signers(row.model_id).model
         with self.store.database.read() as connection:
@@ -171,7 +171,7 @@ class Engine:
         return queue_task(self.store, self.bell, kind, map_name, data, *more)
 
     def handle(self, kind: str, handler: Handler) -> None:
-        """Let jobs of a kind be done by this process."""
+        """Run jobs of a kind in this process."""
         self.jobs.handlers[kind] = handler
 
     def claim(self, worker: str) -> Work | LongJob | None:

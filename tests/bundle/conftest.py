@@ -31,7 +31,7 @@ SIGNED = 4
 
 
 def settings_of(folder: Path) -> Settings:
-    """Settings of a data folder, whatever the environment says; deletions are for good at once."""
+    """Return settings of a data folder, independent of the environment; deletions are immediate."""
     return Settings(data_dir=folder, database_url=None, index_dir=None, undo_window_s=0)
 
 
@@ -50,7 +50,7 @@ class Upload:
 
 @pytest.fixture(scope="session")
 def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Upload]:
-    """24 small frames with poses: from each of four corners of six views."""
+    """24 small frames with poses, from four offsets of each of six views."""
     found = []
     for frame in room_frames:
         assert frame.pose is not None
@@ -63,10 +63,7 @@ def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]
 
 @pytest.fixture(scope="session")
 def master(uploads: list[Upload], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data folder with signed frames, one deleted, one that waits, a key, and an orphan.
-
-    Not to be changed.
-    """
+    """A read-only data folder with signed, deleted and waiting frames, a key and an orphan."""
     folder = tmp_path_factory.mktemp("master") / "data"
     with Engine(settings_of(folder)) as engine:
         engine.create_map(NewMap(name="hall", model="depth"))
@@ -83,13 +80,13 @@ def master(uploads: list[Upload], tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture
 def data(master: Path, tmp_path: Path) -> Path:
-    """A copy of `master` to be changed."""
+    """A writable copy of `master`."""
     return Path(shutil.copytree(master, tmp_path / "data"))
 
 
 @pytest.fixture(scope="session")
 def place(master: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A folder with one bundle of `master`; not to be changed."""
+    """A read-only folder with a bundle of `master`."""
     folder = str(tmp_path_factory.mktemp("place") / "bundles")
     take_backup(settings_of(master), folder)
     return folder
@@ -97,7 +94,7 @@ def place(master: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="session")
 def content() -> Callable[[Path], dict[str, str]]:
-    """What is in a data folder: SQL of its database, and the hash of every blob by its path."""
+    """A function that returns the SQL dump and the hashes of the blobs of a data folder."""
 
     def of(folder: Path) -> dict[str, str]:
         with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
@@ -113,7 +110,7 @@ def content() -> Callable[[Path], dict[str, str]]:
 
 @pytest.fixture(scope="session")
 def rows() -> Callable[..., list[tuple[Any, ...]]]:
-    """Ask a data folder's database."""
+    """A function that queries a data folder's database."""
 
     def ask(folder: Path, asked: str) -> list[tuple[Any, ...]]:
         with closing(sqlite3.connect(folder / "sceneprint.db", timeout=PATIENCE_S)) as database:
@@ -126,7 +123,7 @@ def rows() -> Callable[..., list[tuple[Any, ...]]]:
 
 @pytest.fixture(scope="session")
 def answers() -> Callable[[Path, list[Upload]], list[Answer]]:
-    """What the map `hall` of a data folder answers, but for what no two answers share."""
+    """A function that returns the answers of the map `hall`, without parts that always differ."""
 
     def of(folder: Path, asked: list[Upload]) -> list[Answer]:
         free = {"query_id": "", "milliseconds": {}}
@@ -145,7 +142,7 @@ def answers() -> Callable[[Path, list[Upload]], list[Answer]]:
 def sceneprint(
     run_command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Any]:
-    """Runs a command in this process and checks its exit code."""
+    """A function that runs a command in this process and checks its exit code."""
     monkeypatch.delenv("SCENEPRINT_DATABASE_URL", raising=False)
 
     def run(*arguments: object, expect: int = 0) -> Any:

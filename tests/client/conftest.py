@@ -42,14 +42,14 @@ def embedded(tmp_path: Path) -> Iterator[Client]:
 
 @pytest.fixture(scope="session")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    """One service in this process for all tests; each uses maps of its own."""
+    """A service in this process for all tests, each of which uses its own maps."""
     with Client.embedded(tmp_path_factory.mktemp("client")) as client:
         yield client
 
 
 @pytest.fixture
 def map_name(request: pytest.FixtureRequest) -> str:
-    """A name no other test uses."""
+    """A name that no other test uses."""
     return "m" + f"{abs(hash(request.node.nodeid)):x}"[:20]
 
 
@@ -73,7 +73,7 @@ def references(
 def walk(
     room_views: Callable[..., SynthRoom], tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[..., list[tuple[bytes, FrameMeta]]]:
-    """Makes frames along a path, a second apart, of one session or of two in turn."""
+    """A function that creates frames along a path, a second apart, of one or two sessions."""
     path = tmp_path_factory.mktemp("walk") / "depth.png"
 
     def make(
@@ -103,7 +103,7 @@ def walk(
 def bare_wall(
     tmp_path_factory: pytest.TempPathFactory, references: tuple[FrameReference, ...]
 ) -> Path:
-    """A frame that decodes, and in which nothing can be signed: 30 samples of a wall."""
+    """A frame that decodes but has no surface to sign: 30 samples of a wall."""
     folder = tmp_path_factory.mktemp("bare")
     lens = references[0].camera.intrinsics
     depth = np.zeros((lens.height, lens.width), np.float32)
@@ -115,14 +115,14 @@ def bare_wall(
 
 @pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tries follow each other at once."""
+    """Remove the delay between retries."""
     monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(http, "LONGEST_PAUSE_S", 0.02)
 
 
 @dataclass
 class Scripted:
-    """A service that answers as it was told, and keeps what it was asked."""
+    """A service with scripted answers that records its requests."""
 
     url: str
     asked: list[tuple[str, str, bytes]] = field(default_factory=list)
@@ -130,13 +130,13 @@ class Scripted:
     stop: Callable[[], None] = lambda: None
 
 
-#: Status, headers and JSON of one answer; status 0 breaks the connection.
+#: Status, headers and JSON of an answer; status 0 breaks the connection.
 Reply = tuple[int, dict[str, str], object]
 
 
 @pytest.fixture
 def scripted() -> Iterator[Callable[[list[Reply]], Scripted]]:
-    """Makes a server that gives the replies one after the other, the last one for ever."""
+    """A function that starts a server with replies in order; the last one repeats."""
     servers: list[ThreadingHTTPServer] = []
 
     def make(replies: list[Reply]) -> Scripted:

@@ -43,24 +43,24 @@ FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-#: What Chromium says of drawing without a graphics card, whatever a page does.
+#: Message of Chromium about drawing without a graphics card.
 NOISE = "GL Driver Message"
 VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
 ROOMS, VIEWS = 2, 8
-#: When the first frame was taken; each next one is a second later.
+#: Capture time of the first frame; frames are one second apart.
 TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
 Settle = Callable[[Page], None]
 
 
 @dataclass(frozen=True)
 class Sent:
-    """A frame as it was uploaded to the map `building`.
+    """An uploaded frame of the map `building`.
 
     Parameters
     ----------
-    frame_id : that it got
-    png : its depth image
-    meta : what was sent with it
+    frame_id : id of the frame
+    png : depth image
+    meta : metadata
     """
 
     frame_id: str
@@ -68,7 +68,7 @@ class Sent:
     meta: dict[str, Any]
 
     def form(self, **fields: object) -> dict[str, Any]:
-        """Arguments of a request that sends it again, with its camera alone."""
+        """Return the arguments of a request that sends the frame again, with only its camera."""
         known = {"intrinsics": self.meta["intrinsics"]}
         parts = {"frame": ("frame.png", self.png, "image/png")}
         return {"files": parts, "data": {"meta": json.dumps(known), **fields}}
@@ -76,15 +76,15 @@ class Sent:
 
 @dataclass
 class Station:
-    """A service of its own processes.
+    """A service in separate processes.
 
     Parameters
     ----------
-    url : where it listens, without a slash at the end
-    data : its folder
-    client : asks it as one of its own machine, which needs no key
-    process : its number
-    frames : of the map `building`, in the order of time
+    url : address, without a slash at the end
+    data : data folder
+    client : HTTP client of the same machine, which needs no key
+    process : id of the main process
+    frames : frames of the map `building` in order of capture
     """
 
     url: str
@@ -99,13 +99,13 @@ class Station:
         return f"{self.url}/dashboard"
 
     def key(self, name: str, grants: dict[str, str], **more: object) -> str:
-        """The secret of a new key."""
+        """Create a key and return its secret."""
         made = self.client.post("/v1/keys", json={"name": name, "grants": grants, **more})
         assert made.status_code == 201, made.text
         return str(made.json()["secret"])
 
     def make_map(self, name: str, **more: object) -> str:
-        """Make a map; its path."""
+        """Create a map and return its path."""
         made = self.client.post("/v1/maps", json={"name": name, "model": "depth", **more})
         assert made.status_code == 201, made.text
         return f"/v1/maps/{name}"
@@ -113,9 +113,9 @@ class Station:
 
 @contextmanager
 def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
-    """`sceneprint serve` on a loopback port; it is gone when this ends.
+    """Run `sceneprint serve` on a loopback port until the context ends.
 
-    Its workers build a surface when somebody asks for it: most tests look at none.
+    Its workers build surfaces only on request, since most tests use none.
     """
     with (data / "service.log").open("ab") as log:
         process = subprocess.Popen(
@@ -145,13 +145,13 @@ def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
 
 @pytest.fixture(scope="session")
 def serve() -> Callable[..., Any]:
-    """Run a service of one's own: `with serve(folder, workers=0, port=0) as station`."""
+    """A function that runs a new service: `with serve(folder, workers=0, port=0) as station`."""
     return running
 
 
 @pytest.fixture(scope="session")
 def chromium() -> str:
-    """Debian's Chromium, or another that is installed."""
+    """Path of an installed Chromium."""
     names = ("chromium", "chromium-browser", "google-chrome")
     found = next(filter(None, map(shutil.which, names)), None)
     if found is None:
@@ -161,7 +161,7 @@ def chromium() -> str:
 
 @pytest.fixture(scope="session")
 def browser(chromium: str, folder_stack: ExitStack) -> Browser:
-    """One for all tests of this folder: as long as it is there no others may run an event loop."""
+    """A browser for all tests of this folder; no other event loop may run while it exists."""
     playwright = folder_stack.enter_context(sync_playwright())
     one = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
     expect.set_options(timeout=1000 * PATIENCE_S)
@@ -174,12 +174,12 @@ def station(
     chromium: str, tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack,
     room_views: Callable[..., SynthRoom],
 ) -> Station:  # fmt: skip
-    """A service with two workers, and a map `building` of two rooms, all of it indexed.
+    """A service with two workers, and an indexed map `building` of two rooms.
 
-    Tests leave `building` as it is; what they change they make. The frames of a room have the
-    parent frame ROOM, and are of two runs, ROOM/ann (even ones) and ROOM/bob (odd ones).
+    Tests do not change `building`. The frames of a room have the parent frame ROOM and alternate
+    between the runs ROOM/ann (even) and ROOM/bob (odd).
     """
-    del chromium  # asked for first: without a browser nothing needs to be made
+    del chromium  # without a browser the test is skipped before the service starts
     found = folder_stack.enter_context(running(tmp_path_factory.mktemp("station"), 2))
     found.client.post("/v1/maps", json={"name": "building", "title": "Two rooms", "model": "depth"})
     metas, files = [], []
@@ -206,9 +206,9 @@ def station(
 
 @pytest.fixture(scope="session")
 def four_sides(station: Station) -> dict[str, Any]:
-    """The answer, which is kept, to a view of a cube whose four sides look the same.
+    """A kept answer to a view of a cube whose four sides look the same.
 
-    Its map `four-sides` has twelve views from all around, of the run `round` in `hall`.
+    Its map `four-sides` has twelve views from all sides, of the run `round` in `hall`.
     """
     path = station.make_map("four-sides")
     ids = send(station.client, "four-sides", circled(range(30, 390, 30)))
@@ -225,7 +225,7 @@ def four_sides(station: Station) -> dict[str, Any]:
 def _shots(
     folder: Path, room_views: Callable[..., SynthRoom]
 ) -> Iterator[tuple[dict[str, Any], bytes]]:
-    """Views along a path through each room, with what is known of them, in the order of time."""
+    """Yield views along a path through each room with their metadata, in order of capture."""
     path = folder / "frame.png"
     for room in range(ROOMS):
         for view, frame in enumerate(room_views(21, room, VIEWS, along_path=True).frames):
@@ -249,9 +249,9 @@ def _shots(
 
 @pytest.fixture(scope="session")
 def shared_context(browser: Browser) -> BrowserContext:
-    """That of all pages that ask for nothing else, which come and go beside an empty one.
+    """A context for all pages without options of their own, with an empty page that stays open.
 
-    Chromium makes a window for the first page of a context, at half a second of processor.
+    Chromium creates a window for the first page of a context, which takes half a second.
     """
     context = browser.new_context(viewport=VIEWPORT)
     context.new_page()
@@ -259,7 +259,7 @@ def shared_context(browser: Browser) -> BrowserContext:
 
 
 def _forget(page: Page) -> None:
-    """Close a page of the shared context, and leave the next one nothing of it."""
+    """Close a page of the shared context, and remove its state."""
     page.context.set_offline(False)
     page.context.clear_cookies()
     page.context.clear_permissions()
@@ -271,13 +271,12 @@ def _forget(page: Page) -> None:
 
 @pytest.fixture
 def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Callable[..., Page]]:
-    """Open a page; with arguments, as of Browser.new_context, in a context of its own.
+    """A function that opens a page, in a new context if it has arguments for Browser.new_context.
 
-    Without, it shares one with those of other tests; its cookies and storage go with it.
+    Without arguments the page uses a shared context, whose cookies and storage are removed.
 
-    The test fails on whatever a page says in its console as a warning or an error, on what is
-    thrown in it, and on requests to other places than the address it was sent to first. A page
-    that provokes such has `page.allowed`, parts of what may be said.
+    The test fails on warnings and errors in the console, on exceptions, and on requests to other
+    hosts. A page that provokes such messages lists parts of them in `page.allowed`.
     """
     opened: list[Page] = []
 
@@ -317,12 +316,12 @@ def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Call
 
 @pytest.fixture
 def page(open_page: Callable[..., Page]) -> Page:
-    """A page, 1280 x 800, that goes nowhere yet; see `open_page` for what it must not say."""
+    """A new page, 1280 x 800, with the checks of `open_page`."""
     return open_page()
 
 
 def _asked(page: Page, request: Request) -> None:
-    """Note what a page asks for; a stream is never over."""
+    """Record a request of a page, except streams, which never end."""
     home = httpx.URL(page.url if page.url.startswith("http") else request.url)
     there = httpx.URL(request.url.removeprefix("blob:"))
     page.origins.add(f"{there.scheme}://{there.netloc.decode()}")  # type: ignore[attr-defined]
@@ -334,13 +333,13 @@ def _asked(page: Page, request: Request) -> None:
 
 @pytest.fixture(scope="session")
 def settle() -> Settle:
-    """Wait until a page is there: nothing in flight, and the main part not busy."""
+    """A function that waits until a page has no pending requests and is not busy."""
 
     def wait(page: Page) -> None:
-        # by evaluate: wait_for_function evaluates in the page, which the policy forbids
+        # The page's policy forbids wait_for_function.
         busy = "() => document.getElementById('main')?.getAttribute('aria-busy') !== 'false'"
         end, quiet = time.monotonic() + PATIENCE_S, 0
-        while quiet < 3:  # what was just answered may ask for more
+        while quiet < 3:  # an answer may cause further requests
             assert time.monotonic() < end, [one.url for one in page.pending]  # type: ignore[attr-defined]
             page.wait_for_timeout(20)
             quiet = 0 if page.pending or page.evaluate(busy) else quiet + 1  # type: ignore[attr-defined]
@@ -350,9 +349,7 @@ def settle() -> Settle:
 
 @pytest.fixture(scope="session")
 def axe() -> Callable[[Page], list[str]]:
-    """Return what axe finds on a page; in the dark theme only colours differ, so only they are
-    judged again.
-    """
+    """Return axe's findings on a page; the dark theme is checked only for colours."""
     judge = Axe()
 
     def look(page: Page) -> list[str]:
@@ -372,13 +369,13 @@ def axe() -> Callable[[Page], list[str]]:
 
 @pytest.fixture(scope="session")
 def pixels() -> Callable[..., Image.Image]:
-    """What an element, or a page, looks like."""
+    """A function that returns a screenshot of an element or a page."""
     return lambda shown: Image.open(io.BytesIO(shown.screenshot())).convert("RGB")
 
 
 @pytest.fixture(scope="session")
 def free_port() -> int:
-    """A port that nobody listens on, for a service that is to come back to the same one."""
+    """A free port, for a service that restarts on the same port."""
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return int(one.getsockname()[1])

@@ -15,7 +15,7 @@ DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
 def frame_or_error(
     decode: Callable[[bytes], np.ndarray], data: bytes, camera: Intrinsics
 ) -> DepthFrame | None:
-    """Whatever the bytes: a frame that can be used, or a FrameError on one line."""
+    """Return a valid frame, or a FrameError with a message of one line."""
     try:
         frame = make_frame(decode(data), camera)
     except FrameError as error:
@@ -29,7 +29,7 @@ def frame_or_error(
 
 
 def mutations(data: bytes, number: int) -> Iterator[bytes]:
-    """The file with one to three bytes changed, bits flipped, pieces lost or put in."""
+    """Yield the file with random changes: bytes, flipped bits, removed or inserted parts."""
     random = np.random.default_rng(7)
     for _ in range(number):
         mutated = bytearray(data)

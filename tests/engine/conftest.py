@@ -31,7 +31,7 @@ from tests.whole_engine import Engine
 
 @dataclass(frozen=True)
 class Upload:
-    """A frame as a robot sends it, and where it was really taken."""
+    """A frame as a robot sends it, with its true pose."""
 
     data: bytes
     meta: FrameMeta
@@ -41,7 +41,7 @@ class Upload:
 
 
 class Between:
-    """An end of a slice that is not reached, and what happens when it is looked for."""
+    """A deadline that is never reached, with a callback at each check."""
 
     def __init__(self, do: Callable[[], object]) -> None:
         self._do = do
@@ -85,7 +85,7 @@ def signer() -> Signer:
 
 @pytest.fixture(scope="session")
 def whitened_model(small_model: Model) -> Model:
-    """The small model with signatures of 64 bytes that are compared by L2."""
+    """The small model with whitened signatures of 64 bytes, which are compared by L2."""
     axes = np.random.default_rng(1).integers(-127, 128, (64, small_model.signature_bytes))
     ones = np.ones(64)
     return replace(
@@ -98,14 +98,14 @@ def whitened_model(small_model: Model) -> Model:
 
 @pytest.fixture(scope="session")
 def prepared(uploads: tuple[Upload, ...], signer: Signer) -> list[tuple[Signature, Geometry]]:
-    """What the library makes of the uploads, with artifacts as they are read back."""
+    """The library's signatures of the uploads, with decoded artifacts."""
     made = [prepare(each.frame, signer) for each in uploads]
     return [(signature, read_geometry(write_geometry(seen))) for signature, seen in made]
 
 
 @pytest.fixture
 def make_engine(tmp_path: Path) -> Iterator[Callable[..., Engine]]:
-    """Engines on one data folder; all are closed at the end."""
+    """A function that opens engines on a data folder; all are closed after the test."""
     opened: list[Engine] = []
 
     def make(folder: Path = tmp_path / "data", **more: object) -> Engine:
@@ -119,7 +119,7 @@ def make_engine(tmp_path: Path) -> Iterator[Callable[..., Engine]]:
 
 @pytest.fixture(scope="session")
 def work_off() -> Callable[[Engine], list[JobState | None]]:
-    """Do all jobs that are due; returns what became of them."""
+    """A function that runs all due jobs and returns their states."""
 
     def work(engine: Engine) -> list[JobState | None]:
         states = []
@@ -135,9 +135,7 @@ def signed_folder(
     once: Callable[[str, Callable[[Path], object]], Path], uploads: tuple[Upload, ...],
     work_off: Callable[[Engine], list[JobState | None]],
 ) -> Path:  # fmt: skip
-    """A data folder whose map `hall` holds all uploads, signed in their order. Only to be copied,
-    as all processes of the run have it.
-    """
+    """A read-only data folder of all processes, whose map `hall` has all signed uploads."""
 
     def make(folder: Path) -> None:
         with Engine(Settings(data_dir=folder)) as engine:
@@ -156,7 +154,7 @@ def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def data(signed_folder: Path, tmp_path: Path) -> Path:
-    """A copy of `signed_folder`, to be changed."""
+    """A writable copy of `signed_folder`."""
     return Path(shutil.copytree(signed_folder, tmp_path / "data"))
 
 
@@ -177,7 +175,7 @@ def empty(make_engine: Callable[..., Engine]) -> Engine:
 
 @pytest.fixture(scope="session")
 def put_back() -> Callable[[Path, Path], None]:
-    """Put a data folder back from a copy, which an engine has opened, all but its indexes."""
+    """A function that restores an open data folder from a copy, except its indexes."""
 
     def put(copy: Path, data: Path) -> None:
         shutil.rmtree(copy / "index", ignore_errors=True)
@@ -190,13 +188,13 @@ def put_back() -> Callable[[Path, Path], None]:
 
 @pytest.fixture(scope="session")
 def ids() -> Callable[[Engine], list[str]]:
-    """Ids of the frames of `hall`, as they came."""
+    """A function that returns the ids of the frames of `hall` in order of arrival."""
     return lambda engine: [frame.frame_id for frame in engine.list_frames("hall").items]
 
 
 @pytest.fixture(scope="session")
 def told() -> Callable[[Engine], list[str]]:
-    """Kinds of all events, in order."""
+    """A function that returns the kinds of all events in order."""
 
     def tell(engine: Engine) -> list[str]:
         number_events(engine.store.database)
@@ -210,7 +208,7 @@ def told() -> Callable[[Engine], list[str]]:
 
 @pytest.fixture(scope="session")
 def due_now() -> Callable[..., None]:
-    """Let nobody wait: neither for a lease to run out nor for another try."""
+    """A function that makes all jobs due, by ending leases and delays."""
 
     def turn(engine: Engine) -> None:
         with engine.store.database.write() as connection:
@@ -223,8 +221,9 @@ def due_now() -> Callable[..., None]:
 
 @pytest.fixture(scope="session")
 def each_slice_lost_once(due_now: Callable[[Engine], None]) -> Callable[..., int]:
-    """Do a job of a product, a step a slice, while a worker dies after each; returns how many
-    slices there were.
+    """A function that runs a product's job in steps, with a worker that dies after each one.
+
+    It returns the number of slices.
     """
 
     def work(engine: Engine, products: Products[Any, Any], job_id: str) -> int:
@@ -236,7 +235,7 @@ def each_slice_lost_once(due_now: Callable[[Engine], None]) -> Callable[..., int
             due_now(engine)
             again = engine.claim("lives")
             assert isinstance(again, LongJob)
-            assert engine.jobs._tasks.run(lost, 60.0, 60.0) is None  # its lease is another's
+            assert engine.jobs._tasks.run(lost, 60.0, 60.0) is None  # another worker has the lease
             second = products.run_slice(again, lambda: True)
             assert asdict(first) == asdict(second)
             engine.jobs._tasks._store_result(again, second)

@@ -17,7 +17,7 @@ from sceneprint_lab.evaluation.protocol import Error, QueryOutcome, ValidatedPai
 
 @pytest.fixture(scope="session")
 def building(once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
-    """Two rooms of twelve views along a path. Only to be read."""
+    """Two read-only rooms with twelve views each along a path."""
 
     def make(folder: Path) -> None:
         of = ("--rooms", "2", "--views", "12", "--seed", "9", "--path", "--jobs", "1")
@@ -71,7 +71,7 @@ def outcome(
     present: bool = True,
     **rest: Any,
 ) -> QueryOutcome:
-    """A query at the origin of "here" with a database of as many frames as `least`."""
+    """Return an outcome for a query at the origin of "here", with a database like `least`."""
     overlap = np.array(least if least is not None else [0.4] * (max(ranking) + 1))
     return QueryOutcome(
         name="here/query",
@@ -103,11 +103,12 @@ def make_outcome() -> Callable[..., QueryOutcome]:
 
 @pytest.fixture
 def three() -> list[QueryOutcome]:
-    """One query found, one lost, one whose scene is not in the database.
+    """A successful query, a failed one, and one whose scene is not in the database.
 
-    The first: rank 1 weak and 7 cm off, rank 2 strong and 2 cm off, rank 3 strong, 4 cm and 6
-    degrees off; C has ranks 1 and 3. The second: rank 1 of another scene, rank 2 weak and 15 cm
-    off, rank 3 ambiguous but right; C has ranks 1 and 3. The third: one weak, wrong match.
+    First query: rank 1 is weak and off by 7 cm, rank 2 strong and off by 2 cm, rank 3 strong and
+    off by 4 cm and 6 degrees; C has ranks 1 and 3. Second: rank 1 is of another scene,
+    rank 2 weak and off by 15 cm, rank 3 ambiguous but correct; C has ranks 1 and 3.
+    Third: a weak, wrong match.
     """
     found = outcome(
         [0, 1, 2],

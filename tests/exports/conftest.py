@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-SIZE = np.array([5.0, 4.0, 2.6])  #: the room reaches from the origin to here, metres; z is up
+SIZE = np.array([5.0, 4.0, 2.6])  #: corner opposite the origin, metres; z is up
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera without distortion; pixel centres have whole coordinates."""
+    """A camera without distortion; pixel centres have integer coordinates."""
 
     fx: float
     fy: float
@@ -26,20 +26,20 @@ class Lens:
 
     @property
     def rays(self) -> Floats:
-        """(H, W, 3) in optical axes, z = 1."""
+        """Return rays (H, W, 3) in optical axes, z = 1."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack((x, y, np.ones_like(x)), axis=-1)
 
 
 class Room:
-    """A box that is seen from within; it is not symmetric about any of the poses."""
+    """A box seen from inside, which is not symmetric about any of the poses."""
 
     lens = Lens(105.0, 103.0, 38.5, 31.0, 80, 60)
 
     @staticmethod
     def poses() -> list[Floats]:
-        """T_world_camera (4, 4), optical axes: turned, pitched and rolled at three places."""
+        """Return T_world_camera (4, 4) in optical axes at three places with different rotations."""
         found = []
         for x, y, z, turn, pitch, roll in (
             (1.2, 1.1, 1.3, 20, 15, 5), (3.1, 2.6, 1.0, 130, -10, -8), (4.0, 0.9, 1.8, -75, 25, 90),
@@ -58,7 +58,7 @@ class Room:
 
     @staticmethod
     def distances(origin: Floats, directions: Floats) -> Floats:
-        """How far the walls are from a place within, in lengths of the directions (..., 3)."""
+        """Return the distances to the walls from within, in lengths of the directions (..., 3)."""
         with np.errstate(divide="ignore"):
             reach = np.where(directions > 0, SIZE - origin, -origin) / directions
         reach[directions == 0] = np.inf
@@ -66,25 +66,25 @@ class Room:
         return found
 
     def depth(self, T_world_camera: Floats, lens: Lens | None = None) -> Floats:
-        """(H, W) metres along the optical axis."""
+        """Return depth (H, W) along the optical axis, metres."""
         rays = (lens or self.lens).rays @ T_world_camera[:3, :3].T
         return self.distances(T_world_camera[:3, 3], rays)
 
     def points(self, T_world_scan: Floats, count: int = 2000) -> Floats:
-        """(N, 3) of the walls in the axes of a scanner, in all directions."""
+        """Return points (N, 3) of the walls in the axes of a scanner, in all directions."""
         directions = np.random.default_rng(5).normal(size=(count, 3))
         world = directions @ T_world_scan[:3, :3].T
         return directions * self.distances(T_world_scan[:3, 3], world)[:, None]
 
     @staticmethod
     def error(points: Floats) -> float:
-        """How far the farthest of the points (N, 3) is from the walls, metres."""
+        """Return the greatest distance of points (N, 3) from the walls, metres."""
         outside = np.linalg.norm(np.maximum(0, np.maximum(-points, points - SIZE)), axis=1)
         within = np.minimum(np.abs(points), np.abs(points - SIZE)).min(axis=1)
         return float(np.maximum(outside, np.where(outside > 0, 0, within)).max())
 
     def error_of_depth(self, depth: NDArray[np.float32], lens: Lens, T: Floats) -> float:
-        """The error of a depth image's points, at a pose; all of it must be there."""
+        """Return the greatest error of a complete depth image at a pose, metres."""
         assert (depth > 0).all()
         points = (lens.rays * depth[..., None]).reshape(-1, 3)
         return self.error(points @ T[:3, :3].T + T[:3, 3])

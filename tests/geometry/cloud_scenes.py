@@ -6,12 +6,12 @@ import numpy as np
 
 from sceneprint.types import Cloud, Floats
 
-#: Walls of the room, from the viewpoint: x, y, z from -> to, metres.
+#: Walls of the room relative to the viewpoint: x, y, z from -> to, metres.
 LOW, HIGH = np.array([-2.0, -1.6, -1.1]), np.array([2.6, 1.9, 1.4])
 
 
 def directions(n: int, seed: int = 0, half_deg: float = 180.0) -> Floats:
-    """(n, 3) unit vectors, uniform within an angle of the x axis."""
+    """Return unit vectors (n, 3), uniform within an angle of the x axis."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(np.cos(np.radians(half_deg)), 1.0, n)
     turn = rng.uniform(0, 2 * np.pi, n)
@@ -20,7 +20,7 @@ def directions(n: int, seed: int = 0, half_deg: float = 180.0) -> Floats:
 
 
 def in_room(rays: Floats) -> tuple[Floats, Floats]:
-    """Where rays meet the walls, and the normals there, (n, 3) each."""
+    """Return the points where rays meet the walls, and the normals there, (n, 3) each."""
     with np.errstate(divide="ignore"):
         reach = np.where(rays > 0, HIGH / rays, LOW / rays)
     wall = reach.argmin(axis=1)
@@ -31,19 +31,19 @@ def in_room(rays: Floats) -> tuple[Floats, Floats]:
 
 
 def room(n: int = 40_000, seed: int = 0, half_deg: float = 180.0) -> Cloud:
-    """The room as a cloud about the viewpoint, without noise."""
+    """Return an exact cloud of the room around the viewpoint."""
     return Cloud(in_room(directions(n, seed, half_deg))[0].astype(np.float32))
 
 
 def off_walls(points: Floats) -> Floats:
-    """How far points lie from the nearest wall, metres."""
+    """Return the distances of points from the nearest wall, metres."""
     gaps = np.concatenate([points - LOW, HIGH - points], axis=-1)
     result: Floats = np.abs(gaps).min(axis=-1)
     return result
 
 
 def rotation(seed: int) -> Floats:
-    """A rotation drawn uniformly: (3, 3)."""
+    """Return a uniformly random rotation (3, 3)."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     q[:, 0] *= np.linalg.det(q)

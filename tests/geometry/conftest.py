@@ -10,7 +10,7 @@ import pytest
 
 
 def beside(name: str) -> ModuleType:
-    """The module `name` of this folder; importlib mode puts no folder on the path."""
+    """Return the module `name` of this folder, which importlib mode does not put on the path."""
     path = Path(__file__).resolve().with_name(f"{name}.py")
     spec = util.spec_from_file_location(f"geometry_{name}", path)
     assert spec is not None

@@ -22,7 +22,7 @@ def two_patches(l_mu: Floats, n_mu: Floats, l_alpha: Floats, n_alpha: Floats) ->
 
 
 def from_invariants(d: float, theta_mu: float, theta_alpha: float, phi: float) -> Patches:
-    """Two patches with u = x, v = y, w = z that have these four invariants."""
+    """Return two patches with u = x, v = y, w = z and the given invariants."""
     n_mu = [math.cos(theta_mu), math.sin(theta_mu), 0.0]
     s = math.sin(theta_alpha)
     n_alpha = [math.cos(theta_alpha), s * math.cos(phi), s * math.sin(phi)]
@@ -30,7 +30,7 @@ def from_invariants(d: float, theta_mu: float, theta_alpha: float, phi: float) -
 
 
 def check_eq1(module: ModuleType) -> None:
-    """Two pairs in which no term of Eq. (1) is zero and every sign occurs both ways."""
+    """Check two pairs in which no term of Eq. (1) is zero and every sign occurs both ways."""
     p = module.PropertyParameters(
         radius=10.0, angular_tolerance=math.radians(10), colinearity=0.999
     )
@@ -73,7 +73,7 @@ def check_eq1(module: ModuleType) -> None:
 
 
 def check_r1(module: ModuleType) -> None:
-    """Reading R1: the robust sign is 0 within 10 degrees of perpendicular, and not beyond.
+    """Check reading R1: the robust sign is 0 within 10 degrees of perpendicular, and not beyond.
 
     With d = 2 and the angles 90 - 9.9 or 90 - 10.1 degrees to u, v or w, the four signs are
     0 or 2; mirrored, 0 or -2.
@@ -82,11 +82,11 @@ def check_r1(module: ModuleType) -> None:
         radius=10.0, angular_tolerance=math.radians(10), colinearity=0.999
     )
     for off, value in ((9.9, 0.0), (10.1, 2.0), (-9.9, 0.0), (-10.1, -2.0)):
-        # both normals off perpendicular to u by the same angle; n_alpha between v and w
+        # Both normals are off perpendicular to u by the same angle; n_alpha is between v and w.
         near = math.radians(90 - off)
         f = module.properties(np.array([[2.0, near, near, math.radians(45)]]), p)
         assert f[0, 9:].tolist() == [value, value, 2.0, 2.0]
-        # n_alpha perpendicular to u, off w by the angle towards v, and the other way round
+        # n_alpha is perpendicular to u, off w by the angle towards v; then the roles are swapped.
         f = module.properties(np.array([[2.0, near, math.radians(90), near]]), p)
         assert f[0, 9:].tolist() == [value, 0.0, value, 2.0]
         f = module.properties(np.array([[2.0, near, math.radians(90), math.radians(off)]]), p)
@@ -94,7 +94,7 @@ def check_r1(module: ModuleType) -> None:
 
 
 def check_eq2(module: ModuleType) -> None:
-    """Two pairs, two components, two dimensions; posteriors are given, not computed.
+    """Check two pairs, two components and two dimensions with given posteriors.
 
     f = (1, 2), (3, -1) with pi = (.2, .8), (.6, .4); p = (.36, .64), whose roots are .6, .8;
     nu_1 = (.5, 1.5), Lambda_1 = (4, .25); nu_2 = (-1, .5), Lambda_2 = (.25, 4).

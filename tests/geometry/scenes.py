@@ -8,12 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.types import Floats, Intrinsics, Patches, Surface
 
-#: Half a reduced Kinect: the field of view of a room sensor at a quarter of the work.
+#: Camera with the field of view of a Kinect and a quarter of the pixels.
 CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
 
 
 def rays(camera: Intrinsics) -> Floats:
-    """(h, w, 3) directions with z = 1, by the pinhole equation."""
+    """Return directions (h, w, 3) with z = 1, by the pinhole equation."""
     y, x = np.mgrid[: camera.height, : camera.width]
     return np.dstack(
         [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x, float)]
@@ -21,7 +21,7 @@ def rays(camera: Intrinsics) -> Floats:
 
 
 def plane(camera: Intrinsics, normal: Floats, point: Floats) -> Floats:
-    """1/z of the plane through `point`, 0 where it is not in front of the camera."""
+    """Return 1 / z of the plane through `point`, 0 where it is not in front of the camera."""
     q: Floats = rays(camera) @ normal / float(np.dot(normal, point))
     return np.maximum(q, 0.0)
 
@@ -32,16 +32,16 @@ def unit(*v: float) -> Floats:
 
 
 def degrees_between(a: Floats, b: Floats) -> Floats:
-    """Angle of unit vectors in degrees; exact for small ones, as arccos is not."""
+    """Return the angle of unit vectors in degrees, more accurate than arccos at small angles."""
     result: Floats = np.degrees(2 * np.arcsin(np.linalg.norm(a - b, axis=-1).clip(0, 2) / 2))
     return result
 
 
 def corner(camera: Intrinsics = CAMERA) -> tuple[Surface, NDArray[np.int64]]:
-    """A room's corner seen from inside, without noise, and which of its planes each pixel sees."""
+    """Return an exact corner of a room, seen from inside, and the plane of each pixel."""
     axes = Rotation.from_euler("xyz", [32, -40, 8], degrees=True).as_matrix().T
     apex = np.array([0.1, 0.0, 2.5])
-    # every wall faces the sensor: its normal points against the ray to the corner
+    # Every wall faces the sensor, so its normal points against the ray to the corner.
     normals = np.array([-np.sign(a[2]) * a for a in axes])
     q = np.array([plane(camera, n, apex) for n in normals])
     seen = q.argmax(axis=0)
@@ -49,12 +49,12 @@ def corner(camera: Intrinsics = CAMERA) -> tuple[Surface, NDArray[np.int64]]:
 
 
 def lifted(camera: Intrinsics, q: Floats, normals: Floats) -> Surface:
-    """The surface with these exact inverse depths and normals; 0 is missing."""
+    """Return the surface with exact inverse depths and normals; 0 is missing."""
     valid = q > 0
     z = np.where(valid, 1 / np.where(valid, q, 1.0), 0.0)
     points = rays(camera) * z[..., None]
-    # solid angle 1 / (fx fy |ray|^3), times range^2, over the cosine of incidence:
-    # z^2 / (fx fy |ray| cosine), whose last two factors are -n . ray
+    # The area is the solid angle 1 / (fx fy |ray|^3) times range^2 over the cosine of incidence:
+    # z^2 / (fx fy |ray| cosine), whose last two factors are -n . ray.
     lean = -(normals * rays(camera)).sum(axis=2)
     areas = np.where(valid, z**2 / (camera.fx * camera.fy * np.where(valid, lean, 1.0)), 0.0)
     return Surface(
@@ -78,7 +78,7 @@ def random_patches(rng: np.random.Generator, n: int, extent: float = 2.0) -> Pat
 
 
 def room(rng: np.random.Generator, n: int = 110) -> Patches:
-    """Patches on the walls of a box and on some boxes in it, normals off by 2 degrees."""
+    """Return patches on the walls of a room and of boxes in it, with normals off by 2 degrees."""
     size = np.array([rng.uniform(2.5, 6), rng.uniform(2.5, 6), 2.5])
     boxes = [(np.zeros(3), size, -1.0)]
     for _ in range(rng.integers(1, 4)):

@@ -19,10 +19,10 @@ Publish = Callable[..., IndexVersion]
 
 @pytest.fixture(scope="session")
 def walk() -> Walk:
-    """Signatures (n, length) of a camera on smooth walks: near frames alike, none a cluster.
+    """A function that returns signatures (n, length) of a camera on smooth walks, without clusters.
 
-    Sixteen slow sinusoids of random period are where the camera is; a fixed nonlinear map of low
-    rank, the same for every walk, makes them bytes; and every byte has noise of its own.
+    Sixteen slow sinusoids of random periods are the position of the camera. A fixed nonlinear map
+    of low rank converts them to bytes, each with its own noise.
     """
 
     def make(n: int, length: int = 256, seed: int = 0, walks: int = 1) -> Bytes:
@@ -44,7 +44,7 @@ def walk() -> Walk:
 
 @pytest.fixture
 def published(tmp_path: Path) -> Publish:
-    """Publish keys and signatures as the next version of one folder."""
+    """A function that publishes keys and signatures as the next version of a folder."""
 
     def run(
         keys: Keys,
@@ -72,7 +72,7 @@ def published(tmp_path: Path) -> Publish:
 
 @pytest.fixture(scope="session")
 def nearest() -> Callable[..., tuple[list[int], list[int]]]:
-    """The oracle: keys and distances of the nearest, by Python's own sort of naive sums."""
+    """A function that returns the nearest keys and distances by sorting all sums."""
 
     def find(query: Bytes, frames: dict[int, Bytes], size: int) -> tuple[list[int], list[int]]:
         asked = query.astype(np.int64)

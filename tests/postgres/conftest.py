@@ -23,7 +23,7 @@ class Small(NamedTuple):
 
 @pytest.fixture(scope="session")
 def small(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Small]:
-    """Frames of their own content: from another corner each."""
+    """Frames with different content, from different offsets."""
     found = []
     for number in range(12):
         data, lens = small_image(room_frames[number % 6], *divmod(number, 4))
@@ -41,7 +41,7 @@ def server_store(postgres_url: str, tmp_path: Path) -> Iterator[Store]:
 
 @pytest.fixture
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Server]]:
-    """A primary, and an asynchronous standby: the primary goes on without it."""
+    """A primary and an asynchronous standby."""
     folder = tmp_path_factory.mktemp("pair")
     primary = Server(folder / "primary")
     primary.start()

@@ -24,13 +24,13 @@ from typing import Any
 
 import pytest
 
-#: One change of a folder: names and what they lead to from now on, None where to nothing.
+#: A change of a folder: names and their new targets, None for a removed name.
 Change = dict[str, int | None]
 
 
 @dataclass
 class Inode:
-    """A file or a folder: as programs see it, and as the disk has it for sure."""
+    """A file or a folder, with its visible and its durable content."""
 
     is_folder: bool
     seen: bytes = b""
@@ -41,19 +41,19 @@ class Inode:
 
 
 class Disk:
-    """The log of one folder, as the states that the disk went through.
+    """The log of one folder as a sequence of disk states.
 
     Parameters
     ----------
-    root : the folder; what is in it now is durable
-    deaf : "files" or "folders": whose fsyncs this disk does not do, to see that somebody notices
+    root : folder, whose initial content is durable
+    deaf : "files" or "folders", whose fsyncs this disk ignores, so that a test must fail
     """
 
     def __init__(self, root: Path, deaf: str = "") -> None:
         self.root, self.deaf = root.resolve(), deaf
         self.inodes: dict[int, Inode] = {}
         self.states: list[tuple[str, dict[int, Inode]]] = []
-        self._ids: dict[int, int] = {}  # of files that have a name now: numbers are given out again
+        self._ids: dict[int, int] = {}  # for files with a name, since inode numbers are reused
         self._top = self._new(self.root.stat().st_ino, is_folder=True)
         self._look()
         for inode in self.inodes.values():
@@ -66,12 +66,12 @@ class Disk:
         return self._ids[real]
 
     def mark(self, what: str) -> None:
-        """Note that something happened elsewhere, such as a commit."""
+        """Record an event elsewhere, such as a commit."""
         self._look()
         self._keep(what)
 
     def synced(self, descriptor: int) -> None:
-        """After an fsync."""
+        """Record an fsync."""
         found = os.fstat(descriptor)
         self._look()
         if found.st_ino not in self._ids or found.st_dev != self.root.stat().st_dev:
@@ -87,12 +87,12 @@ class Disk:
             self._keep("sync file")
 
     def about_to(self, event: str) -> None:
-        """Before a call that opens, renames or removes: see what was done until now."""
+        """Record the changes so far, before a call that opens, renames or removes."""
         self._look()
         self._keep(f"before {event}")
 
     def _look(self) -> None:
-        """Bring what programs see up to date with the real folder."""
+        """Update the visible state from the real folder."""
         found: dict[int, dict[str, int]] = {}
         named = {self.root.stat().st_ino}
         for place, _, _ in os.walk(self.root):
@@ -112,7 +112,7 @@ class Disk:
             inode, changes = self.inodes[folder], []
             gone = {name: at for name, at in inode.names.items() if names.get(name) != at}
             for name, at in names.items():
-                if inode.names.get(name) != at:  # together with the name that it had here before
+                if inode.names.get(name) != at:  # with the name that it had here before
                     before = {old: None for old in gone if gone[old] == at and old != name}
                     changes.append({**before, name: at})
             moved = {old for change in changes for old in change}
@@ -123,13 +123,13 @@ class Disk:
         self.states.append((what, deepcopy(self.inodes)))
 
     def crashes(self, seeds: int = 3) -> Iterator[tuple[int, str, dict[str, bytes | None]]]:
-        """What may be left after each step: nothing unsure, all of it, and subsets.
+        """Yield possible folders after a crash at each step, with none, all or some unsynced data.
 
         Yields
         ------
-        step : number of the state
-        what : the step, and what was kept
-        tree : content by path, None for a folder; what was yielded at that step is not again
+        step : index of the state
+        what : description of the step, and of the data that was kept
+        tree : content by path, None for a folder; without repetitions within a step
         """
         for step, (what, inodes) in enumerate(self.states):
             known: list[dict[str, bytes | None]] = []
@@ -181,7 +181,7 @@ def _at_random(rng: random.Random) -> tuple[Callable[[], bool], Callable[[Inode]
 
 
 _EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate")
-#: The one that listens; a hook cannot be taken away again.
+#: The active disk; audit hooks cannot be removed.
 _listening: list[Disk] = []
 
 
@@ -190,7 +190,7 @@ def _hooked() -> None:
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if event not in _EVENTS or not _listening:
             return
-        disk = _listening.pop()  # it opens files itself
+        disk = _listening.pop()  # this code opens files itself
         try:
             if event == "open" and not arguments[2] & (os.O_CREAT | os.O_TRUNC):
                 return
@@ -208,7 +208,7 @@ Recording = Callable[..., Any]
 
 @pytest.fixture
 def recorded(_hooked: None, monkeypatch: pytest.MonkeyPatch) -> Recording:
-    """`with recorded(folder) as disk:` records what this thread does to files in a folder."""
+    """`with recorded(folder) as disk:` records this thread's file operations in a folder."""
     fsync, fdatasync = os.fsync, os.fdatasync
 
     def listen(after: Callable[[int], None]) -> Callable[[Any], None]:
@@ -243,13 +243,13 @@ def recorded(_hooked: None, monkeypatch: pytest.MonkeyPatch) -> Recording:
 
 @pytest.fixture
 def after_crash(tmp_path: Path) -> Callable[[dict[str, bytes | None]], Path]:
-    """Make the folder that a crash left; each has a new name, as files may be mapped."""
+    """A function that creates the folder after a crash with a new name, as files may be mapped."""
     made = iter(range(1_000_000))
 
     def make(tree: dict[str, bytes | None]) -> Path:
         root = tmp_path / f"crashed-{next(made)}"
         root.mkdir()
-        for name, content in tree.items():  # folders before what is in them
+        for name, content in tree.items():  # folders before their content
             if content is None:
                 (root / name).mkdir()
             else:

@@ -13,7 +13,7 @@ from sceneprint.types import Floats
 
 @pytest.fixture(scope="session")
 def walk(ros: SimpleNamespace) -> list[tuple[float, Floats]]:
-    """Where a base is every tenth of a second: it drives along a bend."""
+    """Poses of a base that drives along a bend, every tenth of a second."""
     return [
         (
             0.1 * i,
@@ -25,7 +25,7 @@ def walk(ros: SimpleNamespace) -> list[tuple[float, Floats]]:
 
 @pytest.fixture(scope="session")
 def depth() -> Callable[[int], np.ndarray]:
-    """Samples in millimetres of frame number i; some are missing."""
+    """A function that returns the samples of a frame in millimetres, some of them missing."""
 
     def samples(i: int) -> np.ndarray:
         rng = np.random.default_rng(i)

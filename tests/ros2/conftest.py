@@ -21,12 +21,12 @@ from sceneprint_client import Client
 from sceneprint_client.frame_files import meta_of
 
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "sceneprint_ros"
-#: Frames of the room, of which every second is in the map; and seconds from one to the next.
+#: Number of frames, of which every second is in the map, and interval of frames, seconds.
 FRAMES, STEP_S = 12, 0.5
-#: Where odometry begins in the map: it knows nothing of it.
+#: Origin of the odometry in the map, which the odometry does not know.
 T_MAP_ODOM = np.array([[0.0, -1, 0, 2], [1, 0, 0, -3], [0, 0, 1, 0], [0, 0, 0, 1]])
 
-#: A topic, a type, and a message of it.
+#: A topic, a type, and a message.
 Arrived = tuple[str, str, Any]
 
 
@@ -51,9 +51,9 @@ def service_url(service_url: str, room: tuple[Any, ...]) -> str:
 
 @pytest.fixture(scope="session")
 def drive(room: tuple[Any, ...], ros: SimpleNamespace) -> Callable[..., list[Arrived]]:
-    """What topics carry while a robot drives through the room, a frame every half second.
+    """A function that returns the messages of a drive through the room, with a frame every 0.5 s.
 
-    `kind` is how depth is sent; with `turn`, everything happens so many seconds later.
+    `kind` is the encoding of depth, and `turn` a delay of all messages, seconds.
     """
 
     def carried(kind: str = "depth", *, later: float = 0.0, frames: int = FRAMES) -> list[Arrived]:
@@ -65,7 +65,7 @@ def drive(room: tuple[Any, ...], ros: SimpleNamespace) -> Callable[..., list[Arr
             T_odom_base = np.linalg.inv(T_MAP_ODOM) @ one.pose @ np.linalg.inv(ros.camera)
             samples = decode_png(one.read_bytes())
             writer.camera_info(t, k=(k.fx, k.fy, k.cx, k.cy), size=(k.width, k.height))
-            send(writer, kind, t, samples, k)  # odometry of its time comes after it
+            send(writer, kind, t, samples, k)  # odometry of the same time follows
             writer.transforms(t, {("odom", "base_link"): T_odom_base})
         return list(writer.written)
 
@@ -79,7 +79,7 @@ def send(writer: Any, kind: str, t: float, samples: np.ndarray, k: Any) -> None:
         writer.image(t, samples / 1000.0, "32FC1")
     elif kind == "compressed_depth":
         writer.compressed(t, samples)
-    elif kind == "compressed_metres":  # quantised as the transport does: z = a / (v - b)
+    elif kind == "compressed_metres":  # quantised like the transport: z = a / (v - b)
         a, b = 10_100.0, 1 - 10_100.0 / 10.0
         with np.errstate(divide="ignore"):
             quantised = np.where(samples > 0, a / (samples / 1000.0) + b, 0)
@@ -93,17 +93,17 @@ def send(writer: Any, kind: str, t: float, samples: np.ndarray, k: Any) -> None:
         writer.points(t, points.reshape(-1), frame="camera", height=len(points))
 
 
-# What rclpy gives a node, as far as ours asks for it.
+# The part of rclpy that our node uses.
 
 
 @dataclass
 class Bus:
-    """What a node subscribed to, and what it published.
+    """Subscriptions and publications of a node.
 
     Parameters
     ----------
-    parameters : that are set, others have their defaults
-    now_ns : of its clock
+    parameters : parameters that are set; others have their defaults
+    now_ns : time of its clock
     """
 
     parameters: dict[str, Any] = field(default_factory=dict)
@@ -118,12 +118,12 @@ class Bus:
     is_up: bool = False
 
     def on(self, topic: str) -> list[Any]:
-        """Messages that were published on a topic."""
+        """Return the messages that were published on a topic."""
         return [message for name, _, message in self.published if name == topic]
 
 
 class StubNode:
-    """rclpy.node.Node on a bus: messages that it publishes go through their bytes."""
+    """Stand-in for rclpy.node.Node that serialises published messages."""
 
     bus: Bus
     types: Any
@@ -137,7 +137,7 @@ class StubNode:
     def declare_parameter(self, name: str, default: Any) -> SimpleNamespace:
         self.bus.declared[name] = default
         value = self.bus.parameters.get(name, default)
-        assert type(value) is type(default), name  # as rclpy sees to it
+        assert type(value) is type(default), name  # rclpy checks this too
         return SimpleNamespace(value=value)
 
     def create_subscription(
@@ -170,7 +170,7 @@ class StubNode:
 
 
 def plain(message: Any) -> Any:
-    """A message for rosbags, which has numbers for what rclpy has bytes of length 1."""
+    """Return a message for rosbags, which uses numbers for rclpy's bytes of length 1."""
     if hasattr(message, "level"):
         assert isinstance(message.level, bytes)
         assert len(message.level) == 1
@@ -181,7 +181,7 @@ def plain(message: Any) -> Any:
 
 
 def message_class(types: Any, name: str) -> Any:
-    """A class that makes messages as rclpy's do: of named fields, the others zero."""
+    """Return a class for messages like rclpy's, with named fields and zero defaults."""
 
     def make(**fields: Any) -> Any:
         message = zero(types, name)
@@ -195,7 +195,7 @@ def message_class(types: Any, name: str) -> Any:
 
 
 def zero(types: Any, name: str) -> Any:
-    """A message whose numbers are 0 and whose lists are empty."""
+    """Return a message with zeros and empty lists."""
     from rosbags.interfaces import Nodetype
 
     plain_values = {"string": "", "bool": False, "float64": 0.0, "float32": 0.0}
@@ -214,7 +214,7 @@ def zero(types: Any, name: str) -> Any:
 
 @pytest.fixture
 def bus(ros: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Bus:
-    """What `start_node` runs a node on, whose modules are stand-ins."""
+    """A bus on which `start_node` runs a node with stand-in modules."""
     made = Bus()
     types = ros.messages().types
 
@@ -258,7 +258,7 @@ def bus(ros: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Bus:
 
 @pytest.fixture
 def node_module(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """The file of the node, on the stand-ins."""
+    """The module of the node, with the stand-ins."""
     yield import_module("sceneprint_ros.relocaliser_node")
     for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):
         sys.modules.pop(name, None)

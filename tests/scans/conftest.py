@@ -16,13 +16,13 @@ Write = Callable[..., bytes]
 
 @pytest.fixture
 def points() -> np.ndarray:
-    """Twelve points (12, 3) that every type of number holds exactly, times four."""
+    """Twelve points (12, 3) that every number type represents exactly, even times four."""
     return POINTS.copy()
 
 
 @pytest.fixture(scope="session")
 def ply() -> Write:
-    """A PLY file of points and a triangle, between them a list of odd lengths."""
+    """A function that returns a PLY file of points, a list of odd lengths, and a triangle."""
 
     def write(points: np.ndarray = POINTS, form: str = "binary_little_endian") -> bytes:
         header = (
@@ -46,7 +46,7 @@ def ply() -> Write:
 
 @pytest.fixture(scope="session")
 def pcd() -> Write:
-    """A PCD file of points with two fields more, one of them of three values."""
+    """A function that returns a PCD file of points with two more fields, one of three values."""
 
     def write(
         points: np.ndarray = POINTS, form: str = "binary", viewpoint: str = "0 0 0 1 0 0 0"
@@ -79,7 +79,7 @@ def pcd() -> Write:
 
 
 def lzf_of(data: bytes) -> bytes:
-    """Packed, plainly: the longest repetition that begins here, else the byte itself."""
+    """Return data compressed with the longest repetition at each byte."""
     out, i = bytearray(), 0
     while i < len(data):
         best, back = 0, 0
@@ -103,7 +103,7 @@ def lzf_of(data: bytes) -> bytes:
 
 @pytest.fixture(scope="session")
 def lzf() -> Callable[[bytes], bytes]:
-    """A plain packer."""
+    """A simple LZF compressor."""
     return lzf_of
 
 
@@ -127,7 +127,7 @@ def npy() -> Write:
 
 @pytest.fixture(scope="session")
 def las() -> Write:
-    """A LAS 1.2 file of point format 1, in millimetres from an offset."""
+    """A function that returns a LAS 1.2 file of point format 1, in millimetres from an offset."""
 
     def write(
         points: np.ndarray = POINTS, offset: tuple[float, float, float] = (10.0, 20.0, 30.0)

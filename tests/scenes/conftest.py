@@ -24,13 +24,13 @@ from sceneprint_client import Client, meta_of
 from sceneprint_viewers.scene import Moment, SceneEntity
 
 MAP, WALK = "rooms", 8
-#: What Rerun, which does not draw them, calls lines and labels.
+#: Rerun's names of lines and labels, which it does not draw.
 UPDATE = "foxglove.SceneUpdate:message"
 
 
 @dataclass
 class Logged:
-    """What a file has at one path and time: components by their names, one row each."""
+    """Content of a file at one path and time: components by name, one row each."""
 
     path: str
     time_ns: int | None
@@ -38,7 +38,7 @@ class Logged:
 
 
 def _rows(path: Path) -> Iterator[Logged]:
-    from rerun.chunk import McapReader  # half a second
+    from rerun.chunk import McapReader  # takes half a second
 
     for chunk in McapReader(path).stream():
         batch = chunk.to_record_batch()
@@ -53,18 +53,18 @@ def _rows(path: Path) -> Iterator[Logged]:
 
 
 def mcap_rows(path: Path) -> list[Logged]:
-    """All messages of an MCAP file as Rerun understands them: a reader that is not Foxglove's."""
+    """Return all messages of an MCAP file, read by Rerun instead of Foxglove's library."""
     return [one for one in _rows(path) if not one.path.startswith("/__")]
 
 
 def moves_of(rows: list[Logged], child: str) -> list[Logged]:
-    """The transforms of a frame of coordinates, in the order of time."""
+    """Return the transforms of a coordinate frame in order of time."""
     key = "Transform3D:child_frame"
     return [one for one in rows if one.values.get(key) == [child]]
 
 
 def drawn_at(rows: list[Logged], topic: str) -> dict[str, Any]:
-    """The lines and labels that a topic holds in the end, by their paths."""
+    """Return the final lines and labels of a topic by path."""
     drawn: dict[str, Any] = {}
     for row in rows:
         if row.path == topic and UPDATE in row.values:
@@ -77,7 +77,7 @@ def drawn_at(rows: list[Logged], topic: str) -> dict[str, Any]:
 
 @dataclass
 class ListWriter:
-    """Keeps what it is given."""
+    """A writer that stores its input."""
 
     moments: list[Moment] = field(default_factory=list)
     gone: list[Collection[SceneEntity]] = field(default_factory=list)
@@ -87,19 +87,19 @@ class ListWriter:
         self.gone.append(gone)
 
     def contents(self, moment: int = -1) -> dict[str, Any]:
-        """Contents of a moment by path."""
+        """Return the contents of a moment by path."""
         return {"/".join(one.path): one.content for one in self.moments[moment].entities}
 
 
 @pytest.fixture(scope="session")
 def walk(building: Path) -> tuple[FrameReference, ...]:
-    """The first frames of a walk through a room, which the map has."""
+    """The first frames of a walk through a room, which are in the map."""
     return find_sequences(building / "room-0" / "seq-01")[0].frames[:WALK]
 
 
 @pytest.fixture(scope="session")
 def unseen(building: Path) -> tuple[FrameReference, ...]:
-    """Frames of the same walk that the map does not have."""
+    """Frames of the same walk that are not in the map."""
     return find_sequences(building / "room-0" / "seq-02")[0].frames[:2]
 
 
@@ -108,7 +108,7 @@ def client(
     service_url: str, walk: tuple[FrameReference, ...], room_frames: tuple[DepthFrame, ...],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Client]:  # fmt: skip
-    """Of a service whose map MAP has a walk in `room`, and a frame in `yard`; only read."""
+    """A read-only client of a service whose map MAP has a walk in `room` and a frame in `yard`."""
     folder, far = tmp_path_factory.mktemp("yard"), room_frames[3]
     assert far.pose is not None
     write_intrinsics(folder, Camera(far.intrinsics))
@@ -129,12 +129,12 @@ def sceneprint(
     service_url: str, client: Client, run_command: Callable[..., Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[..., Any]:  # fmt: skip
-    """Runs a command in this process against the service and checks its exit code."""
+    """A function that runs a command in this process with the service and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_URL", service_url)
     return run_command
 
 
 def moved(T: Any, points: Any) -> Any:
-    """Points by a (4, 4), as text books have it."""
+    """Return points transformed by a (4, 4) matrix."""
     T = np.asarray(T, float)
     return np.asarray(points, float) @ T[:3, :3].T + T[:3, 3]

@@ -36,12 +36,12 @@ from service.app import create_app
 from tests.whole_engine import Engine
 
 BIN = Path(sys.executable).parent
-#: The origin whose pages may ask the server for all tests.
+#: Origin whose pages may use the server.
 FLEET = "https://fleet.example"
 
 
 def members(group: int) -> list[int]:
-    """Processes of a group that still run."""
+    """Return the running processes of a group."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -56,7 +56,7 @@ def members(group: int) -> list[int]:
 
 @dataclass
 class Server:
-    """A command of ours that serves, with all its children, and what it says."""
+    """A serving command with its child processes and its log."""
 
     process: subprocess.Popen[str]
     folder: Path
@@ -68,14 +68,14 @@ class Server:
 
     @property
     def workers(self) -> list[int]:
-        """Worker processes: children that run our code."""
+        """Return the child processes that run our code."""
         lines = {pid: Path(f"/proc/{pid}/cmdline") for pid in members(self.process.pid)}
         return [pid for pid, line in lines.items() if b"spawn_main" in line.read_bytes()]
 
     def log(self, message: str = "") -> list[dict[str, Any]]:
-        """Lines of standard error, or those with a message; each must be JSON."""
+        """Return the JSON lines of standard error, optionally only those with a message."""
         text = self.errors.read_text()
-        # by this mark alone: a name in a line may hold others, such as U+2028
+        # Only this character separates lines: names may contain others, such as U+2028.
         whole = text.split("\n")[:-1]
         try:
             lines = [json.loads(line) for line in whole]
@@ -84,25 +84,25 @@ class Server:
         return [line for line in lines if not message or line["message"] == message]
 
     def ready(self, workers: int = 1) -> None:
-        """Wait until that many workers have begun, in all."""
+        """Wait until `workers` workers have started in total."""
         until(lambda: len(self.log("worker ready")) >= workers)
 
     def tell(self, number: int) -> None:
-        """Send a signal to the command alone."""
+        """Send a signal to the main process only."""
         self.process.send_signal(number)
 
     def end(self, number: int | None = None) -> int:
-        """Exit code, after a signal if one is given."""
+        """Return the exit code, after sending a signal if one is passed."""
         if number is not None:
             self.tell(number)
         return self.process.wait(PATIENCE_S)
 
     def gone(self) -> None:
-        """Wait until no process of the group is left."""
+        """Wait until the group has no process left."""
         until(lambda: not members(self.process.pid))
 
     def kill(self) -> None:
-        """End all of it, whatever state it is in."""
+        """Kill the whole group."""
         self.client.close()
         if members(self.process.pid):
             os.killpg(self.process.pid, signal.SIGKILL)
@@ -113,7 +113,7 @@ class Server:
 
 @pytest.fixture(scope="session")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A certificate of this machine that nobody else vouches for, and its key."""
+    """A self-signed certificate of this machine, and its key."""
     folder = tmp_path_factory.mktemp("certificate")
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
@@ -137,7 +137,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def promised(document: dict[str, Any], answer: httpx.Response) -> None:
-    """Hold an answer to the OpenAPI document: its status and its type are declared."""
+    """Check that the OpenAPI document declares the status and the type of an answer."""
     method, path = answer.request.method.lower(), answer.request.url.path
     for pattern, operations in document["paths"].items():
         if method in operations and re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", pattern), path):
@@ -150,8 +150,8 @@ def promised(document: dict[str, Any], answer: httpx.Response) -> None:
 
 @pytest.fixture(scope="session")
 def starter(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Server]:
-    """See `begin`; with `stack`, the server ends when that does."""
-    document: dict[str, Any] = {}  # of the first: they all have the same, and it takes a while
+    """A function like `begin`; with `stack`, the server ends with the stack."""
+    document: dict[str, Any] = {}  # document of the first server, which all others share
 
     def start(
         stack: ExitStack, *arguments: str, folder: Path | None = None,
@@ -191,14 +191,14 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Server]:
 
 @pytest.fixture(scope="module")
 def begin(starter: Callable[..., Server]) -> Iterator[Callable[..., Server]]:
-    """Start `sceneprint serve` or another command; settings are given as for Settings."""
+    """A function that starts `sceneprint serve` or another command with the passed settings."""
     with ExitStack() as stack:
         yield partial(starter, stack)
 
 
 @pytest.fixture(scope="session")
 def served(starter: Callable[..., Server], folder_stack: ExitStack) -> Server:
-    """One server for all tests that leave it as it was but for maps of their own."""
+    """A server for all tests that change only their own maps."""
     return starter(folder_stack, cors_origins=FLEET, decoders=2)
 
 
@@ -211,7 +211,7 @@ class Shot:
     pose: list[list[float]] | None = None
 
     def form(self, **meta: object) -> dict[str, Any]:
-        """Arguments of a request that uploads it."""
+        """Return the arguments of a request that uploads the frame."""
         known = {"intrinsics": self.camera, **meta}
         parts = {"frame": ("frame.png", self.png, "image/png")}
         return {"files": parts, "data": {"meta": json.dumps(known)}}
@@ -219,7 +219,7 @@ class Shot:
 
 @pytest.fixture(scope="session")
 def shoot(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Shot]:
-    """A depth image of a camera as it is sent."""
+    """A function that returns a depth image as it is sent."""
     path = tmp_path_factory.mktemp("png") / "frame.png"
 
     def of(depth: Floats32, intrinsics: Intrinsics, pose: Any = None) -> Shot:
@@ -241,7 +241,7 @@ def shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot]) -> li
 
 @pytest.fixture(scope="session")
 def small_shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
-    """96 small frames: every fourth sample from each of 16 corners of each of six views."""
+    """96 small frames: every fourth sample from each of 16 offsets of each of six views."""
     found = []
     for frame in room_frames:
         k = frame.intrinsics
@@ -255,7 +255,7 @@ def small_shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot])
 
 @pytest.fixture(scope="session")
 def make_map() -> Callable[..., str]:
-    """Make a map on a server; its path is returned."""
+    """A function that creates a map on a server and returns its path."""
 
     def make(server: Server, name: str, model: str = "depth") -> str:
         made = server.client.post("/v1/maps", json={"name": name, "model": model})
@@ -267,7 +267,7 @@ def make_map() -> Callable[..., str]:
 
 @pytest.fixture(scope="session")
 def refused() -> Callable[..., dict[str, Any]]:
-    """Check that an answer is a problem document and as we write them; return it."""
+    """A function that checks an answer's problem document and returns it."""
 
     def check(answer: httpx.Response, status: int, kind: str, text: str = "") -> dict[str, Any]:
         assert answer.status_code == status, answer.text
@@ -286,13 +286,13 @@ def refused() -> Callable[..., dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Walled:
-    """A server that asks for keys, with some that were made on its folder."""
+    """A server that requires keys, with some keys."""
 
     server: Server
     secrets: dict[str, str]
 
     def ask(self, key: str, method: str, path: str, **request: Any) -> httpx.Response:
-        """A request with the secret of a key."""
+        """Send a request with a key."""
         headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
         return self.server.client.request(method, path, headers=headers, **request)
 
@@ -302,7 +302,7 @@ def _walled(
     **settings: object,
 ) -> Walled:  # fmt: skip
     server = begin("--host", "0.0.0.0", *arguments, **settings)
-    # the address that is printed is that of every interface; asked from here it is this one
+    # The printed address is that of all interfaces.
     server.client.base_url = server.url = server.url.replace("0.0.0.0", "127.0.0.1")
     with Engine(Settings(data_dir=server.folder, database_url=None)) as engine:
         made = {name: engine.create_key(name, grants) for name, grants in keys.items()}
@@ -311,14 +311,15 @@ def _walled(
 
 @pytest.fixture(scope="module")
 def wall(begin: Callable[..., Server]) -> Callable[..., Walled]:
-    """Begin a server that asks for keys; what each may do is given by its name."""
+    """A function that starts a server with keys, whose grants follow from their names."""
     return partial(_walled, begin)
 
 
 @pytest.fixture(scope="session")
 def walled(starter: Callable[..., Server], folder_stack: ExitStack) -> Walled:
-    """One server that asks for keys, for all tests that leave it as it was but for maps of their
-    own; `alpha` and `bravo` are those of test_isolation.
+    """A server that requires keys, for all tests that change only their own maps.
+
+    Its maps `alpha` and `bravo` belong to test_isolation.
     """
     keys = {
         "boss": {"*": "admin"}, "watcher": {"*": "read"}, "keeper": {"bravo": "admin"},
@@ -330,12 +331,12 @@ def walled(starter: Callable[..., Server], folder_stack: ExitStack) -> Walled:
 
 @dataclass
 class House:
-    """A service without workers, whose jobs are done here, its engine, and keys to it.
+    """A service without workers, with its engine and keys; this process runs its jobs.
 
     Parameters
     ----------
-    client, portal, engine : of the service, which runs in a thread of its own
-    secrets : of the keys
+    client, portal, engine : access to the service, which runs in its own thread
+    secrets : secrets of the keys
     """
 
     client: httpx.AsyncClient
@@ -350,7 +351,7 @@ class House:
         return answer
 
     def work(self) -> None:
-        """Do all jobs that wait."""
+        """Run all queued jobs."""
         while (work := self.engine.claim("here:1")) is not None:
             self.engine.run(work)
 
@@ -382,7 +383,7 @@ def _opened(
 
 @pytest.fixture(scope="session")
 def open_house() -> Callable[..., Any]:
-    """Opens a service in a folder, on SQLite where no database is given, with some keys."""
+    """A function that opens a service with keys in a folder, by default on SQLite."""
     return _opened
 
 

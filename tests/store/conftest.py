@@ -22,8 +22,7 @@ from sceneprint_client.api import JobState
 
 MODEL = "ab" * 32
 
-#: Imports once, then lets children loose at one moment: they are processes of their own, and
-#: what they return comes back as JSON, or the name and text of what they raised.
+#: Script that starts processes at once, and returns results as JSON, or errors as name and text.
 NURSERY = """
 import json, sys
 from multiprocessing import get_context
@@ -57,7 +56,7 @@ for line in sys.stdin:
 
 @pytest.fixture(scope="session")
 def race() -> Iterator[Callable[..., list[Any]]]:
-    """Run `work(i)` of some code in that many processes at once; ARGS are what it is given."""
+    """A function that runs `work(i)` of a script in several processes at once with ARGS."""
     nursery = subprocess.Popen(
         [sys.executable, "-c", NURSERY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -77,7 +76,7 @@ def race() -> Iterator[Callable[..., list[Any]]]:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run a test of a database on both; those of what only SQLite has, on that alone."""
+    """Run a database test on both databases, or only on SQLite if it concerns SQLite."""
     if "url" in metafunc.fixturenames:
         marked = metafunc.definition.get_closest_marker("sqlite_only") is not None
         alone = marked or "plans" in metafunc.fixturenames
@@ -87,18 +86,20 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(scope="session")
 def empty_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A SQLite file with the schema of this version, to be copied: making it takes longer."""
+    """An empty SQLite file with the current schema, since copying is faster than creating."""
     path = tmp_path_factory.mktemp("empty") / "truth.db"
     open_database(f"sqlite:///{path}").close()
-    assert [one.name for one in path.parent.iterdir()] == [path.name]  # nothing is in its log
+    assert [one.name for one in path.parent.iterdir()] == [path.name]  # the log is empty
     return path
 
 
 @pytest.fixture
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """A new database; on the server it has the schema already."""
+    """URL of a new database; on a server it already has the schema."""
     if request.param == "postgresql":
-        (tmp_path / "blobs").mkdir()  # that of a database that is there is not made up for
+        (
+            tmp_path / "blobs"
+        ).mkdir()  # the store does not create the folder for an existing database
         return str(request.getfixturevalue("postgres_url"))
     return f"sqlite:///{tmp_path / 'truth.db'}"
 
@@ -123,7 +124,7 @@ def hall(store: Store) -> MapRow:
 
 @pytest.fixture
 def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
-    """Insert a frame; what is not given is like that of any other."""
+    """A function that inserts a frame with default fields."""
 
     def add(
         content: str, row: MapRow = hall, frame_id: str | None = None,
@@ -145,7 +146,7 @@ def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
 
 @pytest.fixture
 def queued(store: Store, received: Callable[..., FrameRow]) -> Callable[..., JobRow]:
-    """Queue a job for a frame of its own."""
+    """A function that queues a job for a new frame."""
 
     def add(name: str, priority: int = 0) -> JobRow:
         frame = received(name)
@@ -157,7 +158,7 @@ def queued(store: Store, received: Callable[..., FrameRow]) -> Callable[..., Job
 
 @pytest.fixture
 def turned(store: Store) -> Callable[..., None]:
-    """Write columns of a job, such as a lease that is over: no test waits for one."""
+    """A function that sets columns of a job, such as an expired lease."""
 
     def write(job: JobRow, **values: object) -> None:
         with store.database.write() as connection:
@@ -167,7 +168,7 @@ def turned(store: Store) -> Callable[..., None]:
 
 
 class Hand:
-    """A worker's hand at the queue."""
+    """A worker's access to the queue."""
 
     def __init__(self, store: Store) -> None:
         self.database = store.database
@@ -201,7 +202,7 @@ def hand(store: Store) -> Hand:
 
 @pytest.fixture(scope="session")
 def plans() -> Callable[[Connection], AbstractContextManager[list[str]]]:
-    """How SQLite goes about every statement of a connection, while it is looked at."""
+    """A context that returns SQLite's query plans of all statements of a connection."""
 
     @contextmanager
     def looked_at(connection: Connection) -> Iterator[list[str]]:
@@ -220,7 +221,7 @@ def plans() -> Callable[[Connection], AbstractContextManager[list[str]]]:
 
 @pytest.fixture(scope="session")
 def opens() -> str:
-    """Code for `race`: opens the database of a URL, and tells the schema that it then has."""
+    """Code for `race` that opens the database of a URL and returns its schema version."""
     return """
 from sceneprint.store import open_database
 from sqlalchemy import text

@@ -20,12 +20,12 @@ from sceneprint.settings import Settings
 from sceneprint_client.api import Added, FrameMeta, NewMap
 from tests.whole_engine import Engine
 
-LEASE_S = 1.5  # a busy machine renews one late at times
+LEASE_S = 1.5  # a busy machine sometimes renews a lease late
 
 
 @dataclass
 class Crew:
-    """Two worker processes, a store, and this process as the service would be."""
+    """Two worker processes and a store; this process acts as the service."""
 
     engine: Engine
     errors: Path
@@ -53,12 +53,12 @@ class Crew:
         return row
 
     def pid(self, job_id: str) -> int:
-        """Of the worker that holds, or held last, a job."""
+        """Return the process id of the worker that holds or last held a job."""
         (worker,) = self.job(job_id, "worker")
         return int(worker.rpartition(":")[2]) if worker else 0
 
     def signed(self, map_name: str) -> list[int]:
-        """How many signatures each frame of a map has."""
+        """Return the number of signatures of each frame of a map."""
         asked = (
             "SELECT count(*) FROM signatures s JOIN frames f ON f.number = s.frame_number "
             f"JOIN maps m ON m.number = f.map_number AND m.name = '{map_name}' GROUP BY f.number"
@@ -66,19 +66,19 @@ class Crew:
         return [count for (count,) in self.rows(asked)]
 
     def pause(self) -> None:
-        """Stop both workers, while neither can be in the middle of a write: others would wait."""
+        """Stop both workers while neither is writing, since its lock would block others."""
         with self.engine.store.database.write():
             self.send(signal.SIGSTOP)
 
     def send(self, number: int, workers: int = 2) -> None:
-        """A signal to both workers, or to the first."""
+        """Send a signal to both workers or to the first one."""
         for line in self.log("worker ready")[:workers]:
             os.kill(int(line["worker"].rpartition(":")[2]), number)
 
 
 @pytest.fixture(scope="module")
 def frames(room_frames, small_image) -> list[tuple[bytes, FrameMeta]]:
-    """Small frames of their own content: from another corner each."""
+    """Small frames with different content, from different offsets."""
     found = []
     for number in range(64):
         data, lens = small_image(room_frames[number // 16], *divmod(number % 16, 4))
@@ -88,7 +88,7 @@ def frames(room_frames, small_image) -> list[tuple[bytes, FrameMeta]]:
 
 @pytest.fixture(scope="session")
 def hire(tmp_path_factory) -> Callable[..., AbstractContextManager[Crew]]:
-    """Run a command that keeps two workers, on a store of its own with the map `warm`."""
+    """A function that runs a command with two workers on a separate store with the map `warm`."""
 
     @contextmanager
     def run(command: list[str], **settings: object) -> Iterator[Crew]:
@@ -126,7 +126,7 @@ def crew(hire) -> Iterator[Crew]:
 
 @dataclass
 class Slow:
-    """A frame whose bytes come from a pipe, as from a disk that takes its time."""
+    """A frame whose bytes come from a pipe, like those of a slow disk."""
 
     added: Added
     path: Path
@@ -134,7 +134,7 @@ class Slow:
     data: bytes
 
     def give(self) -> None:
-        """Let the one that reads the pipe have all of it."""
+        """Write all bytes for the reader of the pipe."""
         opened = until(self._opened)
         assert os.write(opened, self.data) == len(self.data)
         os.close(opened)
@@ -143,10 +143,10 @@ class Slow:
         try:
             return os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK)
         except OSError:
-            return 0  # nobody reads yet
+            return 0  # the pipe has no reader yet
 
     def mend(self) -> None:
-        """Let whoever reads from now on have a file."""
+        """Replace the pipe by a file for later readers."""
         other = self.path.with_suffix(".mended")
         other.write_bytes(self.data)
         other.replace(self.path)
@@ -154,7 +154,7 @@ class Slow:
 
 @pytest.fixture
 def slow(crew, frames) -> Callable[[str, int], Slow]:
-    """Upload a frame whose blob is a pipe before any worker looks."""
+    """A function that uploads a frame whose blob is a pipe, before any worker claims it."""
 
     def make(name: str, number: int) -> Slow:
         crew.engine.create_map(NewMap(name=name, model="depth"))

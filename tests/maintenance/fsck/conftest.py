@@ -24,7 +24,7 @@ from sceneprint.types import DepthFrame
 from sceneprint_client.api import FrameMeta, GivenPose, JobState, Query
 from tests.whole_engine import Engine
 
-#: Frames of `hall`, all signed; the first index holds half of them, the second all.
+#: Number of frames of `hall`, all signed; the first index holds half of them, the second all.
 HALL = 12
 
 
@@ -37,7 +37,7 @@ class Upload:
 
 
 class House:
-    """A data folder and a cache folder in one place, and what happens to them."""
+    """A data folder with its cache folder, and actions on them."""
 
     def __init__(self, place: Path) -> None:
         self.place, self.data = place, place / "data"
@@ -54,7 +54,7 @@ class House:
         return list(fsck(self.settings, **how))
 
     def files(self) -> dict[str, int | None]:
-        """Checksum of every file, and every folder."""
+        """Return the checksum of every file, and the names of folders."""
         return {
             str(path.relative_to(self.place)): (
                 zlib.crc32(path.read_bytes()) if path.is_file() else None
@@ -63,7 +63,7 @@ class House:
         }
 
     def sql(self, asked: str, *values: object) -> list[tuple[Any, ...]]:
-        """Ask or change the database past what it would refuse, and leave no log behind."""
+        """Query or change the database without its checks, and without a log."""
         if self.is_sqlite:
             with closing(sqlite3.connect(self.data / "sceneprint.db")) as database:
                 found = database.execute(asked, values).fetchall()
@@ -79,7 +79,7 @@ class House:
         return self.data / "blobs" / digest[:2] / digest
 
     def index_files(self, kind: str) -> list[Path]:
-        """The files of a kind of the newest version of `hall`, or its manifest."""
+        """Return files of a kind of the newest version of `hall`, or its manifest."""
         manifest = max((self.data / "index").glob("hall*/*.json"))
         if kind == "json":
             return [manifest]
@@ -87,7 +87,7 @@ class House:
         return [path for path in manifest.parent.glob(f"*.{kind}") if path.name in named]
 
     def damage(self, path: Path, condition: str = "damaged", at: int = 7, bit: int = 0) -> bytes:
-        """Flip a bit of a file, or remove it; return the bytes that are left."""
+        """Flip a bit of a file or remove it; return the remaining bytes."""
         data = bytearray(path.read_bytes())
         data[at] ^= 1 << bit
         path.unlink()
@@ -99,7 +99,7 @@ class House:
         return [path.read_bytes() for path in self.data.glob("quarantine/*")]
 
     def work(self) -> list[JobState | None]:
-        """Do all jobs, and publish what is due."""
+        """Run all jobs, and publish due indexes."""
         with Engine(self.settings) as engine:
             states = []
             while (claimed := engine.claim("w")) is not None:
@@ -108,7 +108,7 @@ class House:
         return states
 
     def answers(self, uploads: list[Upload], without: str = "") -> list[Any]:
-        """What `hall` answers, without what no two answers share, and without a frame."""
+        """Return the answers of `hall` without a frame and without parts that always differ."""
         found = []
         with Engine(self.settings) as engine:
             for each in uploads:
@@ -122,7 +122,7 @@ class House:
 
 @pytest.fixture(scope="session")
 def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Upload]:
-    """24 small frames with poses: from each of four corners of six views."""
+    """24 small frames with poses, from four offsets of each of six views."""
     found = []
     for number, frame in enumerate(room_frames):
         assert frame.pose is not None
@@ -139,8 +139,9 @@ def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]
 def master(
     uploads: list[Upload], small_whitened: Model, tmp_path_factory: pytest.TempPathFactory
 ) -> House:
-    """`hall` with two versions of its index; `attic` with a signed frame, a deleted, one that
-    waits. Not to be changed.
+    """A read-only store: `hall` with two versions of its index, and `attic`.
+
+    `attic` has a signed frame, a deleted one and a waiting one.
     """
     house = House(tmp_path_factory.mktemp("master"))
     open_table(small_whitened, house.settings.cache_dir)
@@ -170,7 +171,7 @@ def master(
 
 @pytest.fixture(scope="session")
 def copied(master: House) -> Callable[[Path], House]:
-    """A copy of `master` in another place, to be changed."""
+    """A function that returns a writable copy of `master`."""
 
     def copy(place: Path) -> House:
         shutil.copytree(master.place, place)
@@ -186,5 +187,5 @@ def house(copied: Callable[[Path], House], tmp_path: Path) -> House:
 
 @pytest.fixture(scope="session")
 def truth(master: House, copied: Any, uploads: Any, tmp_path_factory: Any) -> list[Any]:
-    """What `hall` answers where nothing is wrong."""
+    """The answers of the undamaged `hall`."""
     return copied(tmp_path_factory.mktemp("truth") / "house").answers(uploads[:HALL])
