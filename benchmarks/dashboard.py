@@ -113,20 +113,20 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
             f"{max(one.code for one in first) / 1000:.1f} kB", "35 kB"
         ),
         f"overlay of {clouds['size']:,} points ready": (_seconds(both), "1.2 s"),
-        "all that came for it": (_size(both), "700 kB"),
-        "drawing it, {} x {}, antialiased".format(*CANVAS): (_drawing(clouds), "150 ms"),
-        "drawn again in a second without a change": (clouds["idle"], "0"),
+        "total transfer for the overlay": (_size(both), "700 kB"),
+        "drawing the overlay, {} x {}, antialiased".format(*CANVAS): (_drawing(clouds), "150 ms"),
+        "drawings per second without a change": (clouds["idle"], "0"),
         f"the place, {surface['size']:,} cells, drawn": (_seconds(places), "1.5 s"),
-        "all that came for the place": (_size(places), ""),
+        "total transfer for the place": (_size(places), ""),
         "drawing the place, {} x {}".format(*CANVAS): (_drawing(surface), "50 ms"),
-        "place drawn again in a second without a change": (surface["idle"], "0"),
-        f"first page of {frames:,} frames, with its pictures": (_seconds(gallery), ""),
-        "all that came for the first page": (_size(gallery), ""),
-        "requests elsewhere, violations, errors in the console": (faults, "0"),
+        "drawings of the place per second without a change": (surface["idle"], "0"),
+        f"first page of {frames:,} frames, with pictures": (_seconds(gallery), ""),
+        "total transfer for the first page": (_size(gallery), ""),
+        "requests to other hosts, policy violations, console errors": (faults, "0"),
     }  # fmt: skip
     return [
         *lines,
-        f"Without a window or a graphics card (SwiftShader), cache empty, median of {runs}; "
+        f"Headless, without a graphics card (SwiftShader), cache empty, median of {runs}; "
         "service and browser share the processors.",
         "", "| | measured | bound |", "|---|--:|--:|",
         *(f"| {what} | {value} | {aim} |" for what, (value, aim) in rows.items()), "",

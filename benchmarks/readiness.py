@@ -65,13 +65,13 @@ def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[st
         signed = {n: _sign(Path(folder) / f"by-{n}", to_sign, n) for n in (1, 2)}
     length = read_model("depth").signature_bytes
     return [
-        f"### A service with {FRAMES:,} frames of {length:,} bytes starts", "", "| | s, MB |",
-        "|---|--:|", f"| until it answers | {ready:.1f} |",
+        f"### Start of a service with {FRAMES:,} frames of {length:,} bytes", "", "| | s, MB |",
+        "|---|--:|", f"| until it is ready | {ready:.1f} |",
         f"| until the first query is answered | {first:.1f} |",
-        f"| the same with its index deleted, from the database, exactly | {bare:.1f} |",
-        f"| its own memory then | {memory:.0f} |",
-        f"| the same without its index | {bare_memory:.0f} |", "",
-        f"One worker signs {signed[1]:.1f} frames a second, two {signed[2]:.1f}: "
+        f"| until the first exact answer without an index | {bare:.1f} |",
+        f"| private memory after that | {memory:.0f} |",
+        f"| private memory without an index | {bare_memory:.0f} |", "",
+        f"One worker signs {signed[1]:.1f} frames per second, two sign {signed[2]:.1f}: "
         f"**{signed[2] / signed[1]:.2f}** times as many.",
         "",
     ]  # fmt: skip
@@ -122,7 +122,7 @@ def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
     frames : at least four frames; the first quarter creates the database
     """
     lines = [
-        "### Disk a frame, beside the index; bytes", "",
+        "### Disk use per frame without the index, bytes", "",
         "| signature | rows of the database | upload | geometry artifact |", "|--:|--:|--:|--:|",
     ]  # fmt: skip
     first = max(len(frames) // 4, 1)

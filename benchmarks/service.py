@@ -87,10 +87,10 @@ def measure(
         f"| /healthz, idle: p50, p99 | {idle[0]:.1f}, {idle[1]:.1f} |",
         f"| /healthz while {CLIENTS} clients query and a worker signs: p50, p99 | "
         f"{loaded[0]:.1f}, {loaded[1]:.1f} |",
-        "", f"Queries answered meanwhile: {sum(map(len, meanwhile)) / SECONDS:.1f} a second.", "",
-        "| clients at once | queries a second | p50, ms | p99, ms | slowest client / mean |",
+        "", f"Answered queries: {sum(map(len, meanwhile)) / SECONDS:.1f} per second.", "",
+        "| concurrent clients | queries per second | p50, ms | p99, ms | slowest client / mean |",
         "|--:|--:|--:|--:|--:|", *(_row(n, crowd) for n, crowd in crowds.items()), "",
-        f"{CROWD} clients are answered **{rates[CROWD] / rates[1]:.2f}** times as often as one.",
+        f"{CROWD} clients receive **{rates[CROWD] / rates[1]:.2f}** times as many answers as one.",
         "",
     ]  # fmt: skip
 

@@ -57,13 +57,13 @@ def description(figures: SoakFigures) -> Iterator[str]:
             yield sentence.format(_TIMES.get(kills[victim], f"{kills[victim]} times"))
     if plan.retention_s is not None:
         yield (
-            f"Three of four robots have maps that keep a frame for {plan.retention_s:g} s, so that "
-            "frames go as fast as they come."
+            f"The maps of three in four robots delete frames after {plan.retention_s:g} s, as fast "
+            "as new frames arrive."
         )
     if plan.count("offline-hour"):
         yield (
-            "One more robot was offline for a simulated hour, at one frame every ten seconds; its "
-            f"{figures.spooled} frames were spooled at once."
+            "Another robot was offline for a simulated hour with a frame every ten seconds; its "
+            f"{figures.spooled} frames were spooled at the start."
         )
 
 
@@ -79,10 +79,11 @@ def rows(figures: SoakFigures) -> dict[str, str]:
     """Return the rows of the table: labels and figures."""
     plan, found = figures.plan, figures.found
     figure_of = {
-        "frames acknowledged, and those that robots deleted again":
+        "acknowledged frames, and frames that robots deleted":
             f"{found.acknowledged + figures.deleted}, {figures.deleted}",
-        "of the rest indexed, or in a state that says why not": f"{found.indexed}, {found.stated}",
-        "of the indexed, looked up by a query of themselves, found":
+        "of the others: indexed, not indexed for a stated reason":
+            f"{found.indexed}, {found.stated}",
+        "of the indexed: queried with their own content, found":
             f"{found.looked_up}, {found.found}",
         "**lost**": f"**{figures.lost}**",
     }  # fmt: skip
@@ -90,35 +91,35 @@ def rows(figures: SoakFigures) -> dict[str, str]:
         figure_of["deleted by retention, with an event"] = f"{found.aged}"
     if plan.count("offline-hour"):
         sent = f"{figures.spooled}, {figures.spooled_twice}"
-        figure_of["frames of the robot that was offline, and those sent again"] = sent
+        figure_of["frames of the offline robot, frames sent again"] = sent
     if plan.asynchronous:
         figure_of[
-            "acknowledged, and not received by the standby when its primary died: missing, of "
-            "those that only the dead primary has"
+            "acknowledged frames that the standby had not received: missing, of frames that only "
+            "the dead primary has"
         ] = f"{len(found.missing)}, {figures.window}"
     figure_of |= {
-        "**stored twice; stored, and not acknowledged; back after a deletion**":
+        "**stored twice, stored without acknowledgement, restored after deletion**":
             f"**{found.doubled}, {found.strangers}, {found.returned}**",
-        "**changes without their event or line of the audit log**": f"**{found.separated}**",
-        "**half-written, by `sceneprint fsck`**": f"**{figures.damaged}**",
-        "files that nothing refers to (fsck removes them)": f"{figures.leftovers}",
-        "events of frames that were not heard, or heard twice":
+        "**changes without their event or audit entry**": f"**{found.separated}**",
+        "**damages found by `sceneprint fsck`**": f"**{figures.damaged}**",
+        "unreferenced files (`sceneprint fsck` removes them)": f"{figures.leftovers}",
+        "events of frames: not received, received twice":
             f"{found.unheard}, {found.heard_twice}",
-        "answers and lists that differ between the services": f"{found.disagreeing}",
-        "**searches with a wrong distance, order or match**, of":
+        "answers and lists that differ between services": f"{found.disagreeing}",
+        "**searches with a wrong distance, order or match**, all searches":
             f"**{len(found.wrong)}**, {found.searches:,}",
-        "queries answered, requests sent again, errors":
+        "answered queries, repeated requests, errors":
             f"{figures.queries}, {figures.repeated}, {len(figures.faults)}",
     }  # fmt: skip
     for kind, (p50, p99) in figures.waits_ms.items():
         figure_of[f"{kind}: median, p99"] = f"{p50:,.0f}, {p99:,.0f} ms"
     if plan.store == "postgresql":
         turns = "{:.1f}, {:.1f} ms".format(*figures.turn_ms)
-        figure_of["of a frame, all writers wait for one; those of its map do"] = turns
+        figure_of["time that a frame blocks all writers, writers of its map"] = turns
     else:
         figure_of['**"database is locked"**'] = f"**{figures.locked}**"
     service, worker = (one / 1e6 for one in figures.memory)
-    figure_of["most memory of a service's process, of a worker's"] = (
+    figure_of["peak memory of a service process, of a worker process"] = (
         f"{service:,.0f}, {worker:,.0f} MB"
     )
     return figure_of
@@ -129,7 +130,7 @@ def table(figures: SoakFigures) -> list[str]:
     lines = [f"### {title(figures.plan)}", "", *description(figures), "", "| | |", "|---|--:|"]
     lines += [f"| {what} | {value} |" for what, value in rows(figures).items()]
     if figures.outages:
-        lines += ["", "| fault | longest that a client had no answer, s |", "|---|--:|"]
+        lines += ["", "| fault | longest time without an answer, s |", "|---|--:|"]
     for victim, waits in sorted(figures.outages.items()):
         waited = [f"{one:.1f}" for one in sorted(waits) if one >= 0.05]
         lines.append(f"| {victim}, {len(waits)} | {', '.join(waited) or '0.0'} |")
@@ -145,7 +146,7 @@ def table(figures: SoakFigures) -> list[str]:
     if figures.operations:
         lines += operation_table(figures.operations)
     if figures.attacks:
-        lines += ["### One tenant attacks while others work", "", *attack_table(figures.attacks)]
+        lines += ["### Attacks by one tenant while others work", "", *attack_table(figures.attacks)]
     return [*lines, ""]
 
 
