@@ -42,7 +42,7 @@ def chromium(path: str) -> Iterator[Browser]:
             browser.close()
 
 
-def watched(page: Page) -> Page:
+def watch_page(page: Page) -> Page:
     """Make a page record the time at which it settles, for `settled`."""
     page.add_init_script(_WATCH)
     return page

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from benchmarks.chromium import chromium, installed, settled, until, watched
+from benchmarks.chromium import chromium, installed, settled, until, watch_page
 from benchmarks.rooms import Shot, fuse, multiply, send, shots, wait
 from sceneprint_lab.cli.demo import serving
 
@@ -96,10 +96,10 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
             first = [_load(browser, home, _is_usable) for _ in range(runs)]
             slow = [_load(browser, home, _is_usable, slow=True) for _ in range(runs)]
             overlay = home + _overlay(client, views)
-            both = [_load(browser, overlay, _marked("overlay")) for _ in range(runs)]
+            both = [_load(browser, overlay, _until_mark("overlay")) for _ in range(runs)]
             clouds = _draw(browser, overlay, "overlay", "canvas.overlay-canvas", _POINTS)
             place = f"{home}#/maps/{MAP}/place"
-            places = [_load(browser, place, _marked("place")) for _ in range(runs)]
+            places = [_load(browser, place, _until_mark("place")) for _ in range(runs)]
             surface = _draw(browser, place, "place", "canvas.paths-canvas", _CELLS)
         multiply(data, MAP, LARGE, frames)
         with serving(data, workers=0) as url:
@@ -114,11 +114,11 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
         ),
         f"overlay of {clouds['size']:,} points ready": (_seconds(both), "1.2 s"),
         "total transfer for the overlay": (_size(both), "700 kB"),
-        "drawing the overlay, {} x {}, antialiased".format(*CANVAS): (_drawing(clouds), "150 ms"),
+        "drawing the overlay, {} x {}, antialiased".format(*CANVAS): (_draw_time(clouds), "150 ms"),
         "drawings per second without a change": (clouds["idle"], "0"),
         f"the place, {surface['size']:,} cells, drawn": (_seconds(places), "1.5 s"),
         "total transfer for the place": (_size(places), ""),
-        "drawing the place, {} x {}".format(*CANVAS): (_drawing(surface), "50 ms"),
+        "drawing the place, {} x {}".format(*CANVAS): (_draw_time(surface), "50 ms"),
         "drawings of the place per second without a change": (surface["idle"], "0"),
         f"first page of {frames:,} frames, with pictures": (_seconds(gallery), ""),
         "total transfer for the first page": (_size(gallery), ""),
@@ -155,7 +155,7 @@ def _is_usable(page: Page) -> float:
     return when
 
 
-def _marked(name: str) -> Callable[[Page], float]:
+def _until_mark(name: str) -> Callable[[Page], float]:
     return lambda page: float(until(page, _MARKED.format(name)))
 
 
@@ -174,10 +174,10 @@ def _load(
     """Load a page in a new context, whose cache is empty."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     try:
-        page = watched(context.new_page())
+        page = watch_page(context.new_page())
         faults: list[str] = []
         came: list[Any] = []
-        page.on("console", lambda one: _hear(faults, one))
+        page.on("console", lambda one: _record_message(faults, one))
         page.on("pageerror", lambda one: faults.append(str(one)))
         page.on("requestfinished", lambda one: came.append(one))
         if slow:
@@ -200,7 +200,7 @@ def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> 
     """Draw a canvas repeatedly; `size` is an expression for the number of drawn points or cells."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     try:
-        page = watched(context.new_page())
+        page = watch_page(context.new_page())
         page.goto(address)
         until(page, _MARKED.format(mark))
         settled(page)
@@ -213,7 +213,7 @@ def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> 
         context.close()
 
 
-def _hear(faults: list[str], message: Any) -> None:
+def _record_message(faults: list[str], message: Any) -> None:
     # Without a graphics card, Chromium itself warns that reading drawn pixels is slow.
     if message.type in ("error", "warning") and "GL Driver Message" not in message.text:
         faults.append(message.text)
@@ -227,5 +227,5 @@ def _size(loads: Sequence[Load]) -> str:
     return f"{statistics.median(one.bytes for one in loads) / 1000:.0f} kB"
 
 
-def _drawing(drawn: dict[str, Any]) -> str:
+def _draw_time(drawn: dict[str, Any]) -> str:
     return f"{statistics.median(drawn['taken']):.0f} ms"

@@ -113,7 +113,7 @@ class Server:
         if self.is_running:
             return
         settings = {**self._options, "port": str(self.port)}
-        command = [*of_nobody(), str(self._bin / "postgres"), "-D", str(self.data)]
+        command = [*nobody_prefix(), str(self._bin / "postgres"), "-D", str(self.data)]
         command += [part for item in settings.items() for part in ("-c", "=".join(item))]
         (self.data / "postmaster.pid").unlink(missing_ok=True)  # left by a killed server
         with self.log.open("ab") as log:
@@ -251,14 +251,14 @@ class Server:
 
     def _run(self, name: str, *arguments: str) -> None:
         done = subprocess.run(
-            [*of_nobody(), str(self._bin / name), *arguments],
+            [*nobody_prefix(), str(self._bin / name), *arguments],
             capture_output=True, text=True, env=_environment(), cwd="/", check=False,
         )  # fmt: skip
         if done.returncode != 0:
             raise NoServer(f"{name}: {done.stderr.strip() or done.stdout.strip()}")
 
 
-def of_nobody() -> tuple[str, ...]:
+def nobody_prefix() -> tuple[str, ...]:
     """Return the command prefix for programs that root must not run, such as PostgreSQL."""
     return _AS_NOBODY if os.geteuid() == 0 else ()
 

@@ -59,10 +59,10 @@ def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[st
     with TemporaryDirectory() as folder:
         data = Path(folder) / "large"
         fill_map(data, FRAMES, "depth")
-        ready, first, memory = _start(data, frame)
+        ready, first, memory = _start_times(data, frame)
         shutil.rmtree(data / "index")
-        _, bare, bare_memory = _start(data, frame)
-        signed = {n: _sign(Path(folder) / f"by-{n}", to_sign, n) for n in (1, 2)}
+        _, bare, bare_memory = _start_times(data, frame)
+        signed = {n: _signing_rate(Path(folder) / f"by-{n}", to_sign, n) for n in (1, 2)}
     length = read_model("depth").signature_bytes
     return [
         f"### Start of a service with {FRAMES:,} frames of {length:,} bytes", "", "| | s, MB |",
@@ -77,7 +77,7 @@ def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[st
     ]  # fmt: skip
 
 
-def _start(data: Path, frame: FrameReference) -> tuple[float, float, float]:
+def _start_times(data: Path, frame: FrameReference) -> tuple[float, float, float]:
     """Return the seconds until the service is ready and has answered a query, and its memory."""
     begun = time.perf_counter()
     with serving(data, workers=0) as url, Client(url) as client:
@@ -89,7 +89,7 @@ def _start(data: Path, frame: FrameReference) -> tuple[float, float, float]:
         return ready, first, sum_over_processes(own_bytes, data, "serve") / 1e6
 
 
-def _sign(data: Path, frames: Sequence[FrameReference], n: int) -> float:
+def _signing_rate(data: Path, frames: Sequence[FrameReference], n: int) -> float:
     """Return the frames per second that `n` workers sign once all of them have started."""
     if len(frames) <= 16:
         raise ValueError(f"{len(frames)} frames are too few to time two workers.")
@@ -141,7 +141,7 @@ def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
                 blobs = [
                     one.stat().st_size for one in (folder / "blobs").rglob("*") if one.is_file()
                 ]
-                sizes.append((_used(folder / "sceneprint.db"), sum(blobs)))
+                sizes.append((_used_bytes(folder / "sceneprint.db"), sum(blobs)))
         rows, written = np.subtract(sizes[1], sizes[0])
         lines.append(
             f"| {read_model(model).signature_bytes:,} | {rows / n:,.0f} | {uploads / n:,.0f} "
@@ -150,7 +150,7 @@ def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
     return [*lines, ""]
 
 
-def _used(database: Path) -> int:
+def _used_bytes(database: Path) -> int:
     """Return the bytes of the used pages of a database, in its file or its log."""
     with closing(sqlite3.connect(database)) as connection:
         count, free, size = (

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import httpx
 from tqdm import tqdm
 
-from benchmarks.chromium import chromium, installed, settled, watched
+from benchmarks.chromium import chromium, installed, settled, watch_page
 from benchmarks.rooms import Shot, box, circled, fuse, scans, send, shots, wait
 from benchmarks.waiting import PATIENCE_S, until
 from sceneprint_lab.cli.demo import serving
@@ -242,7 +242,7 @@ def take_picture(browser: Any, url: str, view: View, theme: str, path: Path) -> 
     )  # fmt: skip
     context.set_default_timeout(1000 * PATIENCE_S)
     try:
-        page = watched(context.new_page())
+        page = watch_page(context.new_page())
         if view.key is not None:
             page.add_init_script(f"sessionStorage.setItem('sceneprint.key', '{view.key}')")
         page.goto(f"{url}/dashboard{'#/' if view.gone else view.address}")

@@ -105,7 +105,7 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
         folder = Path(name) / "index"
         folder.mkdir()
         version = whole.run("publish", lambda: published(folder, None, 0, frames))
-        opened, held, shared = _probed(folder, queries)
+        opened, held, shared = _probe_memory(folder, queries)
         grown = frames + 1000
         whole.run("append", lambda: published(folder, version, frames, grown))
         rows: dict[str, Callable[[Bytes], object]] = {
@@ -144,7 +144,7 @@ def table() -> list[str]:
     ]  # fmt: skip
 
 
-def _probed(folder: Path, queries: Bytes) -> list[float]:
+def _probe_memory(folder: Path, queries: Bytes) -> list[float]:
     file = folder.parent / "queries.npy"
     np.save(file, queries)
     command = [sys.executable, "-c", _PROBE, str(folder), str(file)]

@@ -51,14 +51,14 @@ def join(client: Client, bags: tuple[Path, Path]) -> Floats | None:
     result = found.result
     print(f"{result.edges} pairs of frames show one place; {result.inconsistent} were outvoted")
     for one in result.joins:  # a join for each pair of parent frames
-        T_first_second = tell(one)
+        T_first_second = print_join(one)
         if T_first_second is not None:
             return T_first_second
     print("not enough overlap: drive the second robot along the path of the first")
     return None
 
 
-def tell(one: Join) -> Floats | None:
+def print_join(one: Join) -> Floats | None:
     """Print the transform between two parent frames and its uncertainty."""
     if one.transform is None:
         print(f"{one.from_parent} is not joined to {one.to_parent}: {one.reason}")

@@ -52,7 +52,7 @@ def error_of(state: State, truth: Floats) -> float:
     return float(np.linalg.norm(state.T_map_sensor[:3, 3] - truth))
 
 
-def live(client: Client, map_name: str, bag: Path, truth: Path | None = None) -> list[float]:
+def play(client: Client, map_name: str, bag: Path, truth: Path | None = None) -> list[float]:
     """Play a recording to a tracker; return the error of each tracked position, metres."""
     frames = frames_of(bag)
     rows = np.loadtxt(truth, ndmin=2) if truth is not None else np.empty((0, 8))
@@ -94,7 +94,7 @@ def main() -> None:
     options = parser.parse_args()
     embedded = options.data is not None
     with Client.embedded(options.data) if embedded else Client(options.url, options.key) as client:
-        live(client, options.map, options.bag, options.truth)
+        play(client, options.map, options.bag, options.truth)
 
 
 if __name__ == "__main__":

@@ -35,12 +35,12 @@ class Robot:
         self.map = name
         self.waiting: list[str] = []  # jobs of uploaded frames, for which the robot need not wait
 
-    def remember(self, seen: DepthFrame, session: str) -> None:
+    def upload_frame(self, seen: DepthFrame, session: str) -> None:
         """Upload a frame, for example once per metre; it is durable when this returns."""
         added = self.client.upload(self.map, depth_of(seen), meta_of(seen, session))
         self.waiting.append(added.job_id)
 
-    def find_itself(
+    def localise(
         self, views: Iterable[DepthFrame], prior: Prior | None = None
     ) -> tuple[DepthFrame, Floats] | None:
         """Query views until one is found; return it and the camera's pose (4, 4) in the map, or
@@ -56,12 +56,12 @@ class Robot:
                 continue
             if found.status == "ambiguous":
                 print(f"  do not drive: {found.reason}")
-                tell_alternatives(found)
+                print_alternatives(found)
                 print("  move a metre, and look again")
                 prior = None  # it applied to this view
             elif found.status == "not_found":
                 print(f"  not a place of the map ({found.cause}): explore, and map it")
-                self.remember(seen, session="afternoon")
+                self.upload_frame(seen, session="afternoon")
                 return None
             elif found.pose is None or found.confidence is None:
                 print("  a place of the map, but its pose is unknown: look again")
@@ -73,7 +73,7 @@ class Robot:
         return None
 
 
-def tell_alternatives(found: Localization) -> None:
+def print_alternatives(found: Localization) -> None:
     """Print the poses that the evidence supports, of which at most one is right."""
     for one in found.alternatives:
         t, sure = one.pose.translation, 100 * (one.confidence or 0.0)
@@ -116,12 +116,12 @@ def run(client: Client) -> list[float]:
     robot = Robot(client, MAP)
     print(f"driving: uploading {len(walk[::2])} frames")
     for seen in walk[::2]:
-        robot.remember(seen, session="morning")
+        robot.upload_frame(seen, session="morning")
     client.wait(robot.waiting)
     errors = []
     for place, views in {"in its room": walk[13::2], "in another": elsewhere}.items():
         print(f"carried away and put down {place}:")
-        known = robot.find_itself(views)
+        known = robot.localise(views)
         if known is not None:
             seen, pose = known
             errors.append(float(np.linalg.norm(pose[:3, 3] - truth_of(seen)[:3, 3])))
@@ -142,17 +142,17 @@ def beside_a_cabinet(client: Client) -> list[float]:
         print(f"using the existing map {CABINET}")
     robot = Robot(client, CABINET)
     for seen in site.map:
-        robot.remember(seen, session="round")
+        robot.upload_frame(seen, session="round")
     client.wait(robot.waiting)
     print("carried away and put down beside a cabinet that looks the same from behind:")
-    if robot.find_itself(site.queries) is None:
+    if robot.localise(site.queries) is None:
         print("  still unknown: do not drive by these poses")
     last = site.queries[-1]
     odometry = truth_of(last).copy()
     odometry[:2, 3] += 0.1, -0.1  # the prior is off by some centimetres
     believed = GivenPose(parent_frame=f"{ROBOT}/round", matrix=odometry.tolist())
     print("queried again with a prior from odometry, accurate to 30 cm:")
-    known = robot.find_itself([last], Prior(pose=believed, deviation_m=0.3, deviation_deg=10))
+    known = robot.localise([last], Prior(pose=believed, deviation_m=0.3, deviation_deg=10))
     if known is None:
         return []
     seen, pose = known

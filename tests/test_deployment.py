@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.postgres import Server, binaries, of_nobody
+from benchmarks.postgres import Server, binaries, nobody_prefix
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.settings import Settings
@@ -52,7 +52,7 @@ def run(primary: Server, bucket: str, tmp_path: Path) -> Run:
             "SCENEPRINT_BLOB_URL": bucket, "SCENEPRINT_DATA_DIR": str(tmp_path / "caches"), **given,
         }  # fmt: skip
         done = subprocess.run(
-            [*of_nobody(), "bash", "-euo", "pipefail", "-c", block],
+            [*nobody_prefix(), "bash", "-euo", "pipefail", "-c", block],
             env=told, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S,
         )  # fmt: skip
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"

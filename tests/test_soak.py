@@ -16,7 +16,7 @@ from benchmarks.postgres import NoServer, binaries
 from benchmarks.soak import attacks, audit, faults
 from benchmarks.soak.__main__ import parse_fault
 from benchmarks.soak.attacks import ATTACKS, AttackFigures
-from benchmarks.soak.audit import Found, check, count_separated, wrong_matches
+from benchmarks.soak.audit import AuditCounts, check, count_separated, wrong_matches
 from benchmarks.soak.broken_uploads import BrokenFigures
 from benchmarks.soak.failover_client import FailoverClient, RequestLog
 from benchmarks.soak.faults import CUT_OFF, FROZEN, FULL, PRIMARY, Promotion
@@ -87,7 +87,7 @@ def assert_sound(figures: SoakFigures) -> None:
     n = figures.found.acknowledged
     looked_up = figures.found.looked_up
     assert (figures.faults, figures.found.wrong, figures.exceeded) == ([], [], [])
-    assert figures.found == Found(
+    assert figures.found == AuditCounts(
         acknowledged=n, indexed=n - figures.found.aged, aged=figures.found.aged,
         looked_up=looked_up, found=looked_up, searches=figures.found.searches,
     )  # fmt: skip
@@ -194,7 +194,7 @@ def test_what_is_lost_is_seen(
             aged = check(ledger, [kept[0].frame_id], [client, client], [listener], ages)
             assert (aged.missing, aged.aged, aged.looked_up) == (missing, 1 - len(missing), 0)
     assert found.wrong
-    assert replace(found, wrong=[]) == Found(
+    assert replace(found, wrong=[]) == AuditCounts(
         acknowledged=4, indexed=2, looked_up=2, found=1, missing={kept[1].frame_id}, returned=1,
         stuck=1, strangers=1, unheard=2, heard_twice=1, searches=2,
     )  # fmt: skip
@@ -246,7 +246,7 @@ def figures(found: dict[str, Any], **changed: Any) -> SoakFigures:
         "waits_ms": {"query": (90.0, 1200.0)}, "memory": (200_000_000, 100_000_000),
         "seconds": 99.0, "locks": LockShares(5_000, 100.0, 0.09, 0.9),
     }  # fmt: skip
-    return SoakFigures(found=Found(**NOTHING | found), **same | changed)
+    return SoakFigures(found=AuditCounts(**NOTHING | found), **same | changed)
 
 
 def broken(**changed: Any) -> BrokenFigures:

@@ -71,7 +71,7 @@ def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
     return (
         f"`{name.upper()}`",
         ", ".join([_type_of(field), *bounds]),
-        extra["shown"] or _shown(name, field.default),
+        extra["shown"] or _default_text(name, field.default),
         cell(field.description),
         cell(extra["change"]),
     )
@@ -90,7 +90,7 @@ def _type_of(field: FieldInfo) -> str:
     return "list" if Ellipsis in found else kinds[found[0]]
 
 
-def _shown(name: str, default: object) -> str:
+def _default_text(name: str, default: object) -> str:
     if default in (None, ()):
         return "none"
     if name.endswith("_bytes") and isinstance(default, int):

@@ -253,7 +253,7 @@ def _posts(path: str, body: dict[str, Any]) -> Send:
     return lambda _, client, __: client.post(path, json=body)
 
 
-def _repeated(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack], None]:
+def _repeat(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack], None]:
     """Return an attack by consecutive requests on several connections."""
 
     def work(attack: Attack, first: int) -> None:
@@ -276,7 +276,7 @@ def _repeated(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack],
     return repeat
 
 
-def _held(
+def _hold(
     line: str, head: str, *, body: bytes = b"", two: bool = False, count: int = _CONNECTIONS
 ) -> Callable[[Attack], None]:
     """Return an attack by incomplete requests on open connections, which are reopened when closed.
@@ -318,34 +318,34 @@ def _held(
 #: Attacks by their names in the table.
 ATTACKS: dict[str, Callable[[Attack], None]] = {
     # Bodies without an end.
-    "held queries, two headers": _held(
+    "held queries, two headers": _hold(
         f"POST {_MAP}/queries", "Content-Length: 5000\r\n", two=True
     ),
-    "event streams": _held("GET /v1/events", "Accept: text/event-stream\r\n", count=80),
+    "event streams": _hold("GET /v1/events", "Accept: text/event-stream\r\n", count=80),
     # Bodies whose last part never arrives.
-    "large slow bodies": _held(
+    "large slow bodies": _hold(
         f"POST {_FRAMES}",
         "Content-Type: application/octet-stream\r\nContent-Length: 70000000\r\n",
         body=bytes(8 << 20), count=16,
     ),
-    "queue at priority 10": _repeated(_frame, 4),
-    "one frame, many Idempotency-Keys": _repeated(_same_frame),
-    "archives": _repeated(_archive, 4),
-    "pages of 1000 rows": _repeated(_gets(f"{_FRAMES}?limit=1000")),
-    "all other lists": _repeated(
+    "queue at priority 10": _repeat(_frame, 4),
+    "one frame, many Idempotency-Keys": _repeat(_same_frame),
+    "archives": _repeat(_archive, 4),
+    "pages of 1000 rows": _repeat(_gets(f"{_FRAMES}?limit=1000")),
+    "all other lists": _repeat(
         _gets(
             "/v1/jobs?limit=1000", "/v1/events?after=0&limit=1000", "/v1/queries?limit=1000",
             f"{_MAP}/sessions?limit=1000", f"{_MAP}/deletions?limit=1000",
         )
     ),
-    "queries": _repeated(_query),
-    "clouds and pictures": _repeated(
+    "queries": _repeat(_query),
+    "clouds and pictures": _repeat(
         _gets(f"{_FRAMES}/FRAME/cloud.ply", f"{_FRAMES}/FRAME/preview.png")
     ),
-    "edits, each audited": _repeated(_rename),
-    "unknown keys": _repeated(_unknown_key),
-    "sessions deleted and restored": _repeated(_session, 4),
-    "coverage": _repeated(_posts(f"{_MAP}/coverage", {}), 4),
-    "associations": _repeated(_posts(f"{_MAP}/associations", {"sessions": [SESSION]}), 4),
-    "surface and its plan": _repeated(_surface),
+    "edits, each audited": _repeat(_rename),
+    "unknown keys": _repeat(_unknown_key),
+    "sessions deleted and restored": _repeat(_session, 4),
+    "coverage": _repeat(_posts(f"{_MAP}/coverage", {}), 4),
+    "associations": _repeat(_posts(f"{_MAP}/associations", {"sessions": [SESSION]}), 4),
+    "surface and its plan": _repeat(_surface),
 }  # fmt: skip

@@ -39,7 +39,7 @@ CHANGES = ("map.created", "frame.received")
 
 
 @dataclass
-class Found:
+class AuditCounts:
     """Final state of the store, by numbers of frames.
 
     Parameters
@@ -91,7 +91,7 @@ def await_idle(client: Client) -> None:
 def check(
     ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
     listeners: Sequence[Listener], aging: Mapping[str, float] = MappingProxyType({}),
-) -> Found:  # fmt: skip
+) -> AuditCounts:  # fmt: skip
     """Check every acknowledged frame at every address.
 
     Parameters
@@ -126,7 +126,7 @@ def check(
         if name in gone
         and at - expected[name].begun >= aging.get(expected[name].map_name, math.inf)
     }  # fmt: skip
-    result = Found(
+    result = AuditCounts(
         len(expected), len(indexed), stated, len(aged), len(looked_up), found, gone - aged,
         returned=len(stored.keys() & ledger.deleted.keys()),
         stuck=len(present) - len(indexed) - stated,
@@ -161,7 +161,7 @@ def _count_found(client: Client, frames: Sequence[Acknowledged]) -> int:
 
 
 def _compare_searches(
-    result: Found, ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
+    result: AuditCounts, ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
     some: Sequence[Acknowledged],
 ) -> None:  # fmt: skip
     """Compare searches with each other, and with signatures that only the library computes."""
@@ -248,7 +248,7 @@ def count_separated(connection: Connection, map_names: Sequence[str]) -> int:
 
 
 def _compare_events(
-    result: Found, stored: Sequence[Acknowledged], listeners: Sequence[Listener]
+    result: AuditCounts, stored: Sequence[Acknowledged], listeners: Sequence[Listener]
 ) -> None:
     """Count events of stored frames that were not received, or received repeatedly."""
     heard = {one.map_name: one.heard for one in listeners}

@@ -124,25 +124,25 @@ class BrokenFigures:
     seconds: float
 
 
-def mutated(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
+def damaged_upload(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
     """Return an upload with one to four damaged places, which depend only on the numbers."""
     rng = random.Random(f"{seed} {number}")
     shot = rng.choice(shots)
     kind = rng.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0]
     meta = shot.meta.model_dump_json()
     if kind == "json":
-        return BrokenUpload(kind, shot.png, _broken_text(meta, rng))
+        return BrokenUpload(kind, shot.png, _damage_json(meta, rng))
     data = FILES[kind](shot)
     if kind in CLOUDS:
         meta = json.dumps({"format": "kitti"} if kind == "kitti" else {})
     for _ in range(rng.randint(1, 4)):
-        data = _broken(data, rng)
+        data = _damage_bytes(data, rng)
     if rng.random() < 0.5:
-        data = _sealed(data)
+        data = _with_checksums(data)
     return BrokenUpload(kind, data, meta)
 
 
-def _sealed(data: bytes) -> bytes:
+def _with_checksums(data: bytes) -> bytes:
     """Return a damaged PNG with correct checksums, so that parsers read on."""
     at = data.find(b"\x89PNG") + 8
     out = bytearray(data)
@@ -156,7 +156,7 @@ def _sealed(data: bytes) -> bytes:
     return bytes(out)
 
 
-def _broken(data: bytes, rng: random.Random) -> bytes:
+def _damage_bytes(data: bytes, rng: random.Random) -> bytes:
     """Return the bytes with one random change."""
     if not data:
         return rng.choice(_WORDS)
@@ -179,7 +179,7 @@ def _broken(data: bytes, rng: random.Random) -> bytes:
     return data + rng.randbytes(rng.randint(1, 64))
 
 
-def _broken_text(text: str, rng: random.Random) -> str:
+def _damage_json(text: str, rng: random.Random) -> str:
     """Return JSON with an invalid value or character."""
     if rng.random() < 0.5:
         known: dict[str, Any] = json.loads(text)
@@ -188,7 +188,7 @@ def _broken_text(text: str, rng: random.Random) -> str:
         marked = {**place, name: "@@"}
         whole = marked if place is known else {**known, "intrinsics": marked}
         return json.dumps(whole).replace('"@@"', rng.choice(_TEXTS))
-    return _broken(text.encode(), rng).decode("utf-8", "replace")
+    return _damage_bytes(text.encode(), rng).decode("utf-8", "replace")
 
 
 def send_broken(
@@ -213,7 +213,7 @@ def send_broken(
     lock, start = threading.Lock(), time.perf_counter()
 
     def send(number: int) -> None:
-        upload = mutated(shots, seed, number)
+        upload = damaged_upload(shots, seed, number)
         try:
             status, text = _send(client, upload, number)
         except httpx.HTTPError as error:

@@ -202,14 +202,14 @@ class Fleet:
         self._networks.append([])
         if self.pair is None or not (self._plan.delays or self._plan.count("partition")):
             return self._shared
-        database = [self._reached(port, DATABASE_S) for port in self.pair.ports]
+        database = [self._reachable_port(port, DATABASE_S) for port in self.pair.ports]
         own = self._shared | {"SCENEPRINT_DATABASE_URL": self.pair.url(database)}
         if self._objects is not None:
-            port = self._reached(self._objects.port, STORE_S)
+            port = self._reachable_port(self._objects.port, STORE_S)
             own["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{port}"
         return own
 
-    def _reached(self, port: int, delay_s: float) -> int:
+    def _reachable_port(self, port: int, delay_s: float) -> int:
         """Return the port at which the last created host reaches a server."""
         proxy = DelayProxy(port, delay_s if self._plan.delays else 0.0)
         self._opened.callback(proxy.end)

@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.soak.attacks import SESSION, AttackFigures, run_attacks
-from benchmarks.soak.audit import Found, await_idle, check, count_separated
+from benchmarks.soak.audit import AuditCounts, await_idle, check, count_separated
 from benchmarks.soak.broken_uploads import BrokenFigures, send_broken
 from benchmarks.soak.failover_client import Exchange, FailoverClient, RequestLog, bearer
 from benchmarks.soak.faults import CUT_OFF_S, FaultInjector, Kill, Promotion, schedule
@@ -83,7 +83,7 @@ class SoakFigures:
     """
 
     plan: Plan
-    found: Found
+    found: AuditCounts
     kills: Counter[str] = field(default_factory=Counter)
     outages: dict[str, list[float]] = field(default_factory=dict)
     promotions: Sequence[Promotion] = ()
@@ -178,7 +178,7 @@ class _Run:
         self._walked, self._stable, self._spooled = walked, stable, spooled
         self._ledger, self._log, self._stop = Ledger(), RequestLog(), threading.Event()
         self._rng = random.Random(plan.seed)
-        self._figures = SoakFigures(plan, Found(), faults=self._log.faults)
+        self._figures = SoakFigures(plan, AuditCounts(), faults=self._log.faults)
         #: Retention of some maps, seconds; the others keep all frames.
         self._aging: dict[str, float] = {}
         if plan.retention_s is not None:
@@ -272,7 +272,7 @@ class _Run:
         """Start all clients, inject the faults, and stop the robots at the end."""
         plan, stop = self._plan, self._stop
         drivers = self._drivers(client)
-        noisy = self._noisy(client) if plan.count("attack") else []
+        noisy = self._create_noisy_tenant(client) if plan.count("attack") else []
         with tqdm(total=plan.seconds, unit="s", disable=None, leave=False) as bar:
             showing = threading.Thread(target=_show, args=(bar, self._ledger, stop), daemon=True)
             begun = time.monotonic()
@@ -281,7 +281,7 @@ class _Run:
             try:
                 due = schedule(plan.seconds, plan.faults, self._rng)
                 injector.run(due, bar.set_postfix_str)
-                self._besiege(client, key, noisy)
+                self._attack_others(client, key, noisy)
                 if not noisy:  # otherwise the run ends with the attacks
                     stop.wait(max(begun + plan.seconds - time.monotonic(), 0.0))
             finally:
@@ -290,7 +290,7 @@ class _Run:
         for driver in drivers:
             driver.finish(end - time.monotonic())
 
-    def _besiege(self, client: Client, key: str, noisy: Sequence[str]) -> None:
+    def _attack_others(self, client: Client, key: str, noisy: Sequence[str]) -> None:
         """Let a tenant attack the others, and send broken uploads."""
         plan, fleet, figures = self._plan, self._fleet, self._figures
         if plan.count("attack"):
@@ -305,7 +305,7 @@ class _Run:
                 plan.count("broken-upload"), plan.seed,
             )  # fmt: skip
 
-    def _noisy(self, client: Client) -> list[str]:
+    def _create_noisy_tenant(self, client: Client) -> list[str]:
         """Create a tenant with a map of many frames, and return its keys."""
         client.create_map("noisy", model=MODEL)
         grants: dict[str, Scope] = {"noisy": "admin"}

@@ -54,11 +54,11 @@ class AdminMethods(JobMethods):
             NewKey, "The key", name=name, grants=dict(grants), expires_at=expires_at,
             tenant=tenant,
         )  # fmt: skip
-        return self._ask(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
+        return self._call(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
 
     def keys(self) -> list[Key]:
         """Return all keys by name, without secrets."""
-        return list(self._items(Page[Key], "/v1/keys"))
+        return list(self._pages(Page[Key], "/v1/keys"))
 
     def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
         """Replace the secret of a key. Only the returned record contains the new secret.
@@ -75,7 +75,7 @@ class AdminMethods(JobMethods):
         InvalidRequest : If the overlap is out of range.
         """
         path = f"/v1/keys/{quote(name, safe='')}/rotate"
-        return self._ask(MadeKey, "POST", path, params={"overlap_s": overlap_s})
+        return self._call(MadeKey, "POST", path, params={"overlap_s": overlap_s})
 
     def revoke_key(self, name: str) -> None:
         """Revoke a key; raise UnknownKey if it does not exist."""
@@ -83,7 +83,7 @@ class AdminMethods(JobMethods):
 
     def me(self) -> Me:
         """Return the permissions of this client's key."""
-        return self._ask(Me, "GET", "/v1/keys/me")
+        return self._call(Me, "GET", "/v1/keys/me")
 
     def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[AuditLine]:
         """Yield the entries of the audit log, newest first.
@@ -93,7 +93,7 @@ class AdminMethods(JobMethods):
         actor : name of the key that made the changes; None selects all changes
         map_name : name of the changed map; None selects all changes
         """
-        return self._items(Page[AuditLine], "/v1/audit", actor=actor, map=map_name)
+        return self._pages(Page[AuditLine], "/v1/audit", actor=actor, map=map_name)
 
     def events(
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
@@ -121,7 +121,7 @@ class AdminMethods(JobMethods):
         if follow:
             parameters = without_none(map=map_name, kind=list(kinds))
             return follow_stream(lambda last: self._open_stream(_EVENTS, last, parameters), after)
-        return self._kept_events(map_name, kinds, after)
+        return self._stored_events(map_name, kinds, after)
 
     def event_page(
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
@@ -133,9 +133,9 @@ class AdminMethods(JobMethods):
             order="newest" if newest_first else "oldest",
         )  # fmt: skip
         headers = {"Accept": "application/json"}
-        return self._ask(EventPage, "GET", _EVENTS, params=parameters, headers=headers)
+        return self._call(EventPage, "GET", _EVENTS, params=parameters, headers=headers)
 
-    def _kept_events(
+    def _stored_events(
         self, map_name: str | None, kinds: Sequence[str], after: str | None
     ) -> Iterator[Event]:
         cursor = None
@@ -162,8 +162,8 @@ class AdminMethods(JobMethods):
                 (("minutes", "out of range"),),
             )
         parameters = without_none(minutes=minutes, map=map_name)
-        return self._ask(Stats, "GET", "/v1/stats", params=parameters)
+        return self._call(Stats, "GET", "/v1/stats", params=parameters)
 
     def models(self) -> list[ModelInfo]:
         """Return the models that ship with the service, and those that its maps use or used."""
-        return self._ask(Page[ModelInfo], "GET", "/v1/models").items
+        return self._call(Page[ModelInfo], "GET", "/v1/models").items

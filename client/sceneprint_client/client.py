@@ -106,7 +106,7 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
 
     def status(self) -> Status:
         """Return the version, and the number of frames and jobs in each state."""
-        return self._ask(Status, "GET", "/readyz")
+        return self._call(Status, "GET", "/readyz")
 
     def healthy(self) -> bool:
         """Return whether the service answers one request within a short timeout."""

@@ -125,7 +125,7 @@ class FrameFile:
         """
         if self.source is not None:
             return self.source.read_bytes()
-        data = _read(self.path, is_cloud=self.kind == "cloud")
+        data = _read_content(self.path, is_cloud=self.kind == "cloud")
         if self.row is None:
             return data
         with naming(str(self.path)):
@@ -271,7 +271,7 @@ def meta_of(
     return checked(
         FrameMeta,
         "The metadata of the frame",
-        **(_of_depth(reference.camera) if reference.camera else _of_cloud(reference)),
+        **(_depth_fields(reference.camera) if reference.camera else _cloud_fields(reference)),
         trust_depth=trust_depth and reference.camera is not None,
         robot=robot,
         session=sequence if session is None else session,
@@ -318,7 +318,7 @@ def _direction(up: Sequence[float] | None) -> GivenDirection | None:
     return checked(GivenDirection, "The up vector", **dict(zip("xyz", up, strict=False)))
 
 
-def _of_depth(camera: Camera) -> dict[str, Any]:
+def _depth_fields(camera: Camera) -> dict[str, Any]:
     """Return the metadata that specify how to read the samples of a depth image."""
     lens = camera.intrinsics
     return {
@@ -336,7 +336,7 @@ def _of_depth(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _of_cloud(reference: FrameFile) -> dict[str, Any]:
+def _cloud_fields(reference: FrameFile) -> dict[str, Any]:
     """Return the metadata that specify how to read the points of a cloud."""
     source = reference.cloud or CloudSource()
     file_format = source.file_format
@@ -389,16 +389,16 @@ def sendable(
             f"of Open3D or Pillow, not {type(frame).__name__}"
         )
     elif known is not None:
-        data, name = _read(Path(frame), is_cloud=known.intrinsics is None), Path(frame).name
-        return data, _named_as(known, name, seven_scenes_number(name)) if with_pose else known
+        data, name = _read_content(Path(frame), is_cloud=known.intrinsics is None), Path(frame).name
+        return data, _with_name(known, name, seven_scenes_number(name)) if with_pose else known
     else:
-        found = _named(Path(frame))
+        found = _frame_at(Path(frame))
     data = found.read_bytes()
     if known is None:
         return data, meta_of(found, with_pose=with_pose, up=up, with_name=with_pose)
     if not with_pose:
         return data, known
-    return data, _named_as(known, found.original or found.path.name, found.sequence)
+    return data, _with_name(known, found.original or found.path.name, found.sequence)
 
 
 def library_array(frame: Any) -> NDArray[Any] | None:
@@ -422,16 +422,16 @@ def library_array(frame: Any) -> NDArray[Any] | None:
         return None
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
-    if array.dtype == np.int32 and array.size and 0 <= array.min() <= array.max() <= _MOST_UNITS:
+    if array.dtype == np.int32 and array.size and 0 <= array.min() <= array.max() <= _MAXIMUM_UNITS:
         return array.astype(np.uint16)  # Pillow's mode I
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
 #: Greatest sample of a 16-bit image.
-_MOST_UNITS = 65_535
+_MAXIMUM_UNITS = 65_535
 
 
-def _named_as(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
+def _with_name(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
     """Add name and sequence index of the file to metadata that have none."""
     labels = {"name": file_name(name), "sequence": sequence}
     missing = {field: label for field, label in labels.items() if getattr(known, field) is None}
@@ -476,7 +476,7 @@ def array_sendable(
     if up is not None:
         known = known.model_copy(update={"up": _direction(up)})
     if known.intrinsics is None:
-        return _npy(_checked_points(array), _MOST_LOST_M), known
+        return _npy(_checked_points(array), _ROUNDING_M), known
     if size is None or not array.size or array.dtype.kind + str(array.dtype.itemsize) not in _DEPTH:
         raise UnreadableFrame(
             f"The array has shape {array.shape} and type {array.dtype}. Convert it to depth of "
@@ -562,7 +562,7 @@ def rows_as_npy(data: bytes, row: tuple[str, ...]) -> bytes:
 
 
 #: Greatest rounding error of coordinates in float32, metres; large ones such as UTM need float64.
-_MOST_LOST_M = 1e-4
+_ROUNDING_M = 1e-4
 
 
 def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
@@ -580,7 +580,7 @@ def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
     return file.getvalue()
 
 
-def _named(path: Path) -> FrameFile:
+def _frame_at(path: Path) -> FrameFile:
     """Return the frame of a path that the caller passed."""
     if path.is_dir():
         raise DatasetError(
@@ -601,7 +601,7 @@ def _named(path: Path) -> FrameFile:
     return find_frame_file(file)
 
 
-def _read(path: Path, *, is_cloud: bool) -> bytes:
+def _read_content(path: Path, *, is_cloud: bool) -> bytes:
     if is_cloud:
         return read_bytes(path, MAXIMUM_CLOUD_BYTES, UnreadableCloud)
     return read_bytes(path, MAXIMUM_IMAGE_BYTES, UnreadableFrame)

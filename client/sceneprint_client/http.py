@@ -1,7 +1,7 @@
 """HTTP requests to a service, their retries, and their answers as records or errors.
 
 frame, options  --named_or_sent, query_of-->  QueryFrame, Query
-QueryFrame, Query  --query_form, query_json-->  arguments of a request  --_ask-->  a record
+QueryFrame, Query  --query_form, query_json-->  arguments of a request  --_call-->  a record
 """
 
 from __future__ import annotations
@@ -118,38 +118,38 @@ def meta_json(meta: FrameMeta) -> dict[str, Any]:
 
 def map_path(name: str) -> str:
     """Return the path of a map; raise UnknownMap for an invalid name."""
-    return f"/v1/maps/{_part(name, 'map', UnknownMap)}"
+    return f"/v1/maps/{_path_part(name, 'map', UnknownMap)}"
 
 
 def query_path(query_id: str) -> str:
     """Return the path of a past query; raise UnknownQuery for an invalid id."""
-    return f"/v1/queries/{_part(query_id, 'query', UnknownQuery)}"
+    return f"/v1/queries/{_path_part(query_id, 'query', UnknownQuery)}"
 
 
 def match_path(query_id: str, frame_id: str) -> str:
     """Return the path of a match of a past query; raise NotFound for an invalid id."""
-    return f"{query_path(query_id)}/matches/{_part(frame_id, 'frame', UnknownFrame)}"
+    return f"{query_path(query_id)}/matches/{_path_part(frame_id, 'frame', UnknownFrame)}"
 
 
 def frame_path(map_name: str, frame_id: str) -> str:
     """Return the path of a frame; raise NotFound for an invalid name or id."""
-    return f"{map_path(map_name)}/frames/{_part(frame_id, 'frame', UnknownFrame)}"
+    return f"{map_path(map_name)}/frames/{_path_part(frame_id, 'frame', UnknownFrame)}"
 
 
 def deletion_path(map_name: str, deletion_id: str) -> str:
     """Return the path of a deletion; raise NotFound for an invalid name or id."""
-    return f"{map_path(map_name)}/deletions/{_part(deletion_id, 'deletion', UnknownDeletion)}"
+    return f"{map_path(map_name)}/deletions/{_path_part(deletion_id, 'deletion', UnknownDeletion)}"
 
 
 def job_path(job_id: str) -> str:
     """Return the path of a job; raise UnknownJob for an invalid id."""
-    return f"/v1/jobs/{_part(job_id, 'job', UnknownJob)}"
+    return f"/v1/jobs/{_path_part(job_id, 'job', UnknownJob)}"
 
 
 def product_path(kind: type[Product], map_name: str | None, job_id: str) -> str:
     """Return the path of a product; raise NotFound for an invalid name or id."""
     root = "/v1" if map_name is None else map_path(map_name)
-    return f"{root}/{kind.collection}/{_part(job_id, kind.noun, UnknownJob)}"
+    return f"{root}/{kind.collection}/{_path_part(job_id, kind.noun, UnknownJob)}"
 
 
 def surface_path(map_name: str) -> str:
@@ -159,10 +159,10 @@ def surface_path(map_name: str) -> str:
 
 def surface_tile_path(map_name: str, digest: str) -> str:
     """Return the path of a tile; raise NotFound for an invalid name or digest."""
-    return f"{surface_path(map_name)}/tiles/{_part(digest, 'tile', NotFound)}"
+    return f"{surface_path(map_name)}/tiles/{_path_part(digest, 'tile', NotFound)}"
 
 
-def _part(name: str, what: str, error: type[SceneprintError]) -> str:
+def _path_part(name: str, what: str, error: type[SceneprintError]) -> str:
     """Return a name that is safe as one part of a path; `..` would lead to another resource."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
         raise error(f"There is no {what} {name!r:.80}. Check the name.")
@@ -210,7 +210,7 @@ def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:
     return checked(kind, "The query", **how, **more)
 
 
-def named_or_sent(
+def query_target(
     map_name: str | None, frame: FrameInput | None, meta: MetaInput | None,
     frame_id: str | None, up: Sequence[float] | None = None,
 ) -> tuple[str, QueryFrame]:  # fmt: skip
@@ -314,7 +314,7 @@ class ServiceConnection:
         self._url = url.rstrip("/")
         self._timeout_s = timeout_s
         self._worker = worker
-        self._met = False  # whether the service has ever answered
+        self._answered = False  # whether the service has ever answered
         headers = {"User-Agent": f"sceneprint-client/{__version__}"}
         if key is not None:
             headers["Authorization"] = f"Bearer {_checked_key(key)}"
@@ -349,14 +349,14 @@ class ServiceConnection:
         logging.getLogger("httpx").removeFilter(self._log_filter)
         self._http.close()
 
-    def _ask(self, kind: type[Record], method: str, path: str, **request: Any) -> Record:
+    def _call(self, kind: type[Record], method: str, path: str, **request: Any) -> Record:
         """Send a request and return its answer as a record."""
         return read_record(kind, self._send(method, path, **request))
 
-    def _begin(self, kind: type[Record], path: str, options: BaseModel) -> Record:
+    def _create(self, kind: type[Record], path: str, options: BaseModel) -> Record:
         """Create a job from a record of its options and return it."""
         document = options.model_dump(mode="json", exclude_unset=True)
-        return self._ask(kind, "POST", path, json=document)
+        return self._call(kind, "POST", path, json=document)
 
     def _bytes(self, path: str, **request: Any) -> bytes:
         """Return the bytes of the answer to a GET."""
@@ -365,12 +365,12 @@ class ServiceConnection:
     def _delete(self, path: str) -> None:
         self._send("DELETE", path)
 
-    def _items(self, kind: type[Page[Item]], path: str, **parameters: Any) -> Iterator[Item]:
+    def _pages(self, kind: type[Page[Item]], path: str, **parameters: Any) -> Iterator[Item]:
         """Yield the items of all pages of a list; the first page is requested immediately."""
 
         def page_after(cursor: str | None) -> Page[Item]:
             query = without_none(**parameters, cursor=cursor, limit=PAGE)
-            return self._ask(kind, "GET", path, params=query)
+            return self._call(kind, "GET", path, params=query)
 
         def items(page: Page[Item]) -> Iterator[Item]:
             yield from page.items
@@ -389,8 +389,8 @@ class ServiceConnection:
         raise error_of(response)
 
     def _persist(self, send: Callable[[], httpx.Response]) -> tuple[httpx.Response, int]:
-        response, lost = persist(send, self._url, met=self._met)
-        self._met = True
+        response, lost = persist(send, self._url, met=self._answered)
+        self._answered = True
         return response, lost
 
     def _open_stream(
@@ -413,7 +413,7 @@ class ServiceConnection:
             raise error_of(response)
         return response
 
-    def _let_work(self, pause_s: float) -> None:
+    def _work_or_wait(self, pause_s: float) -> None:
         """Run a job in this process, or wait while workers of the service run jobs."""
         if self._worker is None:
             time.sleep(pause_s)

@@ -60,11 +60,11 @@ class JobMethods(ServiceConnection):
 
     def job(self, job_id: str) -> Job:
         """Return a job; raise UnknownJob if it does not exist."""
-        return self._ask(Job, "GET", job_path(job_id))
+        return self._call(Job, "GET", job_path(job_id))
 
     def jobs(self, state: JobState | None = None) -> Iterator[Job]:
         """Yield the jobs of all maps, newest first, optionally only those in one state."""
-        return self._items(Page[Job], "/v1/jobs", state=state)
+        return self._pages(Page[Job], "/v1/jobs", state=state)
 
     def cancel_job(self, job_id: str) -> Job:
         """Cancel a job that has not ended; its frame becomes `failed`.
@@ -74,7 +74,7 @@ class JobMethods(ServiceConnection):
         UnknownJob : If the job does not exist.
         JobOver : If the job has ended.
         """
-        return self._ask(Job, "POST", f"{job_path(job_id)}/cancel")
+        return self._call(Job, "POST", f"{job_path(job_id)}/cancel")
 
     def retry_job(self, job_id: str) -> Job:
         """Retry a job that is dead, cancelled or failed.
@@ -88,7 +88,7 @@ class JobMethods(ServiceConnection):
         UnknownJob : If the job does not exist.
         CannotRetry : If the job did not fail, or there is nothing to retry.
         """
-        return self._ask(Job, "POST", f"{job_path(job_id)}/retry")
+        return self._call(Job, "POST", f"{job_path(job_id)}/retry")
 
     def retry_dead_jobs(self, map_name: str | None = None) -> Iterator[RetriedJobs]:
         """Retry all dead jobs, or those of a map, except jobs with an earlier retry.
@@ -104,7 +104,7 @@ class JobMethods(ServiceConnection):
         cursor: str | None = None
         while True:
             parameters = without_none(map=map_name, cursor=cursor)
-            done = self._ask(RetriedJobs, "POST", "/v1/jobs/retry", params=parameters)
+            done = self._call(RetriedJobs, "POST", "/v1/jobs/retry", params=parameters)
             yield done
             cursor = done.next_cursor
             if cursor is None:
@@ -145,7 +145,7 @@ class JobMethods(ServiceConnection):
                     break
             if not waiting:
                 break
-            self._let_work(pause)
+            self._work_or_wait(pause)
         return [known[job_id] if job_id in known else self.job(job_id) for job_id in order]
 
     def import_archive(
@@ -204,10 +204,10 @@ class JobMethods(ServiceConnection):
         UnreadableCloud : If the file cannot be read or its format cannot hold a map.
         """
         if not isinstance(file, Path):
-            return self._send_archive(map_name, file, _of_map(options, None))
+            return self._send_archive(map_name, file, _map_import_options(options, None))
         try:
             with file.open("rb") as opened:
-                return self._send_archive(map_name, opened, _of_map(options, file.name))
+                return self._send_archive(map_name, opened, _map_import_options(options, file.name))
         except OSError as error:
             raise UnreadableCloud(
                 f"{file}: The file cannot be read ({error.strerror}). Check its path."
@@ -216,7 +216,7 @@ class JobMethods(ServiceConnection):
     def import_items(self, map_name: str, job_id: str) -> Iterator[ImportItem]:
         """Yield the results for the members of an archive so far, in the order of the archive."""
         job = job_path(job_id).rpartition("/")[2]
-        return self._items(Page[ImportItem], f"{map_path(map_name)}/imports/{job}/items")
+        return self._pages(Page[ImportItem], f"{map_path(map_name)}/imports/{job}/items")
 
     def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
         """Send an archive; each attempt starts at its beginning."""
@@ -260,7 +260,7 @@ class JobMethods(ServiceConnection):
         InvalidRequest : If the map lacks the requested frames, or a field is out of range.
         """
         options = checked(kind.request_type, f"The {kind.noun}", **request)
-        product = self._begin(kind, f"{map_path(map_name)}/{kind.collection}", options)
+        product = self._create(kind, f"{map_path(map_name)}/{kind.collection}", options)
         return self.wait_for_product(product, timeout_s=timeout_s, progress=progress)
 
     def product(self, kind: type[_Product], map_name: str | None, job_id: str) -> _Product:
@@ -271,7 +271,7 @@ class JobMethods(ServiceConnection):
         kind : MapCoverage, Association, Difference or Reconstruction
         map_name, job_id : ids of the product; `map_name` is None for a Reconstruction
         """
-        return self._ask(kind, "GET", product_path(kind, map_name, job_id))
+        return self._call(kind, "GET", product_path(kind, map_name, job_id))
 
     def products(self, kind: type[_Product], map_name: str) -> Iterator[_Product]:
         """Yield the products of a map, newest first; coverage results omit their plans.
@@ -281,7 +281,7 @@ class JobMethods(ServiceConnection):
         kind, map_name : see `product`
         """
         page: type[Page[_Product]] = Page[kind]  # type: ignore[valid-type]
-        return self._items(page, f"{map_path(map_name)}/{kind.collection}")
+        return self._pages(page, f"{map_path(map_name)}/{kind.collection}")
 
     def delete_product(self, kind: type[Product], map_name: str | None, job_id: str) -> None:
         """Delete a product with its results, even while a worker computes it; see `product`.
@@ -313,7 +313,7 @@ class JobMethods(ServiceConnection):
             pause = next(pauses, None)
             if product.state.over or pause is None:
                 return product
-            self._let_work(pause)
+            self._work_or_wait(pause)
             product = self.product(type(product), product.map, product.job_id)
 
     def undo_join(self, map_name: str, job_id: str) -> Association:
@@ -328,7 +328,7 @@ class JobMethods(ServiceConnection):
         NotIndexed : If the job has not succeeded.
         """
         path = f"{product_path(Association, map_name, job_id)}/join"
-        return self._ask(Association, "DELETE", path)
+        return self._call(Association, "DELETE", path)
 
     def edges(
         self, map_name: str, job_id: str, *, min_overlap: float = 0.0,
@@ -348,7 +348,7 @@ class JobMethods(ServiceConnection):
         InvalidRequest : If the overlap is out of range.
         """
         _check_overlap(min_overlap)
-        return self._items(
+        return self._pages(
             Page[Edge], f"{product_path(Association, map_name, job_id)}/edges",
             min_overlap=min_overlap, consistent=consistent,
         )  # fmt: skip
@@ -397,7 +397,7 @@ class JobMethods(ServiceConnection):
         UnknownMap, UnknownJob : If the map or job does not exist.
         """
         path = f"{product_path(MapCoverage, map_name, job_id)}/frames"
-        return self._items(Page[CoverageFrame], path, outcome=outcome)
+        return self._pages(Page[CoverageFrame], path, outcome=outcome)
 
     def coverage_changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
         """Return the cells that became better or worse since an earlier job with the same options.
@@ -409,7 +409,7 @@ class JobMethods(ServiceConnection):
         InvalidRequest : If the two results cannot be compared.
         """
         path = f"{product_path(MapCoverage, map_name, job_id)}/changes"
-        return self._ask(CoverageChanges, "GET", path, params={"since": since})
+        return self._call(CoverageChanges, "GET", path, params={"since": since})
 
     def difference_points(self, map_name: str, job_id: str) -> SurfacePoints:
         """Return the cells of both sessions as points. `patches` holds the kind of each: SAME,
@@ -447,7 +447,7 @@ class JobMethods(ServiceConnection):
         """
         options = checked(NewReconstruction, "The reconstruction", **request)
         query_id = query if isinstance(query, str) else query.query_id
-        product = self._begin(Reconstruction, f"{query_path(query_id)}/reconstruction", options)
+        product = self._create(Reconstruction, f"{query_path(query_id)}/reconstruction", options)
         return product if wait_s is None else self.wait_for_product(product, timeout_s=wait_s)
 
     def reconstruction_mesh(self, job_id: str) -> bytes:
@@ -461,7 +461,7 @@ class JobMethods(ServiceConnection):
         return self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
 
 
-def _of_map(options: ImportOptions | None, name: str | None) -> ImportOptions:
+def _map_import_options(options: ImportOptions | None, name: str | None) -> ImportOptions:
     """Return the options of a map import; raise InvalidRequest for those of an archive."""
     if options is None:
         own = {"as": "map"} if name is None else {"as": "map", "name": name[-64:].lstrip(".")}

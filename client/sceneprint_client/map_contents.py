@@ -81,15 +81,15 @@ class MapMethods(ServiceConnection):
         """
         known: dict[str, Any] = limits if up is None else {**limits, "up": list(up)}
         new = checked(NewMap, "The map", name=name, title=title, model=model, **known)
-        return self._ask(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
+        return self._call(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
 
     def maps(self) -> list[Map]:
         """Return all maps by name."""
-        return self._ask(Page[Map], "GET", "/v1/maps").items
+        return self._call(Page[Map], "GET", "/v1/maps").items
 
     def map(self, name: str) -> Map:
         """Return a map; raise UnknownMap if it does not exist."""
-        return self._ask(Map, "GET", map_path(name))
+        return self._call(Map, "GET", map_path(name))
 
     def edit_map(
         self, map_name: str, changes: Mapping[str, Any], if_match: str | None = None, *,
@@ -102,7 +102,7 @@ class MapMethods(ServiceConnection):
         retention would delete immediately.
         """
         parameters = {"dry_run": "true"} if dry_run else {}
-        return self._ask(
+        return self._call(
             Map, "PATCH", map_path(map_name), params=parameters, **_edit_request(changes, if_match)
         )
 
@@ -123,7 +123,7 @@ class MapMethods(ServiceConnection):
         InvalidRequest : If the model does not exist.
         Conflict : If the map has this model, or is being signed with a third model.
         """
-        return self._ask(Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model})
+        return self._call(Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model})
 
     def cancel_reencoding(self, map_name: str) -> Map:
         """Cancel a re-encoding: the map keeps its model.
@@ -133,11 +133,11 @@ class MapMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         Conflict : If the map is not being re-encoded.
         """
-        return self._ask(Map, "DELETE", f"{map_path(map_name)}/reencoding")
+        return self._call(Map, "DELETE", f"{map_path(map_name)}/reencoding")
 
     def frame(self, map_name: str, frame_id: str) -> Frame:
         """Return a frame; raise UnknownMap or UnknownFrame if it does not exist."""
-        return self._ask(Frame, "GET", frame_path(map_name, frame_id))
+        return self._call(Frame, "GET", frame_path(map_name, frame_id))
 
     def frames(
         self, map_name: str, state: FrameState | None = None, *,
@@ -181,7 +181,7 @@ class MapMethods(ServiceConnection):
             find=find, order=order,
         )  # fmt: skip
         parameters = listing.model_dump(mode="json", exclude_defaults=True)
-        return self._items(Page[Frame], f"{map_path(map_name)}/frames", **parameters)
+        return self._pages(Page[Frame], f"{map_path(map_name)}/frames", **parameters)
 
     def edit_frame(
         self, map_name: str, frame_id: str, changes: Mapping[str, Any],
@@ -200,7 +200,7 @@ class MapMethods(ServiceConnection):
         InvalidRequest, InvalidPose : If a field is unknown, cannot be edited, or is invalid.
         PreconditionFailed : If the frame was edited after you read it.
         """
-        return self._ask(
+        return self._call(
             Frame, "PATCH", frame_path(map_name, frame_id), **_edit_request(changes, if_match)
         )
 
@@ -217,7 +217,7 @@ class MapMethods(ServiceConnection):
         Conflict : If the same content was uploaded again.
         QuotaExceeded : If the quota of the map has no room for the frame.
         """
-        return self._ask(Frame, "POST", f"{frame_path(map_name, frame_id)}/restore")
+        return self._call(Frame, "POST", f"{frame_path(map_name, frame_id)}/restore")
 
     def delete_frames(
         self, map_name: str, frame_ids: Sequence[str] | None = None,
@@ -240,10 +240,10 @@ class MapMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         InvalidRequest : If you pass neither ids nor a filter, or both.
         """
-        body = without_none(frame_ids=_listed(frame_ids), filter=filter)
+        body = without_none(frame_ids=_list_or_none(frame_ids), filter=filter)
         count, deletions = 0, list[FrameDeletion]()
         while True:
-            done = self._ask(
+            done = self._call(
                 FramesDeleted, "POST", f"{map_path(map_name)}/frames/delete", json=body
             )
             count += done.frames
@@ -273,10 +273,10 @@ class MapMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         InvalidRequest : If there is nothing to change, or a frame would have too many tags.
         """
-        body = without_none(frame_ids=_listed(frame_ids), filter=filter) | changes
+        body = without_none(frame_ids=_list_or_none(frame_ids), filter=filter) | changes
         count, inverse = 0, list[dict[str, Any]]()
         while True:
-            done = self._ask(FramesEdited, "POST", f"{map_path(map_name)}/frames/edit", json=body)
+            done = self._call(FramesEdited, "POST", f"{map_path(map_name)}/frames/edit", json=body)
             count += done.frames
             inverse += done.inverse
             if not done.remaining:
@@ -298,7 +298,7 @@ class MapMethods(ServiceConnection):
         path = f"{deletion_path(map_name, deletion_id)}/restore"
         count, refused = 0, dict[str, RefusedFrame]()
         while True:
-            done = self._ask(FramesRestored, "POST", path)
+            done = self._call(FramesRestored, "POST", path)
             count += done.frames
             refused |= {one.frame_id: one for one in done.refused}
             if not done.remaining or not done.frames:
@@ -307,7 +307,7 @@ class MapMethods(ServiceConnection):
 
     def deletions(self, map_name: str) -> Iterator[FrameDeletion]:
         """Yield the deletions that can still be undone, newest first."""
-        return self._items(Page[FrameDeletion], f"{map_path(map_name)}/deletions")
+        return self._pages(Page[FrameDeletion], f"{map_path(map_name)}/deletions")
 
     def sessions(self, map_name: str) -> Iterator[Session]:
         """Yield the sessions of a map by robot, with frame counts, times and parent frames.
@@ -316,7 +316,7 @@ class MapMethods(ServiceConnection):
         ------
         UnknownMap : If the map does not exist.
         """
-        return self._items(Page[Session], f"{map_path(map_name)}/sessions")
+        return self._pages(Page[Session], f"{map_path(map_name)}/sessions")
 
     def delete_session(self, map_name: str, session: str, robot: str | None = None) -> int:
         """Delete all frames of a session and return their number; `restore_deletion` undoes it.
@@ -333,7 +333,7 @@ class MapMethods(ServiceConnection):
         path, deleted = f"{map_path(map_name)}/sessions", 0
         while True:
             parameters = without_none(session=session, robot=robot)
-            change = self._ask(SessionChange, "DELETE", path, params=parameters)
+            change = self._call(SessionChange, "DELETE", path, params=parameters)
             deleted += change.frames
             if not change.remaining:
                 return deleted
@@ -366,7 +366,7 @@ class MapMethods(ServiceConnection):
         body = {name: value for name, value in changes.items() if value}
         while True:
             parameters = without_none(session=session, robot=robot, after=after)
-            change = self._ask(SessionChange, "PATCH", path, json=body, params=parameters)
+            change = self._call(SessionChange, "PATCH", path, json=body, params=parameters)
             edited, after = edited + change.frames, change.last_frame_id
             if not change.remaining:
                 return edited
@@ -395,7 +395,7 @@ class MapMethods(ServiceConnection):
         InvalidRequest : If the session is ambiguous, or too long for one answer.
         """
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
-        return self._ask(Trajectory, "GET", **_run_request(map_name, run, "application/json"))
+        return self._call(Trajectory, "GET", **_run_request(map_name, run, "application/json"))
 
     def trajectory_text(
         self, map_name: str, session: str, *, robot: str | None = None,
@@ -462,11 +462,11 @@ class MapMethods(ServiceConnection):
 
     def patches(self, map_name: str, frame_id: str) -> FramePatches:
         """Return the surface patches of an indexed frame. Errors are those of `cloud`."""
-        return self._ask(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
+        return self._call(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
 
     def signature(self, map_name: str, frame_id: str) -> FrameSignature:
         """Return the signature of an indexed frame. Errors are those of `cloud`."""
-        return self._ask(FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature")
+        return self._call(FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature")
 
     def upload_of(self, map_name: str, frame_id: str) -> bytes:
         """Return the original bytes of a frame's upload.
@@ -505,7 +505,7 @@ class MapMethods(ServiceConnection):
         return self._bytes(f"{map_path(map_name)}/copy/model")
 
 
-def _listed(names: Sequence[str] | None) -> list[str] | None:
+def _list_or_none(names: Sequence[str] | None) -> list[str] | None:
     return None if names is None else list(names)
 
 
@@ -550,7 +550,7 @@ class SurfaceMethods(ServiceConnection):
 
     def surface(self, map_name: str) -> MapSurface:
         """Return the fused surface of a map's posed frames."""
-        return self._ask(MapSurface, "GET", surface_path(map_name))
+        return self._call(MapSurface, "GET", surface_path(map_name))
 
     def begin_surface(self, map_name: str) -> MapSurface:
         """Build the surface of a map immediately, or add new frames to it.
@@ -562,7 +562,7 @@ class SurfaceMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         InvalidRequest : If the map has no indexed frame with a pose.
         """
-        return self._ask(MapSurface, "POST", surface_path(map_name))
+        return self._call(MapSurface, "POST", surface_path(map_name))
 
     def delete_surface(self, map_name: str) -> None:
         """Delete the surface of a map; the service does not rebuild it until `begin_surface`."""
@@ -583,7 +583,7 @@ class SurfaceMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         """
         path = f"{surface_path(map_name)}/tiles"
-        return self._items(Page[SurfaceTile], path, parent=parent, level=level)
+        return self._pages(Page[SurfaceTile], path, parent=parent, level=level)
 
     def surface_tile(self, map_name: str, digest: str) -> bytes:
         """Return the cells of a tile; `sceneprint_client.surface_encoding.decode_tile` reads them.
@@ -618,7 +618,7 @@ class SurfaceMethods(ServiceConnection):
             box=None if box is None else ",".join(map(repr, map(float, box))),
             radius=radius, parent=parent,
         )  # fmt: skip
-        return self._items(Page[SurfaceSighting], f"{surface_path(map_name)}/frames", **parameters)
+        return self._pages(Page[SurfaceSighting], f"{surface_path(map_name)}/frames", **parameters)
 
     def surface_plan(
         self, map_name: str, parent: str | None = None, *, width: int = PLAN_WIDTH,

@@ -43,11 +43,11 @@ from sceneprint_client.http import (
     map_path,
     match_path,
     meta_json,
-    named_or_sent,
     query_form,
     query_json,
     query_of,
     query_path,
+    query_target,
     without_none,
 )
 
@@ -94,12 +94,12 @@ class QueryMethods(ServiceConnection):
         """
         check_options(how)
         if maps is None:
-            name, query_frame = named_or_sent(map_name, frame, meta, frame_id, up)
+            name, query_frame = query_target(map_name, frame, meta, frame_id, up)
             request = _query_request(query_frame, query_of(Query, how), robot)
-            return self._ask(Answer, "POST", f"{map_path(name)}/queries", **request)
+            return self._call(Answer, "POST", f"{map_path(name)}/queries", **request)
         if (frame_id is None) != (map_name is None):
             raise TypeError("with `maps`, pass `map_name` only with `frame_id`")
-        _, query_frame = named_or_sent(map_name or "", frame, meta, frame_id, up)
+        _, query_frame = query_target(map_name or "", frame, meta, frame_id, up)
         named = query_frame if isinstance(query_frame, NamedFrame) else None
         names = maps if isinstance(maps, str) else list(maps)
         several = query_of(SeveralQuery, how, maps=names, frame=named)
@@ -107,7 +107,7 @@ class QueryMethods(ServiceConnection):
             request = {"json": {**query_json(several), **without_none(robot=robot)}}
         else:
             request = query_form(*_with_robot(robot, *query_frame), several)
-        return self._ask(Answer, "POST", "/v1/queries", **request)
+        return self._call(Answer, "POST", "/v1/queries", **request)
 
     def localize(
         self, map_name: str, frame: FrameInput | None = None,
@@ -117,9 +117,9 @@ class QueryMethods(ServiceConnection):
     ) -> Localization:  # fmt: skip
         """Return the status and pose of a frame in a map; see `query` for the parameters."""
         check_options(how)
-        name, query_frame = named_or_sent(map_name, frame, meta, frame_id, up)
+        name, query_frame = query_target(map_name, frame, meta, frame_id, up)
         request = _query_request(query_frame, query_of(Query, how), robot)
-        return self._ask(Localization, "POST", f"{map_path(name)}/localize", **request)
+        return self._call(Localization, "POST", f"{map_path(name)}/localize", **request)
 
     def localize_sequence(
         self, map_name: str, frames: Sequence[FrameInput],
@@ -146,9 +146,10 @@ class QueryMethods(ServiceConnection):
                 (("metas", "pass one for each frame"),),
             )
         request = frames_form(frames, [None] * len(frames) if metas is None else metas)
-        query = query_json(query_of(Query, how))
-        request["data"] |= {name: form_text(value) for name, value in query.items()}
-        return self._ask(Localization, "POST", f"{map_path(map_name)}/localize/sequence", **request)
+        fields = query_json(query_of(Query, how))
+        request["data"] |= {name: form_text(value) for name, value in fields.items()}
+        path = f"{map_path(map_name)}/localize/sequence"
+        return self._call(Localization, "POST", path, **request)
 
     def similarity(
         self, a: FrameInput | NamedFrame | tuple[str, str],
@@ -185,9 +186,9 @@ class QueryMethods(ServiceConnection):
                 files[name] = (name, found[0], "application/octet-stream")
                 body[f"meta_{name}"] = meta_json(found[1])
         if not files:
-            return self._ask(Similarity, "POST", "/v1/similarity", json=body)
+            return self._call(Similarity, "POST", "/v1/similarity", json=body)
         fields = {name: form_text(value) for name, value in body.items()}
-        return self._ask(Similarity, "POST", "/v1/similarity", files=files, data=fields)
+        return self._call(Similarity, "POST", "/v1/similarity", files=files, data=fields)
 
     def queries(
         self, map_name: str | None = None, *,
@@ -211,7 +212,7 @@ class QueryMethods(ServiceConnection):
         InvalidRequest : If the status or a time is invalid.
         """
         statuses = [status] if isinstance(status, str) else list(status)
-        return self._items(
+        return self._pages(
             Page[QueryRecord], "/v1/queries", map=map_name, status=statuses or None, robot=robot,
             since=_as_text(since), until=_as_text(until), kept=True if kept else None,
         )  # fmt: skip
@@ -233,11 +234,11 @@ class QueryMethods(ServiceConnection):
         ------
         UnknownQuery : If the query is not stored.
         """
-        return self._ask(Answer, "GET", query_path(query_id))
+        return self._call(Answer, "GET", query_path(query_id))
 
     def stored_query(self, query_id: str) -> StoredQuery:
         """Return the parameters of an earlier query and the expiry of its answer."""
-        return self._ask(StoredQuery, "GET", f"{query_path(query_id)}/question")
+        return self._call(StoredQuery, "GET", f"{query_path(query_id)}/question")
 
     def keep_answer(self, query_id: str, title: str | None = None) -> QueryRecord:
         """Keep an answer until it is released, or change the title of a kept one.
@@ -254,7 +255,7 @@ class QueryMethods(ServiceConnection):
         InvalidRequest : If the title is too long.
         """
         body = without_none(title=title)
-        return self._ask(QueryRecord, "PUT", f"{query_path(query_id)}/keep", json=body)
+        return self._call(QueryRecord, "PUT", f"{query_path(query_id)}/keep", json=body)
 
     def release_answer(self, query_id: str) -> None:
         """Release a kept answer; raise UnknownQuery if it is not kept."""
@@ -295,7 +296,7 @@ class QueryMethods(ServiceConnection):
                 f"{limit} frames cannot be compared with each other. Pass 1 to {_MOST_ALIKE}.",
                 (("limit", f"pass 1 to {_MOST_ALIKE}"),),
             )
-        return self._ask(
+        return self._call(
             Similarities, "GET", f"{query_path(query_id)}/similarities", params={"limit": limit}
         )
 
@@ -315,7 +316,7 @@ class QueryMethods(ServiceConnection):
         UnknownMap, UnknownFrame : If no match has this id, or its frame was deleted.
         NotIndexed : If the query ran without validation, or the map now has another model.
         """
-        return self._ask(
+        return self._call(
             MatchDetails, "GET", match_path(query_id, frame_id), params=without_none(map=map_name)
         )
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 #: Period for which transforms and accelerations are stored, seconds.
 _MEMORY_S = 10.0
 #: Number of messages between two removals of old data.
-_SWEPT_AFTER = 512
+_SWEEP_INTERVAL = 512
 #: A frame that is older than the last one by this indicates a jump of the clock, seconds.
 _JUMP_S = 1.0
 #: Greatest number of frames that wait for their transforms.
@@ -238,7 +238,7 @@ class Relocaliser:
             if place is None:
                 self.counts["without_transform"] += 1
             elif stamp > self._last_ns:
-                self._go_on(place, message)
+                self._process_frame(place, message)
                 done += 1
         return done
 
@@ -263,7 +263,7 @@ class Relocaliser:
     def _sweep(self) -> None:
         """Remove old data at intervals."""
         self._unswept += 1
-        if self._unswept >= _SWEPT_AFTER:
+        if self._unswept >= _SWEEP_INTERVAL:
             self._unswept = 0
             self._tree.forget(round(_MEMORY_S * 1e9))
             if self._imu is not None:
@@ -287,7 +287,7 @@ class Relocaliser:
             return None
         return _Place(stamp_ns, T_odom_sensor, T_odom_base)
 
-    def _go_on(self, place: _Place, message: Any) -> None:
+    def _process_frame(self, place: _Place, message: Any) -> None:
         """Move the tracker to a frame, and query the frame if the interval has passed."""
         self._last = place
         stamp = place.stamp_ns * 1e-9
@@ -372,7 +372,7 @@ class Relocaliser:
             message = f"tracked in {state.parent_frame}, but this map is {self._parent}"
         if is_stale:
             level = Level.STALE
-            message = self._silence(silent_s)
+            message = self._missing_frame_reason(silent_s)
         if self._questions.answered > self._error_at:
             self._error = ""
         if self._error:
@@ -394,7 +394,7 @@ class Relocaliser:
             T_map_odom = T_map_base @ inverse(planar(last.T_odom_base))
         return TrackedPose(T_map_odom, T_map_base, covariance)
 
-    def _silence(self, silent_s: float) -> str:
+    def _missing_frame_reason(self, silent_s: float) -> str:
         """Return the reason for the lack of a recent frame."""
         p = self.parameters
         if not self.counts["frames"]:

@@ -293,7 +293,7 @@ class Spool:
             are read only if `meta` is omitted.
         """
         data, known = frame_bytes(frame, meta, with_pose=True, up=up)
-        _require_sendable(data, known)
+        _check_sendable(data, known)
         text = json.dumps(meta_json(known))
         digest = hashlib.sha256(text.encode() + b"\0" + data).hexdigest()
         size = (len(data) + len(text) + 2 * _PAGE - 1) // _PAGE * _PAGE
@@ -308,7 +308,7 @@ class Spool:
             if database.execute("SELECT 1 FROM frames WHERE digest = ?", (digest,)).fetchone():
                 return False
             while database.execute("SELECT bytes FROM counters").fetchone()[0] + size > most:
-                _give_up_one(database)
+                _drop_frame(database)
             parent = None if known.pose is None else known.pose.parent_frame
             run = json.dumps([known.robot, known.session, parent])
             last = _neighbour(database, run, None, -1)
@@ -320,7 +320,7 @@ class Spool:
                 "VALUES (?, ?, ?, ?, ?, ?, ?)",
                 (digest, run, stamp, pose, size, text, data),
             )
-            _renew_novelty(database, last)
+            _update_novelty(database, last)
         return True
 
     def status(self) -> SpoolStatus:
@@ -393,7 +393,7 @@ class Spool:
             query = "SELECT count(*), max(id) FROM frames WHERE reason IS NULL"
             total, last = database.execute(query).fetchone()
         report = SyncReport()
-        while total and (batch := self._oldest(last)):
+        while total and (batch := self._next_batch(last)):
             self._send(target, batch, report)
             if progress is not None:
                 progress(report.done, max(total, report.done))
@@ -401,7 +401,7 @@ class Spool:
 
     # Uploads.
 
-    def _oldest(self, last: int) -> list[_Waiting]:
+    def _next_batch(self, last: int) -> list[_Waiting]:
         """Return the first waiting frames up to an id, as many as fit one request."""
         with self._transaction(write=False) as database:
             rows = database.execute(
@@ -438,7 +438,7 @@ class Spool:
             ):
                 raise
             if len(batch) == 1:
-                self._settle([], {batch[0].id: str(error)})
+                self._record_results([], {batch[0].id: str(error)})
                 report.refused += 1
                 return
             half = len(batch) // 2
@@ -454,16 +454,16 @@ class Spool:
                 report.poses += item.frame.has_pose
                 if item.frame.samples is not None:
                     report.ranges.append(item.frame.samples)
-            elif item.status in _OF_A_FRAME:
+            elif item.status in _FRAME_STATUSES:
                 refused[one.id] = item.problem.detail if item.problem else "no reason was stated"
             else:
                 beyond = item
-        self._settle(uploaded, refused)
+        self._record_results(uploaded, refused)
         report.refused += len(refused)
         if beyond is not None:
             raise _error_of(beyond)
 
-    def _settle(self, uploaded: list[int], refused: dict[int, str]) -> None:
+    def _record_results(self, uploaded: list[int], refused: dict[int, str]) -> None:
         """Remove uploaded frames, and mark others as rejected."""
         with self._transaction() as database:
             for number in uploaded:
@@ -511,9 +511,9 @@ class Spool:
                 )
             elif most_bytes is not None:
                 database.execute("UPDATE counters SET most_bytes = ?", (most_bytes,))
-        self._reserve()
+        self._reserve_journal()
 
-    def _reserve(self) -> None:
+    def _reserve_journal(self) -> None:
         """Reserve disk space for the journal, which keeps it after each transaction.
 
         Without it a full disk could not be emptied, since removing frames writes to the journal.
@@ -566,7 +566,7 @@ class Spool:
             ) from error
 
 
-def _require_sendable(data: bytes, meta: FrameMeta) -> None:
+def _check_sendable(data: bytes, meta: FrameMeta) -> None:
     """Raise FrameError for errors that the service would report and the robot can still fix."""
     if not data:
         raise errors.UnreadableFrame("The frame is empty. Write it again.")
@@ -608,7 +608,7 @@ def pose_matrix(pose: GivenPose | None) -> NDArray[np.float64] | None:
     return T if np.isfinite(T).all() else None
 
 
-def _give_up_one(database: sqlite3.Connection) -> None:
+def _drop_frame(database: sqlite3.Connection) -> None:
     """Drop the least valuable frame; see Spool."""
     row = database.execute("SELECT id FROM frames WHERE reason IS NOT NULL ORDER BY id").fetchone()
     if row is not None:
@@ -627,8 +627,8 @@ def _give_up_one(database: sqlite3.Connection) -> None:
     before, after = _neighbour(database, run, number, -1), _neighbour(database, run, number, 1)
     database.execute("DELETE FROM frames WHERE id = ?", (number,))
     database.execute("UPDATE counters SET thinned = thinned + 1")
-    _renew_novelty(database, before)
-    _renew_novelty(database, after)
+    _update_novelty(database, before)
+    _update_novelty(database, after)
 
 
 def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side: int) -> int | None:
@@ -642,7 +642,7 @@ def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side:
     return None if row is None else int(row[0])
 
 
-def _renew_novelty(database: sqlite3.Connection, number: int | None) -> None:
+def _update_novelty(database: sqlite3.Connection, number: int | None) -> None:
     """Store the separation of a frame from its two neighbours; null at the ends of a run."""
     if number is None:
         return
@@ -676,7 +676,7 @@ def _statements(script: str) -> Iterator[str]:
 # Answers of the service.
 
 #: Statuses that concern one frame and not the next one.
-_OF_A_FRAME = (400, 409, 413, 415, 422)
+_FRAME_STATUSES = (400, 409, 413, 415, 422)
 
 
 def _is_about_content(error: errors.SceneprintError) -> bool:

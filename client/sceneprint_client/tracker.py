@@ -51,7 +51,7 @@ __all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters
 #: Errors after which a later query may succeed.
 _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited, errors.StoreAway, errors.StoreLocked)
 #: Greatest age of earlier frames in a query, seconds.
-_OLDEST_S = 30.0
+_MAXIMUM_AGE_S = 30.0
 #: Lowest HTTP status that is a fault of the service or of a proxy.
 _FIRST_FAULT = 500
 
@@ -125,7 +125,7 @@ class Tracker:
         stamp = time.time() if stamp is None else stamp
         with self._lock:
             state = self._core.move(stamp, np.asarray(odom_pose, np.float64))
-            self._write({"stamp": stamp, "odometry": _listed(odom_pose)})
+            self._write({"stamp": stamp, "odometry": _flat_list(odom_pose)})
             return state
 
     def state(self) -> State:
@@ -164,13 +164,13 @@ class Tracker:
                 self._views.clear()
             elif is_readable:
                 self._remember(view)
-            line = {"stamp": stamp, "odometry": _listed(odom_pose)}
+            line = {"stamp": stamp, "odometry": _flat_list(odom_pose)}
             self._write({**line, "observation": _observation_json(observation)})
             return state
 
     def _earlier(self, view: _View) -> list[_View]:
         """Return the earlier frames of the next query; none while tracking."""
-        views = [one for one in self._views if 0 <= view.stamp - one.stamp <= _OLDEST_S]
+        views = [one for one in self._views if 0 <= view.stamp - one.stamp <= _MAXIMUM_AGE_S]
         poses = [one.T_odom_sensor for one in (*views, view)]
         places = spaced_views(poses, self._core.parameters.frames)
         return [views[place] for place in places[:-1]]
@@ -201,7 +201,7 @@ class Tracker:
         self, view: _View, earlier: list[_View], prior: PoseEvidence | None
     ) -> tuple[Localization, list[_View]]:
         """Send a query; return its answer and the earlier frames that support it."""
-        known = None if prior is None else _sent_prior(prior)
+        known = None if prior is None else _prior_of(prior)
         if earlier:
             back = inverse(view.T_odom_sensor)  # the query uses poses relative to this frame
             sent = [*earlier, view]
@@ -341,7 +341,7 @@ def replay(lines: Iterable[str], parameters: TrackerParameters | None = None) ->
             yield core.move(line["stamp"], _matrix(line["odometry"]))
 
 
-def _listed(matrix: NDArray[Any]) -> list[float]:
+def _flat_list(matrix: NDArray[Any]) -> list[float]:
     return [float(value) for value in np.asarray(matrix, np.float64).ravel()]
 
 
@@ -353,16 +353,16 @@ def _observation_json(observation: Observation) -> dict[str, Any]:
     poses = [
         {
             "parent_frame": one.parent_frame,
-            "matrix": _listed(one.T_map_sensor),
+            "matrix": _flat_list(one.T_map_sensor),
             "weight": one.weight,
-            "covariance": None if one.covariance is None else _listed(one.covariance),
+            "covariance": None if one.covariance is None else _flat_list(one.covariance),
         }
         for one in observation.poses
     ]
     return {
         "status": observation.status, "poses": poses, "strong": observation.strong,
         "by_prior": observation.by_prior, "reason": observation.reason,
-        "earlier": [_listed(one) for one in observation.earlier],
+        "earlier": [_flat_list(one) for one in observation.earlier],
     }  # fmt: skip
 
 
@@ -380,11 +380,11 @@ def _observation_from(line: dict[str, Any]) -> Observation:
     )
 
 
-def _sent_prior(pose: PoseEvidence) -> Prior:
+def _prior_of(pose: PoseEvidence) -> Prior:
     if pose.covariance is None:
         raise AssertionError("the prior of a tracker has a covariance")
     sent = GivenPose(parent_frame=pose.parent_frame, matrix=pose.T_map_sensor.tolist())
-    return Prior(pose=sent, covariance=_listed(pose.covariance))
+    return Prior(pose=sent, covariance=_flat_list(pose.covariance))
 
 
 def _with_odometry(meta: FrameMeta, T_odom_sensor: NDArray[np.float64]) -> FrameMeta:

@@ -216,7 +216,7 @@ class _Vote:
     evidence: PoseEvidence
     weight: float
     found: bool
-    friends: set[int] = field(default_factory=set)  #: indices of the votes that agree
+    agreeing: set[int] = field(default_factory=set)  #: indices of the votes that agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +248,7 @@ class TrackerCore:
         """Update the odometry without an answer, and return the state."""
         mark = self._mark(stamp, rigid_transform(T_odom_sensor))
         if self._belief is not None:
-            self._verdict = self._tracked(mark)
+            self._verdict = self._track(mark)
         return self.state()
 
     def update(self, stamp: float, T_odom_sensor: Array, observation: Observation) -> State:
@@ -272,16 +272,16 @@ class TrackerCore:
         mark = self._mark(stamp, rigid_transform(T_odom_sensor))
         if observation.status == "unanswered":
             status, reason = self._verdict[0], observation.reason
-            self._verdict = self._tracked(self._marks[-1]) if self._belief else (status, reason)
+            self._verdict = self._track(self._marks[-1]) if self._belief else (status, reason)
             return self.state()
         self._answers += 1
         mark = replace(mark, earlier=observation.earlier)
         self._vote(mark, observation)
         if self._belief is None:
-            self._verdict = self._fixed(mark, observation)
+            self._verdict = self._first_fix(mark, observation)
         else:
             self._compare(mark, observation)
-            self._verdict = self._tracked(self._marks[-1])
+            self._verdict = self._track(self._marks[-1])
         return self.state()
 
     def reset(self, reason: str = "it was reset") -> State:
@@ -303,7 +303,7 @@ class TrackerCore:
         belief = self._belief
         if belief is None:
             return State(status, stamp, None, None, None, None, None, reason)
-        T, P = self._predicted(self._marks[-1])
+        T, P = self._predict(self._marks[-1])
         T_map_odom = rigid_transform(belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor))
         age = stamp - belief.confirmed
         return State(status, stamp, belief.parent_frame, T_map_odom, T, P, age, reason)
@@ -313,8 +313,8 @@ class TrackerCore:
         alone = (self._answers + 1) % self.parameters.alone_every == 0
         if self._belief is None or self._against or alone or self._verdict[0] != "tracking":
             return None
-        T, P = self._predicted(self._ahead(rigid_transform(T_odom_sensor)))
-        return PoseEvidence(self._belief.parent_frame, T, 1.0, P + _diagonal(0.05, 0.03))
+        T, P = self._predict(self._ahead(rigid_transform(T_odom_sensor)))
+        return PoseEvidence(self._belief.parent_frame, T, 1.0, P + _diagonal_covariance(0.05, 0.03))
 
     # Odometry.
 
@@ -347,7 +347,7 @@ class TrackerCore:
         turned = math.radians(p.heading_drift_deg) * way + p.turn_drift * abs(a.angle - b.angle)
         return p.drift * way, turned
 
-    def _apart(self, a: _Mark, b: _Mark) -> bool:
+    def _are_independent(self, a: _Mark, b: _Mark) -> bool:
         """Return whether each view of one answer is independent of each view of the other."""
         A, B = (np.stack([one.T_odom_sensor, *one.earlier]) for one in (a, b))
         steps = np.linalg.norm(A[:, None, :3, 3] - B[None, :, :3, 3], axis=2)
@@ -369,25 +369,25 @@ class TrackerCore:
                 weight = p.strong_weight if observation.strong else p.weak_weight
             vote = _Vote(self._answers, mark, pose, weight, found)
             for place, other in enumerate(self._votes):
-                if self._agree(other, vote):
-                    vote.friends.add(place)
-                    other.friends.add(len(self._votes))
-            vote.friends.add(len(self._votes))
+                if self._votes_agree(other, vote):
+                    vote.agreeing.add(place)
+                    other.agreeing.add(len(self._votes))
+            vote.agreeing.add(len(self._votes))
             self._votes.append(vote)
-        self._keep(lambda vote: vote.number > self._answers - p.most_votes)
+        self._filter_votes(lambda vote: vote.number > self._answers - p.most_votes)
 
-    def _keep(self, condition: Callable[[_Vote], bool]) -> None:
+    def _filter_votes(self, condition: Callable[[_Vote], bool]) -> None:
         """Remove all votes that do not satisfy a condition."""
         if all(map(condition, self._votes)):
             return
         remaining = [old for old, vote in enumerate(self._votes) if condition(vote)]
         place = {old: new for new, old in enumerate(remaining)}
         self._votes = [
-            replace(one, friends={place[friend] for friend in one.friends if friend in place})
+            replace(one, agreeing={place[friend] for friend in one.agreeing if friend in place})
             for one in map(self._votes.__getitem__, remaining)
         ]
 
-    def _agree(self, older: _Vote, newer: _Vote) -> bool:
+    def _votes_agree(self, older: _Vote, newer: _Vote) -> bool:
         """Return whether two votes agree, after odometry moves the older to the newer."""
         if older.evidence.parent_frame != newer.evidence.parent_frame:
             return False
@@ -404,7 +404,7 @@ class TrackerCore:
         """Return the weight of votes that agree; views that are not `apart` count once."""
         votes = [self._votes[place] for place in places]
         weighed = sorted(
-            ((self._aged(one), one) for one in votes if one.found or not found),
+            ((self._current_weight(one), one) for one in votes if one.found or not found),
             key=lambda pair: (-pair[0], pair[1].number),
         )
         counted: list[_Mark] = []
@@ -415,52 +415,52 @@ class TrackerCore:
                 total += weight
         return total
 
-    def _aged(self, vote: _Vote) -> float:
+    def _current_weight(self, vote: _Vote) -> float:
         """Return the current weight of a vote."""
         p, now = self.parameters, self._votes[-1].mark
         halves = abs(now.distance - vote.mark.distance) / p.half_life_m
         halves += abs(now.stamp - vote.mark.stamp) / p.half_life_s
         return float(vote.weight * 0.5**halves)
 
-    def _fixed(self, mark: _Mark, observation: Observation) -> tuple[TrackerStatus, str]:
+    def _first_fix(self, mark: _Mark, observation: Observation) -> tuple[TrackerStatus, str]:
         """Return the verdict of a first fix; the leading place becomes the belief."""
         p = self.parameters
         own = [i for i, vote in enumerate(self._votes) if vote.number == self._answers]
         if not own:
-            disputed = any(len(one.friends) < len(self._votes) for one in self._votes)
+            disputed = any(len(one.agreeing) < len(self._votes) for one in self._votes)
             waits = "several places are possible; " if disputed else ""
             return "ambiguous" if waits else "lost", waits + observation.reason
-        apart = cache(self._apart)  # each vote compares the same places
-        totals = [self._weight(vote.friends, apart, found=False) for vote in self._votes]
-        founds = [self._weight(vote.friends, apart, found=True) for vote in self._votes]
+        apart = cache(self._are_independent)  # each vote compares the same places
+        totals = [self._weight(vote.agreeing, apart, found=False) for vote in self._votes]
+        founds = [self._weight(vote.agreeing, apart, found=True) for vote in self._votes]
         best = max(own, key=lambda place: (founds[place], totals[place], -place))
-        others = [i for i in range(len(totals)) if i not in self._votes[best].friends]
+        others = [i for i in range(len(totals)) if i not in self._votes[best].agreeing]
         rival = max((totals[i] for i in others), default=0.0)
         rival_found = max((founds[i] for i in others), default=0.0)
         leads = totals[best] - rival >= p.need - 1e-9 and founds[best] >= p.ratio * rival_found
         if founds[best] > 0 and leads:
-            self._believe(mark, best)
+            self._set_belief(mark, best)
             return "tracking", "found: " + observation.reason
         if observation.status == "ambiguous" or rival_found > 0:
             return "ambiguous", "several places are possible; " + observation.reason
         return "lost", "one view suggests a place; move, and query again"
 
-    def _believe(self, mark: _Mark, best: int) -> None:
+    def _set_belief(self, mark: _Mark, best: int) -> None:
         """Set the belief to the newest vote `found` at the best place, moved by odometry."""
-        friends = [self._votes[place] for place in self._votes[best].friends]
-        vote = max((one for one in friends if one.found), key=lambda one: one.number)
+        supporters = [self._votes[place] for place in self._votes[best].agreeing]
+        vote = max((one for one in supporters if one.found), key=lambda one: one.number)
         pose = vote.evidence
         start = _Belief(
-            pose.parent_frame, vote.mark, pose.T_map_sensor, _measured(pose), vote.mark.stamp
+            pose.parent_frame, vote.mark, pose.T_map_sensor, _covariance_of(pose), vote.mark.stamp
         )
         self._belief = start
-        T, P = self._predicted(mark)
+        T, P = self._predict(mark)
         self._belief = replace(start, mark=mark, T_map_sensor=T, covariance=P)
         self._against.clear()
 
     # The tracked place.
 
-    def _predicted(self, mark: _Mark) -> tuple[Array, Array]:
+    def _predict(self, mark: _Mark) -> tuple[Array, Array]:
         """Return T_map_sensor and its covariance at a pose of the odometry."""
         belief = self._belief
         if belief is None:
@@ -468,15 +468,15 @@ class TrackerCore:
         T = belief.T_map_sensor @ inverse(belief.mark.T_odom_sensor) @ mark.T_odom_sensor
         drift_m, drift_rad = self._drifts(belief.mark, mark)
         carried = shifted_covariance(belief.covariance, T[:3, 3] - belief.T_map_sensor[:3, 3])
-        return T, carried + _diagonal(drift_m, drift_rad)
+        return T, carried + _diagonal_covariance(drift_m, drift_rad)
 
     def _is_tracked(self, pose: PoseEvidence, T: Array, P: Array) -> bool:
         """Return whether a pose agrees with the tracked one, within the gate and its covariance."""
         if self._belief is None or pose.parent_frame != self._belief.parent_frame:
             return False
         step, turn = difference(T, pose.T_map_sensor)
-        gate = self.parameters.gate_m + 2 * _deviation(P[:3, :3])
-        gate_rad = math.radians(self.parameters.gate_deg) + 2 * _deviation(P[3:, 3:])
+        gate = self.parameters.gate_m + 2 * _largest_deviation(P[:3, :3])
+        gate_rad = math.radians(self.parameters.gate_deg) + 2 * _largest_deviation(P[3:, 3:])
         return step <= gate and turn <= gate_rad
 
     def _compare(self, mark: _Mark, observation: Observation) -> None:
@@ -484,7 +484,7 @@ class TrackerCore:
         belief = self._belief
         if belief is None or not observation.poses:
             return
-        T, P = self._predicted(mark)
+        T, P = self._predict(mark)
         agreeing = [one for one in observation.poses if self._is_tracked(one, T, P)]
         if observation.status == "found" and agreeing:
             if observation.by_prior:
@@ -508,10 +508,10 @@ class TrackerCore:
     def _correct(self, mark: _Mark, pose: PoseEvidence, factor: float) -> None:
         """Apply a step of a Kalman filter; a repeated view from one place adds no information."""
         belief = self._belief
-        if belief is None or not self._apart(belief.mark, mark):
+        if belief is None or not self._are_independent(belief.mark, mark):
             return
-        T, P = self._predicted(mark)
-        R = _measured(pose) * factor**2
+        T, P = self._predict(mark)
+        R = _covariance_of(pose) * factor**2
         gain = P @ np.linalg.inv(P + R)
         off = np.concatenate([
             pose.T_map_sensor[:3, 3] - T[:3, 3],
@@ -523,29 +523,29 @@ class TrackerCore:
         moved[:3, 3] = T[:3, 3] + shift[:3]
         covariance = P - gain @ P
         covariance = (covariance + covariance.T) / 2
-        floor = np.diag(_diagonal(_LEAST_M, _LEAST_RAD))
+        floor = np.diag(_diagonal_covariance(_LEAST_M, _LEAST_RAD))
         covariance[np.diag_indices(6)] = np.maximum(np.diag(covariance), floor)
         self._belief = replace(
             belief, mark=mark, T_map_sensor=rigid_transform(moved), covariance=covariance
         )
 
-    def _tracked(self, mark: _Mark) -> tuple[TrackerStatus, str]:
+    def _track(self, mark: _Mark) -> tuple[TrackerStatus, str]:
         """Return the verdict on the belief, and drop a belief that is no longer supported."""
         p, belief = self.parameters, self._belief
         if belief is None:
             return self._verdict
-        _, P = self._predicted(mark)
+        _, P = self._predict(mark)
         if self._against:
             first, since = self._against[0][:2]
             lasted = mark.stamp - since.stamp
             enough = self._contradiction() >= p.contradictions - 1e-9
             if enough or (len(self._against) > 1 and lasted >= p.patience_s - 1e-9):
-                self._keep(lambda vote: vote.number >= first)
+                self._filter_votes(lambda vote: vote.number >= first)
                 self._forget()
                 return "lost", "answers repeatedly contradict the tracked place"
             if len(self._against) > 1:
                 return "ambiguous", "answers from one place contradict the tracked place"
-        deviation = _deviation(P[:3, :3])
+        deviation = _largest_deviation(P[:3, :3])
         if deviation > p.most_deviation_m:
             self._forget()
             return "lost", f"odometry since the last fix may be off by {deviation:.2f} m"
@@ -559,7 +559,7 @@ class TrackerCore:
         """Return the weight of contradicting answers; views from one place count once."""
         counted: list[tuple[int, _Mark, float]] = []
         for one in sorted(self._against, key=lambda one: (-one[2], one[0])):
-            if all(self._apart(one[1], other[1]) for other in counted):
+            if all(self._are_independent(one[1], other[1]) for other in counted):
                 counted.append(one)
         return sum(weight for _, _, weight in counted)
 
@@ -657,17 +657,17 @@ def shifted_covariance(P: Array, offset: Array) -> Array:
     return np.asarray(F @ P @ F.T, np.float64)
 
 
-def _diagonal(metres: float, radians: float) -> Array:
+def _diagonal_covariance(metres: float, radians: float) -> Array:
     """Return the covariance (6, 6) of independent deviations."""
     return np.diag(np.repeat([metres**2, radians**2], 3))
 
 
-def _measured(pose: PoseEvidence) -> Array:
+def _covariance_of(pose: PoseEvidence) -> Array:
     """Return the covariance of an answer, with the additional deviation of any answer."""
-    least = _diagonal(_ANSWER_M, _ANSWER_RAD)
+    least = _diagonal_covariance(_ANSWER_M, _ANSWER_RAD)
     return least if pose.covariance is None else pose.covariance + least
 
 
-def _deviation(P: Array) -> float:
+def _largest_deviation(P: Array) -> float:
     """Return the largest standard deviation in any direction."""
     return math.sqrt(max(float(np.linalg.eigvalsh(P)[-1]), 0.0))

@@ -202,7 +202,7 @@ class TransformTree:
             parents = {
                 parent: edge
                 for parent, edge in edges.items()
-                if parent not in found and (not constant or self._holds_still(parent, found[-1]))
+                if parent not in found and (not constant or self._is_fixed(parent, found[-1]))
             }
             if not parents:
                 return found
@@ -236,7 +236,7 @@ class TransformTree:
     def moves_below(self, frame: str) -> bool:
         """Return whether a direct child of a frame moves."""
         return any(
-            not self._holds_still(frame, child)
+            not self._is_fixed(frame, child)
             for child, edges in self._edges.items()
             if frame in edges
         )
@@ -270,7 +270,7 @@ class TransformTree:
         """
         up = self.ancestors(sensor)
         moves = [
-            not self._holds_still(parent, child)
+            not self._is_fixed(parent, child)
             for child, parent in pairwise(up)
         ]  # fmt: skip
         named: list[str] = []
@@ -333,7 +333,7 @@ class TransformTree:
             ]  # fmt: skip
         return found
 
-    def _holds_still(self, parent: str, child: str) -> bool:
+    def _is_fixed(self, parent: str, child: str) -> bool:
         """Return whether a transform is fixed; a base that never moved may have stood still."""
         edge = self._edges[child][parent]
         names = {parent.rpartition("/")[2], child.rpartition("/")[2]}
@@ -346,7 +346,7 @@ class TransformTree:
         """Return one transform at the stamps; see `lookup`."""
         edge = self._edges[child][parent]
         rows = np.frombuffer(edge.samples, np.float64).reshape(-1, 7)
-        if self._holds_still(parent, child):
+        if self._is_fixed(parent, child):
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = rotation_of(rows[-1, 3:]), rows[-1, :3]
             return [T] * len(stamps_ns)
@@ -360,7 +360,7 @@ class TransformTree:
         before = np.maximum(np.searchsorted(times, seconds, "right") - 1, 0)
         after = np.minimum(np.searchsorted(times, seconds), len(times) - 1)
         distance = np.minimum(np.abs(times[before] - seconds), np.abs(times[after] - seconds))
-        doubted = _between_doubts(*contradictions(times, rows), before, after)
+        doubted = _contradict_around(*contradictions(times, rows), before, after)
 
         _, first = np.unique(times, return_index=True)
         trajectory = SensorTrajectory(times[first], rows[first, :3], rows[first, 3:])
@@ -435,7 +435,7 @@ def _steps(rows: Floats, others: Floats) -> Floats:
     return np.hstack([others[:, :3] - rows[:, :3], 2.0 * turn])
 
 
-def _between_doubts(
+def _contradict_around(
     too_fast: NDArray[np.bool_], disputed: NDArray[np.bool_], before: NDArray[np.intp],
     after: NDArray[np.intp],
 ) -> NDArray[np.bool_]:  # fmt: skip

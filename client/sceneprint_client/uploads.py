@@ -73,7 +73,7 @@ class UploadMethods(ServiceConnection):
         added, _ = self.add(
             map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel, up=up
         )  # fmt: skip
-        return self._settled(map_name, added, until)
+        return self._await_job(map_name, added, until)
 
     def add(
         self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
@@ -114,7 +114,7 @@ class UploadMethods(ServiceConnection):
             "PUT", frame_path(map_name, frame_id), frame, meta, wait_s or 0.0,
             upload_fields(priority, if_novel), up,
         )  # fmt: skip
-        return self._settled(map_name, added, until)
+        return self._await_job(map_name, added, until)
 
     def upload_batch(
         self, map_name: str, frames: Sequence[FrameInput],
@@ -149,7 +149,7 @@ class UploadMethods(ServiceConnection):
         known = [None] * len(frames) if metas is None else metas
         request = frames_form(frames, known)
         request["data"] |= upload_fields(priority, if_novel)
-        return self._ask(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request).items
+        return self._call(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request).items
 
     def _upload(
         self, method: str, path: str, frame: FrameInput, meta: MetaInput | None,
@@ -166,13 +166,13 @@ class UploadMethods(ServiceConnection):
         )  # fmt: skip
         return read_record(Added, response), response.status_code != 200
 
-    def _settled(self, map_name: str, added: Added, until: float) -> Added:
+    def _await_job(self, map_name: str, added: Added, until: float) -> Added:
         """Wait for the job of an upload until a time of `time.monotonic`, and return the upload."""
         for pause in growing_pauses(until):
             if added.state not in (FrameState.RECEIVED, FrameState.SIGNING):
                 break
-            self._let_work(pause)
-            now = self._ask(Frame, "GET", frame_path(map_name, added.frame_id))
+            self._work_or_wait(pause)
+            now = self._call(Frame, "GET", frame_path(map_name, added.frame_id))
             added = added.model_copy(update={"state": now.state, "reason": now.reason})
         return added
 

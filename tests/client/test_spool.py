@@ -329,7 +329,7 @@ def test_a_frame_larger_than_the_journal_leaves_it_as_large(tmp_path: Path, refu
         spool.add(b"x" * (3 << 20), meta(name="a"))
         before = journal.stat().st_size
         assert before < 3 << 20
-        spool._settle(*(([], {1: "a reason"}) if refused else ([1], {})))
+        spool._record_results(*(([], {1: "a reason"}) if refused else ([1], {})))
         assert journal.stat().st_size == before
         assert [one.reason for one in spool.refusals()] == ["a reason"] * refused
         assert spool.status().uploaded == (not refused)
@@ -343,7 +343,7 @@ def test_a_reason_without_room_is_told_to_be_missing(tmp_path: Path) -> None:
         spool._database.execute(
             "CREATE TRIGGER stop BEFORE INSERT ON reasons BEGIN SELECT RAISE(ABORT, 'full'); END"
         )
-        spool._settle([], {1: "a reason"})
+        spool._record_results([], {1: "a reason"})
         assert (spool.status().waiting, spool.status().refused) == (0, 1)
         assert [one.reason for one in spool.refusals()] == [
             "The service refused it; the disk had no room for its reason"

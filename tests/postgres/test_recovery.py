@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from benchmarks.postgres import OPTIONS, Server, binaries, of_nobody
+from benchmarks.postgres import OPTIONS, Server, binaries, nobody_prefix
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import UnknownFrame
 from sceneprint.maintenance.fsck.check import fsck
@@ -33,7 +33,7 @@ Until = Callable[[Callable[[], Any]], Any]
 def recover(*arguments: object, options: str = "") -> subprocess.CompletedProcess[str]:
     """Run the script as who runs PostgreSQL."""
     path = f"{binaries()}:{os.environ['PATH']}"
-    command = [*of_nobody(), "env", f"PATH={path}", f"PGOPTS={options}", "bash", str(SCRIPT)]
+    command = [*nobody_prefix(), "env", f"PATH={path}", f"PGOPTS={options}", "bash", str(SCRIPT)]
     given = [*command, *map(str, arguments)]
     return subprocess.run(
         given, capture_output=True, text=True, timeout=PATIENCE_S, cwd="/", check=False
@@ -143,7 +143,7 @@ def recovered(place: Path, data: Path, moment: str) -> Iterator[Server]:
         yield new
     finally:
         stopping = [str(binaries() / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"]
-        subprocess.run([*of_nobody(), *stopping], check=True, capture_output=True, cwd="/")
+        subprocess.run([*nobody_prefix(), *stopping], check=True, capture_output=True, cwd="/")
 
 
 @pytest.mark.thorough

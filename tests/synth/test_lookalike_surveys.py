@@ -22,8 +22,8 @@ from sceneprint_lab.synth.lookalike_surveys import (
     bay,
     block,
     distinct_fraction,
-    drifted,
     row_of,
+    with_drift,
 )
 from sceneprint_lab.synth.lookalikes import Likeness
 from sceneprint_lab.synth.sensors import Rosette, Spinning
@@ -103,7 +103,7 @@ def test_a_scan_does_not_tell_equal_places_apart_and_tells_others() -> None:
 def test_drift_is_a_random_walk_that_starts_true() -> None:
     poses = np.stack([scanner_pose(2.0 * k, 0.0, 1.0, 0.1 * k, np.random.default_rng(k))
                       for k in range(400)])  # fmt: skip
-    off = drifted(poses, np.random.default_rng(1))
+    off = with_drift(poses, np.random.default_rng(1))
     np.testing.assert_array_equal(off[0], poses[0])
     np.testing.assert_allclose(off[:, :3, :3] @ off[:, :3, :3].swapaxes(1, 2),
                                np.broadcast_to(np.eye(3), (400, 3, 3)), atol=1e-9)  # fmt: skip

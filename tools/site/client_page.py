@@ -49,14 +49,14 @@ def client_page() -> str:
         plain("Everything that `sceneprint_client` offers. Bodies and answers are the "
         "records of `sceneprint_client.api`: ") + "[Records](http/records.md). It raises the "
         "errors of `sceneprint_client.errors`: [Errors](errors.md).",
-        *(_described(name, getattr(sceneprint_client, name)) for name in public_names()),
+        *(_describe(name, getattr(sceneprint_client, name)) for name in public_names()),
     )  # fmt: skip
 
 
-def _described(name: str, one: Any) -> str:
+def _describe(name: str, one: Any) -> str:
     if not inspect.isclass(one):
         if callable(one):
-            return page(f"## {name}", fenced(signature(name, one), "python"), documented(one))
+            return page(f"## {name}", fenced(signature(name, one), "python"), markdown_of(one))
         return page(f"## {name}", f"{code(str(one))}")
     methods = public_methods(one)
     constructor = getattr(one, "__init__", None)
@@ -68,7 +68,7 @@ def _described(name: str, one: Any) -> str:
     return page(
         f"## {name}",
         fenced(shown, "python"),
-        documented(one),
+        markdown_of(one),
         properties,
         *(_method(name, each, function) for each, function in methods.items()),
     )
@@ -79,7 +79,7 @@ def _method(owner: str, name: str, function: Callable[..., object]) -> str:
     return page(
         f"### {name} {{ #{anchor} }}",
         fenced(signature(name, function), "python"),
-        documented(function),
+        markdown_of(function),
     )
 
 
@@ -118,10 +118,10 @@ def _annotation(annotation: Any) -> str:
     return annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
 
 
-def documented(one: object) -> str:
+def markdown_of(one: object) -> str:
     """Return a docstring as Markdown, with a table for each section of NumPy's style."""
     text, *sections = _SECTION.split(inspect.getdoc(one) or "")
-    parts = [_prose(text)]
+    parts = [_paragraphs(text)]
     for title, body in zip(sections[::2], sections[1::2], strict=True):
         rows = list(_entries(body))
         if rows:
@@ -131,7 +131,7 @@ def documented(one: object) -> str:
     return page(*parts)
 
 
-def _prose(text: str) -> str:
+def _paragraphs(text: str) -> str:
     """Return paragraphs as Markdown; indented text is code."""
     blocks = re.split(r"\n\n", text.strip("\n"))
     shown: list[str] = []

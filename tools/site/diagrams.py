@@ -115,13 +115,13 @@ def read_diagram(text: str) -> Diagram:
         if line.startswith("accTitle:"):
             found.title = line.partition(":")[2].strip()
         elif edge is not None:
-            source = _note(found, *edge.group(1, 2, 3))
-            target = _note(found, *edge.group(6, 7, 8))
+            source = _add_node(found, *edge.group(1, 2, 3))
+            target = _add_node(found, *edge.group(6, 7, 8))
             if source == target:
                 raise ValueError(f"{line!r}: An edge from a node to itself is not supported.")
             found.links.append(Link(source, target, _lines(edge[5] or ""), edge[4] == "-.->"))
         elif alone is not None:
-            _note(found, *alone.group(1, 2, 3))
+            _add_node(found, *alone.group(1, 2, 3))
         else:
             raise ValueError(f"{line!r} is not a node, an edge or `accTitle: ...`.")
     if not found.title:
@@ -129,7 +129,7 @@ def read_diagram(text: str) -> Diagram:
     return found
 
 
-def _note(diagram: Diagram, name: str, shape: str | None, text: str | None) -> str:
+def _add_node(diagram: Diagram, name: str, shape: str | None, text: str | None) -> str:
     """Add a node at its first use, and set its text when a line defines it."""
     if name not in diagram.nodes or shape:
         diagram.nodes[name] = Node(name, _lines(text or name), _SHAPES[shape or "["])
@@ -163,7 +163,7 @@ def layered(diagram: Diagram) -> LayeredGraph:
     Only edges that close a cycle lead backward. Labels of edges have separate layers, so that they
     overlap nothing.
     """
-    backward = set(_backward(diagram))
+    backward = set(_cycle_links(diagram))
     _assign_layers(diagram, backward)
     found = LayeredGraph(list(diagram.nodes.values()), [])
     for number, link in enumerate(diagram.links):
@@ -173,12 +173,12 @@ def layered(diagram: Diagram) -> LayeredGraph:
         route = list(_route(ends[0], ends[1], link, number))
         found.nodes += route[1:-1]
         found.routes.append(route[::-1] if number in backward else route)
-    layers = _ordered(found)
+    layers = _order_layers(found)
     _place(found, layers, diagram.across)
     return found
 
 
-def _backward(diagram: Diagram) -> Iterator[int]:
+def _cycle_links(diagram: Diagram) -> Iterator[int]:
     """Yield the indices of the links that close a cycle."""
     leaving = defaultdict(list)
     for number, link in enumerate(diagram.links):
@@ -225,7 +225,7 @@ def _route(source: Node, target: Node, link: Link, number: int) -> Iterator[Node
     yield target
 
 
-def _ordered(found: LayeredGraph) -> list[list[Node]]:
+def _order_layers(found: LayeredGraph) -> list[list[Node]]:
     """Return the order of nodes in each layer with the fewest crossings that the sweeps found."""
     layers: list[list[Node]] = [[] for _ in range(max(one.layer for one in found.nodes) + 1)]
     for one in found.nodes:
@@ -287,7 +287,7 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
     for sweep in range(160):
         for layer in layers[:: 1 if sweep % 2 == 0 else -1]:
             wanted = [_mean([beside[o] for o in near[one.name]], beside[one.name]) for one in layer]
-            _spread(layer, wanted, beside, {one.name: size[one.name][0] for one in layer})
+            _separate(layer, wanted, beside, {one.name: size[one.name][0] for one in layer})
     low = min(beside[one.name] - size[one.name][0] / 2 for one in found.nodes)
     along = 2.0
     for layer in layers:
@@ -302,7 +302,7 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
     found.height = max(one.y + one.height / 2 for one in found.nodes) + 2.0
 
 
-def _spread(
+def _separate(
     layer: list[Node], wanted: list[float], beside: dict[str, float], size: dict[str, float]
 ) -> None:
     """Place the nodes of a layer without overlaps, in order and near their wanted positions.
@@ -346,7 +346,7 @@ def svg_of(diagram: Diagram, identity: str) -> str:
         dashed = ' class="dashed"' if link.dashed else ""
         path = _curve(route, diagram.across)
         parts.append(f'<path d="{path}"{dashed} marker-end="url(#{arrow})"/>')
-    parts += [_drawn(one) for one in layout.nodes if one.lines]
+    parts += [_draw_node(one) for one in layout.nodes if one.lines]
     return "".join([*parts, "</svg>"])
 
 
@@ -369,7 +369,7 @@ def _curve(route: list[Node], across: bool) -> str:
     return path
 
 
-def _drawn(one: Node) -> str:
+def _draw_node(one: Node) -> str:
     """Return a node's outline and text, or the label of an edge on an opaque background."""
     left, top = one.x - one.width / 2, one.y - one.height / 2
     radius = {"round": one.height / 2, "": 3.0}.get(one.shape, 4.0)

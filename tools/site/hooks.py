@@ -1,6 +1,6 @@
 """Hooks that mkdocs calls during the build of the site; mkdocs.yml names this file.
 
-docs/*.md, and the pages that they link to elsewhere  --rewritten-->  pages of the site
+docs/*.md, and the pages that they link to elsewhere  --rewrite_links-->  pages of the site
 the code                           --generated_pages-->  pages below reference/
 the index of docs/README.md        --navigation_of-->    tabs and their pages
 blocks of mermaid                  --svg_of-->           figures
@@ -19,12 +19,12 @@ from mkdocs.structure.pages import Page
 from tools.site import markup
 from tools.site.diagrams import Diagram, read_diagram, svg_of
 from tools.site.links import (
+    deepen_lists,
     heading_anchor,
     linked_files,
     outside_fences,
-    rewritten,
+    rewrite_links,
     site_path,
-    with_deep_lists,
 )
 from tools.site.reference import GeneratedPage, generated_pages
 
@@ -76,10 +76,10 @@ def navigation_of(index: str, generated: list[GeneratedPage]) -> list[dict[str, 
     for part in index.split("\n## ")[1:]:
         title = part.partition("\n")[0].strip()
         pages: list[Any] = [
-            {name: rewritten(f"]({path})", INDEX)[2:-1]} for name, path in _ROW.findall(part)
+            {name: rewrite_links(f"]({path})", INDEX)[2:-1]} for name, path in _ROW.findall(part)
         ]
         if title == REFERENCE:
-            pages += _listed(generated)
+            pages += _navigation_entries(generated)
         tabs.append({title: pages})
     if not any(REFERENCE in tab for tab in tabs):
         raise ValueError(f"{INDEX} has no section {REFERENCE!r} for the generated pages.")
@@ -87,7 +87,7 @@ def navigation_of(index: str, generated: list[GeneratedPage]) -> list[dict[str, 
     return tabs
 
 
-def _listed(generated: list[GeneratedPage]) -> list[Any]:
+def _navigation_entries(generated: list[GeneratedPage]) -> list[Any]:
     """Return the entries of generated pages; those of a group are below the group's name."""
     entries: list[Any] = []
     groups: dict[str, list[Any]] = {}
@@ -143,14 +143,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path, one in _Build.pages.items():
         files.append(File.generated(config, path, content=one.text))
     for path in sorted({*linked_files(ROOT, documents), *PROJECT.values()}):
-        files.append(_outside(path, config))
+        files.append(_linked_file(path, config))
         _Build.sources[site_path(path)] = path
     for name, path in _ASSETS.items():
         files.append(File.generated(config, f"site/{name}", abs_src_path=str(ROOT / path)))
     return files
 
 
-def _outside(path: str, config: MkDocsConfig) -> File:
+def _linked_file(path: str, config: MkDocsConfig) -> File:
     """Return a file outside docs/ as a page, or as a page that shows its text."""
     text = (ROOT / path).read_text(encoding="utf-8")
     if not path.endswith(".md"):
@@ -170,7 +170,7 @@ def on_page_markdown(text: str, page: Page, config: MkDocsConfig, files: Files) 
         if page.file.src_uri.startswith("reference/http/"):
             page.meta["search"] = {"boost": _LISTED}
         return text
-    text = with_deep_lists(rewritten(text, path))
+    text = deepen_lists(rewrite_links(text, path))
     if path == INDEX:
         text = with_generated(text, list(_Build.pages.values()))
         page.meta["hide"] = ["navigation"]  # the index itself is the navigation

@@ -69,7 +69,7 @@ def resource_page(name: str, document: Json) -> str:
     return page(
         f"# {name.capitalize()}",
         _overview(own, ""),
-        *(_described(one) for one in own),
+        *(_describe(one) for one in own),
     )
 
 
@@ -104,7 +104,7 @@ def _overview(own: list[Operation], file: str) -> str:
     return table(("operation", "what it does"), rows)
 
 
-def _described(one: Operation) -> str:
+def _describe(one: Operation) -> str:
     parameters = one.body.get("parameters", [])
     bare = [each for each in parameters if each.get("description", "").startswith(BARE)]
     named = [each for each in parameters if each not in bare]

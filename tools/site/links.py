@@ -64,7 +64,7 @@ def linked_files(root: Path, pages: list[str]) -> list[str]:
     return sorted(found)
 
 
-def rewritten(text: str, page: str) -> str:
+def rewrite_links(text: str, page: str) -> str:
     """Return a page's text with the relative links of the site.
 
     Parameters
@@ -93,7 +93,7 @@ def outside_fences(text: str, change: Callable[[str], str]) -> str:
     return "".join(parts) + change(text[end:])
 
 
-def with_deep_lists(text: str) -> str:
+def deepen_lists(text: str) -> str:
     """Return a page's text with list contents indented by four, as Python-Markdown requires.
 
     Git hosts accept two or three, which align with the text of the item.

@@ -274,7 +274,7 @@ def scatter(surface: Shelf, rng: np.random.Generator) -> SyntheticMesh:
     return join(parts)
 
 
-def furnished(piece: Piece, rng: np.random.Generator) -> SyntheticMesh:
+def with_objects(piece: Piece, rng: np.random.Generator) -> SyntheticMesh:
     """Return a piece with objects on all its surfaces; the number varies between pieces."""
     fullness = float(np.clip(rng.lognormal(0.1, 0.7), 0.1, 3.0))
     loads = [
@@ -692,12 +692,12 @@ def _sink(
 
 # Walls: doors, windows and niches, and objects mounted on walls.
 #
-# Wall, rng  --pierced-->  Wall with openings  --fittings-->  Mesh
+# Wall, rng  --with_openings-->  Wall with openings  --fittings-->  Mesh
 
 DOOR_TOP = 2.03  #: height of door openings, metres, below every ceiling
 
 
-def pierced(wall: Wall, rng: np.random.Generator, deepest: float) -> Wall:
+def with_openings(wall: Wall, rng: np.random.Generator, deepest: float) -> Wall:
     """Return a wall with doors, windows and niches side by side, at most `deepest` metres deep."""
     openings: list[Opening] = []
     u = rng.uniform(0.1, 0.8)

@@ -286,14 +286,14 @@ def make_storey(rng: np.random.Generator) -> Premises:
             end = min(x + float(rng.uniform(2.8, 11.0)), long, cross if x < cross else math.inf)
             parts += _room((x, end, y0, y1), side, site)
             x = end
-    with _kept_free(site.floor, PiecePose(long / 2, low + hall / 2, 0.0), long, hall):
+    with _reserved(site.floor, PiecePose(long / 2, low + hall / 2, 0.0), long, hall):
         parts += in_the_open(_OPEN, site)
         parts += on_the_floor(site)
     return Premises("storey", join(parts), site.floor)
 
 
 @contextmanager
-def _kept_free(floor: Floor, place: PiecePose, width: float, depth: float) -> Iterator[None]:
+def _reserved(floor: Floor, place: PiecePose, width: float, depth: float) -> Iterator[None]:
     """Reserve a rectangle of the floor until the context ends."""
     before = floor.claimed.copy()
     floor.take(place, width, depth)
@@ -325,7 +325,7 @@ def _room(
     inner = _rectangle(x0 + t / 2 + 0.02, x1 - t / 2 - 0.02, y0 + t / 2, y1 - t / 2)
     own = Site(walls_of(inner), site.top, site.floor, rng)
     at_walls = _ROOMS[int(rng.integers(0, len(_ROOMS)))]
-    with _kept_free(site.floor, PiecePose(x0 + start + gap / 2, side, 0.0), gap, 3.0):
+    with _reserved(site.floor, PiecePose(x0 + start + gap / 2, side, 0.0), gap, 3.0):
         for wall in own.walls:
             if rng.random() < 0.6:
                 parts += along_wall(wall, at_walls, own)

@@ -57,8 +57,8 @@ from sceneprint_lab.synth.large_scenes import (
 )
 from sceneprint_lab.synth.lookalikes import (
     APART,
+    DISTINCT_SHARE,
     ELSEWHERE,
-    TOLD_SHARE,
     Likeness,
     LookalikeSite,
     PlacedPiece,
@@ -109,7 +109,7 @@ class Stop(NamedTuple):
         return T
 
 
-class Round(NamedTuple):
+class ScanPlan(NamedTuple):
     """Locations of a site's scans; those of the map are in the order of a walk."""
 
     map: list[Stop]
@@ -142,13 +142,13 @@ def synthesise_lookalike_survey(
     own = SURVEYED_KINDS.index(kind)
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 32 + own)))
     sensor: Scanner = own_rosette(rng) if index % 3 == 2 else own_scanner(rng)
-    planned = _ROUNDS[kind](rng, index, queries, sensor)
+    planned = _PLANS[kind](rng, index, queries, sensor)
     of_map = _thinned(planned.map, rng) if index % 3 == 1 else planned.map
     true = np.stack([stop.pose for stop in of_map])
-    recorded = drifted(true, rng) if index % 2 and not perfect else true
+    recorded = with_drift(true, rng) if index % 2 and not perfect else true
     asked = [stop.pose for stop in planned.queries]
     if kind not in APART:
-        asked = [_in_map(T, true, recorded) for T in asked]
+        asked = [_drifted_pose(T, true, recorded) for T in asked]
     if perfect:
         sensor = sensor.perfect()
     name = f"{kind}-{index:03d}"
@@ -180,7 +180,7 @@ def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
     ]
 
 
-def drifted(poses: Floats, rng: np.random.Generator) -> Floats:
+def with_drift(poses: Floats, rng: np.random.Generator) -> Floats:
     """Return the poses (n, 4, 4) of a walk with the drift of odometry.
 
     The first pose is exact. Each step has a normal error. Its standard deviation, 1 to 5 cm and .02
@@ -197,7 +197,7 @@ def drifted(poses: Floats, rng: np.random.Generator) -> Floats:
     return np.stack(found)
 
 
-def _in_map(T: Floats, true: Floats, recorded: Floats) -> Floats:
+def _drifted_pose(T: Floats, true: Floats, recorded: Floats) -> Floats:
     """Return a true pose with the drift of the nearest scan of the recorded map."""
     nearest = int(np.linalg.norm(true[:, :3, 3] - T[:3, 3], axis=1).argmin())
     placed: Floats = recorded[nearest] @ inverse(true[nearest]) @ T
@@ -231,7 +231,7 @@ def _most_different(
     stops: Sequence[Stop], rivals: Callable[[Stop], list[tuple[Premises, Floats]]], n: int,
     sensor: Scanner,
 ) -> tuple[list[Stop], float]:  # fmt: skip
-    """Return n stops that differ from each rival by TOLD_SHARE, or else the n most different stops.
+    """Return the n stops that differ most, or n that each differ from all rivals by DISTINCT_SHARE.
 
     Returns
     -------
@@ -241,7 +241,7 @@ def _most_different(
     shares = [
         min(distinct_fraction(stop, *rival, sensor) for rival in rivals(stop)) for stop in stops
     ]
-    fair = [k for k, share in enumerate(shares) if share >= TOLD_SHARE]
+    fair = [k for k, share in enumerate(shares) if share >= DISTINCT_SHARE]
     if len(fair) < n:
         fair = sorted(range(len(stops)), key=lambda k: -shares[k])
     return [stops[k] for k in sorted(fair[:n])], min(shares[k] for k in fair[:n])
@@ -302,7 +302,7 @@ def bay(rng: np.random.Generator) -> Unit:
     sides = [_strip(0.2, pitch - 0.2, s, half_way + size, half - 0.1) for s in (-1, 1)]
     things = [one for outline in sides for one in stand_about(menu, Floor(outline, CELL), rng, 12)]
     # Openings of the walls along the bays and at both ends, in the order of `walls_of`.
-    pierced = [
+    with_openings = [
         hall_wall(Wall(np.zeros(2), np.array([1.0, 0.0]), length), top, rng).openings
         for length in (pitch, 2 * half, pitch, 2 * half)
     ]
@@ -310,7 +310,7 @@ def bay(rng: np.random.Generator) -> Unit:
     def around(count: int) -> SyntheticMesh:
         outline = _rectangle(0.0, count * pitch, -half, half)
         walls = []
-        for k, (wall, openings) in enumerate(zip(walls_of(outline), pierced, strict=True)):
+        for k, (wall, openings) in enumerate(zip(walls_of(outline), with_openings, strict=True)):
             copies = range(1 if k % 2 else count)
             walls.append(replace(wall, openings=_repeated(openings, pitch, copies)))
         return shell(outline, walls, top)
@@ -405,7 +405,7 @@ def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
 
 # Locations of the scans.
 #
-# rng, index, queries, Scanner  --_ROUNDS[kind]-->  Round
+# rng, index, queries, Scanner  --_PLANS[kind]-->  ScanPlan
 
 
 def _likeness(rng: np.random.Generator) -> Likeness:
@@ -456,30 +456,30 @@ class _Carrier:
 def _row(
     make: Callable[[np.random.Generator], Unit], counts: tuple[int, int], rng: np.random.Generator,
     queries: int, sensor: Scanner,
-) -> Round:  # fmt: skip
+) -> ScanPlan:  # fmt: skip
     unit, count = make(rng), int(rng.integers(*counts))
     row = row_of(unit, count, _likeness(rng), rng)
     carrier = _Carrier(unit, count, sensor, rng)
     stops = [Stop(row, T) for T in carrier.along(MAP_SCANS)]
-    return Round(stops, [Stop(row, T) for T in carrier.anywhere(queries)])
+    return ScanPlan(stops, [Stop(row, T) for T in carrier.anywhere(queries)])
 
 
-def _bays(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:  # noqa: ARG001
+def _bays(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
     return _row(bay, (5, 13), rng, queries, sensor)
 
 
-def _streets(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:  # noqa: ARG001
+def _streets(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
     return _row(block, (5, 9), rng, queries, sensor)
 
 
-def _another(index: int) -> bool:
+def _is_second_variant(index: int) -> bool:
     """Return whether a site is of the second variant of its kind."""
     return index % 4 in (1, 2)
 
 
-def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:
+def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:
     """Omit one of some equal rows, with queries that visibly differ from all of the map."""
-    street = _another(index)
+    street = _is_second_variant(index)
     unit = block(rng) if street else bay(rng)
     rows, count = (2, int(rng.integers(4, 7))) if street else (3, int(rng.integers(2, 4)))
     likeness = replace(_likeness(rng), missing=float(rng.uniform(0.15, 0.5)))
@@ -503,14 +503,14 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
         return found
 
     asked = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries)]
-    return Round(stops, _most_different(asked, rivals, queries, sensor)[0])
+    return ScanPlan(stops, _most_different(asked, rivals, queries, sensor)[0])
 
 
-def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:
+def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:
     """Map a hall with one to three details, or one half with enough details to distinguish it."""
     hall = _with_details(symmetric_hall(rng), rng)
-    if not _another(index):
-        return _walked(hall, rng, queries)
+    if not _is_second_variant(index):
+        return _plan_walk(hall, rng, queries)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
 
     def in_half(poses: list[Floats], side: int) -> list[Stop]:
@@ -523,10 +523,10 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
         asked, least = _most_different(
             in_half(walk(hall, 3 * queries, rng), -1), rivals, queries, sensor
         )
-        if least >= TOLD_SHARE:
+        if least >= DISTINCT_SHARE:
             break
         hall = _with_details(hall, rng)
-    return Round(in_half(walk(hall, MAP_SCANS, rng), 1), asked)
+    return ScanPlan(in_half(walk(hall, MAP_SCANS, rng), 1), asked)
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
@@ -538,7 +538,7 @@ def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
     return Premises("hall", join([hall.mesh, things]), hall.floor)
 
 
-def _walked(premises: Premises, rng: np.random.Generator, queries: int) -> Round:
+def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> ScanPlan:
     """Map every second to fourth scan of a walk; query others, or some beside it."""
     step = int(rng.integers(2, 5))
     poses = walk(premises, step * MAP_SCANS, rng)
@@ -546,12 +546,12 @@ def _walked(premises: Premises, rng: np.random.Generator, queries: int) -> Round
     chosen = sorted(rng.choice(others, queries, replace=queries > len(others)).tolist())
     asked = []
     for number, k in enumerate(chosen):
-        beside = _beside(premises, poses[k], rng) if number % 3 == 2 else poses[k]
+        beside = _pose_beside(premises, poses[k], rng) if number % 3 == 2 else poses[k]
         asked.append(Stop(premises, beside))
-    return Round([Stop(premises, T) for T in poses[::step]], asked)
+    return ScanPlan([Stop(premises, T) for T in poses[::step]], asked)
 
 
-def _beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
+def _pose_beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
     """Return a walkable pose 1 to 4 m beside another, turned by up to about 20 degrees."""
     spots = premises.floor.points[premises.walkable]
     away = np.linalg.norm(spots - T[:2, 3], axis=1)
@@ -563,12 +563,12 @@ def _beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
     return moved
 
 
-def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:  # noqa: ARG001
+def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
     makers = (make_hall, make_block, make_block, make_hall, make_storey)
-    return _walked(makers[index % len(makers)](rng), rng, queries)
+    return _plan_walk(makers[index % len(makers)](rng), rng, queries)
 
 
-def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> Round:  # noqa: ARG001
+def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
     """Return sites without common content, 200 m apart."""
     places = [(make(rng), (200.0 * k, 0.0, 0.0)) for k, make in enumerate((make_hall, make_block))]
     of_map = [
@@ -580,10 +580,10 @@ def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner)
     others = [makers[int(rng.integers(0, 3))](rng) for _ in range(max(2, queries // 8))]
     each = -(-queries // len(others))
     asked = [Stop(site, T) for site in others for T in walk(site, each, rng, 4.0)]
-    return Round(of_map, asked[:queries])
+    return ScanPlan(of_map, asked[:queries])
 
 
-_ROUNDS: dict[str, Callable[[np.random.Generator, int, int, Scanner], Round]] = {
+_PLANS: dict[str, Callable[[np.random.Generator, int, int, Scanner], ScanPlan]] = {
     "bays": _bays,
     "streets": _streets,
     "halls": _halls,

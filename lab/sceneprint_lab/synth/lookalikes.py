@@ -38,13 +38,13 @@ from sceneprint_lab.synth.furniture import (
     fridge,
     kitchen_row,
     overhead,
-    pierced,
     rack,
     scatter,
     shelf,
     swivel_chair,
     table,
     wall_yaw,
+    with_openings,
 )
 from sceneprint_lab.synth.mesh import (
     Ceiling,
@@ -105,7 +105,7 @@ class LookalikeSite(Generic[F_co]):
 
 
 @dataclass(frozen=True, eq=False)
-class Shoot:
+class FramePlan:
     """Scenes and T_world_camera of a site's frames, in order."""
 
     map: Sequence[tuple[Room, Floats]]
@@ -142,7 +142,7 @@ def synthesise_lookalike(
     shoot = _SHOOTS[kind](rng, index, queries)
     sensor = own_sensor(noise, intrinsics, rng) if noise else None
     if sensor is not None and kind == "object":
-        sensor = worn(sensor, rng)
+        sensor = worse_sensor(sensor, rng)
     name = f"{kind}-{index:03d}"
 
     def shots(part: str, views: Sequence[tuple[Room, Floats]]) -> tuple[DepthFrame, ...]:
@@ -164,7 +164,7 @@ def synthesise_lookalike(
     )  # fmt: skip
 
 
-def worn(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
+def worse_sensor(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
     """Return a worse sensor with a shorter range, like depth cameras of other makes."""
     s = float(rng.uniform(1.0, 2.0))
     return replace(
@@ -320,7 +320,7 @@ def bare_floor(thing: SyntheticMesh, rng: np.random.Generator, half: float = 8.0
     return Room(mesh, outline, Ceiling(4.0, np.zeros(2)))
 
 
-def _circled_object(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
+def _circled_object(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
     thing = symmetric_object(rng).mesh
     dull = thing.with_loss(float(rng.choice((0.0, rng.uniform(0.02, 0.2)))))
     room = bare_floor(dull, rng)
@@ -333,11 +333,11 @@ def _circled_object(rng: np.random.Generator, index: int, queries: int) -> Shoot
 
 def _every_fourth(
     room: Room, poses: Sequence[Floats], queries: int, rng: np.random.Generator
-) -> Shoot:
+) -> FramePlan:
     """Use every fourth pose for the map, and a number of the other poses as queries."""
     others = [k for k in range(len(poses)) if k % 4]
     chosen = sorted(rng.choice(others, min(queries, len(others)), replace=False).tolist())
-    return Shoot([(room, T) for T in poses[::4]], [(room, poses[k]) for k in chosen])
+    return FramePlan([(room, T) for T in poses[::4]], [(room, poses[k]) for k in chosen])
 
 
 # Rooms with the same furniture at almost the same places.
@@ -453,10 +453,10 @@ def rectangle(width: float, depth: float) -> Floats:
     return np.array([(0, 0), (width, 0), (width, depth), (0, depth)], float)
 
 
-def _closed(outline: Floats, rng: np.random.Generator, height: float) -> tuple[SyntheticMesh, ...]:
+def _shell(outline: Floats, rng: np.random.Generator, height: float) -> tuple[SyntheticMesh, ...]:
     """Return the shell, the fittings and the objects on the ceiling."""
     top = Ceiling(height, np.zeros(2))
-    walls = [pierced(wall, rng, 0.3) for wall in walls_of(outline)]
+    walls = [with_openings(wall, rng, 0.3) for wall in walls_of(outline)]
     fitted = [fittings(wall, top, rng) for wall in walls]
     return (shell(outline, walls, top), overhead(outline, top, rng), *fitted)
 
@@ -464,7 +464,7 @@ def _closed(outline: Floats, rng: np.random.Generator, height: float) -> tuple[S
 def equal_offices(count: int, likeness: Likeness, rng: np.random.Generator) -> list[Room]:
     """Return rooms with the same plan and furniture whose movable objects differ."""
     outline, height = rectangle(*rng.uniform((3.2, 3.6), (4.8, 5.2))), float(rng.uniform(2.4, 3.0))
-    built = _closed(outline, rng, height)
+    built = _shell(outline, rng, height)
     makers = [_OFFICE[k] for k in rng.permutation(len(_OFFICE))]
     pieces = [make(rng) for make in (*makers, *makers[: int(rng.integers(0, 3))])]
     placed = arrange(walls_of(outline), Floor(outline), pieces, None, rng)
@@ -491,20 +491,20 @@ def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tupl
     return Room(join(parts), outline, top), pitch
 
 
-def _row(rng: np.random.Generator, index: int, queries: int) -> Shoot:
+def _row(rng: np.random.Generator, index: int, queries: int) -> FramePlan:
     """Map all rooms of a row, or all bays of a hall."""
     likeness = Likeness(float(rng.uniform(0.0, 0.03)), float(rng.uniform(0.0, 0.02)))
     if index % 2:
         hall, _ = equal_bays(int(rng.integers(4, 7)), likeness, rng)
         poses = scattered_poses(hall, 48 + queries, rng)
-        return Shoot([(hall, T) for T in poses[:48]], [(hall, T) for T in poses[48:]])
+        return FramePlan([(hall, T) for T in poses[:48]], [(hall, T) for T in poses[48:]])
     rooms = equal_offices(int(rng.integers(2, 4)), likeness, rng)
     map_of = [(room, T) for room in rooms for T in scattered_poses(room, 18, rng)]
     asked = [rooms[k % len(rooms)] for k in range(queries)]
-    return Shoot(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], _in_a_row(rooms))
+    return FramePlan(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], _offsets(rooms))
 
 
-def _in_a_row(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
+def _offsets(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
     """Return a function with the offset of each room: side by side, with walls of 0.2 m."""
 
     def shift(room: Room) -> Floats:
@@ -515,7 +515,7 @@ def _in_a_row(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
 
 
 #: Fraction of a view, difference in metres, and range in metres that make two views distinct.
-TOLD_SHARE, TOLD_M, TOLD_REACH_M = 0.10, 0.10, 3.5
+DISTINCT_SHARE, DISTINCT_M, REACH_M = 0.10, 0.10, 3.5
 _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 
 
@@ -527,11 +527,11 @@ def difference_share(
     there = render(b, T_room_camera if T_other is None else T_other, _COARSE)
     nearer = np.minimum(here, there)
     # The noise of a depth camera grows with the square of the depth, up to its range.
-    least = TOLD_M * np.maximum(1.0, nearer**2 / 5.0)
-    return float(np.mean((np.abs(here - there) > least) & (nearer < TOLD_REACH_M)))
+    least = DISTINCT_M * np.maximum(1.0, nearer**2 / 5.0)
+    return float(np.mean((np.abs(here - there) > least) & (nearer < REACH_M)))
 
 
-def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
+def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
     """Omit the last room of a row from the map; the queries visibly differ from all other rooms.
 
     They must differ by more than a moved chair, since no method distinguishes an equal room from
@@ -542,17 +542,17 @@ def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> Shoot:
     *mapped, last = rooms
     map_of = [(room, T) for room in mapped for T in scattered_poses(room, 20, rng)]
     asked: list[Floats] = []
-    least = TOLD_SHARE
+    least = DISTINCT_SHARE
     while len(asked) < queries:
         for T in scattered_poses(last, queries, rng):
             told = min(difference_share(last, room, T) for room in mapped)
             if told >= least and len(asked) < queries:
                 asked.append(T)
         least *= 0.9  # rooms that are too similar are queried all the same
-    return Shoot(map_of, [(last, T) for T in asked], _in_a_row(rooms))
+    return FramePlan(map_of, [(last, T) for T in asked], _offsets(rooms))
 
 
-def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
+def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
     """Return two rooms of different plans with the same furniture in one corner."""
     pieces = [make(rng) for make in _KITCHEN]
     pieces += [pieces[2], kitchen_row(rng)][: int(rng.integers(1, 3))]
@@ -563,14 +563,14 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Shoot
     rooms = []
     for k in range(2):  # the second is larger, so its far walls are at other places
         outline, height = rectangle(*(small + k * rng.uniform(0.3, 1.5, 2))), rng.uniform(2.4, 3.0)
-        mesh = join([*_closed(outline, rng, float(height)), furnish(placed, 0, likeness, rng)])
+        mesh = join([*_shell(outline, rng, float(height)), furnish(placed, 0, likeness, rng)])
         rooms.append(Room(mesh, outline, Ceiling(float(height), np.zeros(2))))
     first, second = rooms
     asked = [(second, T) for T in scattered_poses(second, queries, rng)]
-    return Shoot([(first, T) for T in scattered_poses(first, 24, rng)], asked)
+    return FramePlan([(first, T) for T in scattered_poses(first, 24, rng)], asked)
 
 
-def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
+def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
     """Put two equal pieces back to back, with other objects around; the map shows one side."""
     make = (desk, shelf, counter, table, cupboard)[int(rng.integers(0, 5))]
     piece = make(rng)
@@ -590,7 +590,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
     size = rng.uniform((6.6, 6.6), (9.5, 9.5))
     outline = rectangle(*size) - size / 2 + rng.normal(0, 0.4, 2).clip(-0.6, 0.6)
     height = float(rng.uniform(2.5, 3.5))
-    mesh = join([*_closed(outline, rng, height), *halves])
+    mesh = join([*_shell(outline, rng, height), *halves])
     room = Room(mesh, outline, Ceiling(height, np.zeros(2)))
     radius = float(rng.uniform(1.5, 2.0)) if w < 1.6 else float(rng.uniform(1.8, 2.2))
     middle = (0.0, 0.0, 0.5 * min(float(piece.mesh.vertices[:, 2].max()), 1.2))
@@ -600,14 +600,14 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Shoot
     views = orbit(middle, radius, 6 * queries, rng, first=math.pi / 2 - sweep / 2, sweep=sweep)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     told = [difference_share(room, room, T, half_turn @ T) for T in views]
-    fair = [i for i, share in enumerate(told) if TOLD_SHARE <= share <= 0.5]
+    fair = [i for i, share in enumerate(told) if DISTINCT_SHARE <= share <= 0.5]
     if len(fair) < queries:
         fair = sorted(range(len(views)), key=lambda i: -told[i])[:queries]
     asked = [views[i] for i in sorted(rng.permutation(fair)[:queries].tolist())]
-    return Shoot([(room, T) for T in seen], [(room, T) for T in asked])
+    return FramePlan([(room, T) for T in seen], [(room, T) for T in asked])
 
 
-def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
+def _absent_places(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
     """Return rooms and objects without common content."""
 
     def views(rooms: int, each: int, around: int) -> list[tuple[Room, Floats]]:
@@ -623,10 +623,10 @@ def _absent_places(rng: np.random.Generator, index: int, queries: int) -> Shoot:
     alone = max(1, queries // 4)
     rooms = max(3, queries // 12)
     each = -(-(queries - alone) // rooms)
-    return Shoot(views(4, 10, 20), views(rooms, each, alone)[-queries:])
+    return FramePlan(views(4, 10, 20), views(rooms, each, alone)[-queries:])
 
 
-def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Shoot:  # noqa: ARG001
+def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
     """Return different rooms side by side, with views from a few places or from many.
 
     The queries see objects that were elsewhere or absent when the map was recorded.
@@ -644,7 +644,7 @@ def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Shoot
         k = next(i for i in range(len(rooms)) if room is before[i] or room is after[i])
         return np.array([starts[k], 0.0, 0.0])
 
-    return Shoot(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], shift)
+    return FramePlan(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], shift)
 
 
 def with_things(room: Room, count: int, rng: np.random.Generator) -> Room:
@@ -658,7 +658,7 @@ def with_things(room: Room, count: int, rng: np.random.Generator) -> Room:
     return replace(room, mesh=join([room.mesh, *things]))
 
 
-_SHOOTS: dict[str, Callable[[np.random.Generator, int, int], Shoot]] = {
+_SHOOTS: dict[str, Callable[[np.random.Generator, int, int], FramePlan]] = {
     "object": _circled_object,
     "offices": _row,
     "unmapped": _unmapped_room,

@@ -24,10 +24,8 @@ from sceneprint_lab.synth.furniture import (
     fittings,
     floor_thing,
     fridge,
-    furnished,
     kitchen_row,
     overhead,
-    pierced,
     round_table,
     shelf,
     small_thing,
@@ -37,6 +35,8 @@ from sceneprint_lab.synth.furniture import (
     swivel_chair,
     table,
     wall_yaw,
+    with_objects,
+    with_openings,
 )
 from sceneprint_lab.synth.mesh import (
     Ceiling,
@@ -243,7 +243,7 @@ def _pick(menu: Menu, rng: np.random.Generator) -> Piece:
 def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
     """Return the piece with its load and its chairs at a place, or nothing if there is no room."""
     rng = site.rng
-    mesh = furnished(piece, rng).moved((place.x, place.y, 0.0), place.yaw)
+    mesh = with_objects(piece, rng).moved((place.x, place.y, 0.0), place.yaw)
     if (mesh.vertices[:, 2] > site.top.at(mesh.vertices[:, :2]) - 0.02).any():
         return []
     if not site.floor.claim(place, piece.width, piece.depth):
@@ -339,7 +339,7 @@ def make_room(rng: np.random.Generator) -> Room:
     """Return a random room of 2.5 to 8 m with furniture, fittings and clutter."""
     outline = floor_plan(rng)
     top = ceiling(rng, outline)
-    walls = [pierced(w, rng, _depth_behind(w, outline)) for w in walls_of(outline)]
+    walls = [with_openings(w, rng, _depth_behind(w, outline)) for w in walls_of(outline)]
     site = Site(walls, top, Floor(outline), rng)
     keep_doors_free(site)
     parts = [shell(outline, walls, top), overhead(outline, top, rng)]

@@ -180,13 +180,13 @@ def kinect_noise(
     depth : (H, W) float32, metres, 0 if missing
     """
     p = parameters
-    rows, columns = _strayed(depth, rng, p)
+    rows, columns = _displaced_pixels(depth, rng, p)
     z, cos = depth[rows, columns], cosine[rows, columns]
-    seen = (z >= p.nearest) & (z <= p.farthest) & _within(depth.shape, p)
+    seen = (z >= p.nearest) & (z <= p.farthest) & _inside_border(depth.shape, p)
     gain = np.float32(intrinsics.fx * p.baseline)
     disparity = np.divide(gain, np.where(seen, z, 1), dtype=np.float32)
-    seen &= ~_shadowed(depth, gain, p)[rows, columns]
-    lost = _lost_share(cos, None if loss is None else loss[rows, columns], p)
+    seen &= ~_shadow_mask(depth, gain, p)[rows, columns]
+    lost = _loss_probability(cos, None if loss is None else loss[rows, columns], p)
     # A threshold on one smooth field groups losses in patches.
     hole = _field(depth.shape, p.patch, rng) * np.float32(0.9)
     hole += np.float32(math.sqrt(1 - 0.81)) * rng.standard_normal(depth.shape, np.float32)
@@ -199,7 +199,7 @@ def kinect_noise(
     return np.where(seen, z, np.float32(0))
 
 
-def _strayed(
+def _displaced_pixels(
     depth: Floats32, rng: np.random.Generator, p: KinectNoise
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return displaced rows and columns of samples; near edges of depth, blocks move together."""
@@ -214,7 +214,7 @@ def _strayed(
     return np.where(edge, other_rows, rows), np.where(edge, other_columns, columns)
 
 
-def _within(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
+def _inside_border(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
     """Return (H, W) whether a pixel lies inside the border."""
     left, right, top, bottom = p.border
     within = np.zeros(shape, bool)
@@ -222,7 +222,7 @@ def _within(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
     return within
 
 
-def _shadowed(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.bool_]:
+def _shadow_mask(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.bool_]:
     """Return the samples that the projector, to the right of the camera, does not reach.
 
     The projector lights column u - d. Of two samples with the same column, the nearer one, whose u
@@ -235,7 +235,7 @@ def _shadowed(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.b
     return ndimage.maximum_filter1d(dark, p.shadow_growth, axis=1)
 
 
-def _lost_share(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floats32:
+def _loss_probability(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floats32:
     """Return the probability (H, W) that a sample is lost, without shadows and the border."""
     steep = (math.cos(p.grazing_start) - cosine) / (
         math.cos(p.grazing_start) - math.cos(p.grazing_end)
@@ -256,13 +256,13 @@ def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Flo
     noise = rng.standard_normal(small, np.float32)
     noise = ndimage.gaussian_filter(noise, size / step, mode="wrap")
     if step > 1:
-        noise = _enlarged(noise, step)
+        noise = _enlarge(noise, step)
     noise = noise[: shape[0], : shape[1]]
     # White noise after a Gaussian blur has the standard deviation 1 / (2 sqrt(pi) sigma).
     return np.asarray(noise * np.float32(2 * math.sqrt(math.pi) * size / step), np.float32)
 
 
-def _enlarged(coarse: Floats32, step: int) -> Floats32:
+def _enlarge(coarse: Floats32, step: int) -> Floats32:
     """Return a linear interpolation with `step` samples for each coarse sample."""
     share = (np.arange(step, dtype=np.float32) / step)[:, None]
     rows = coarse[:-1, None] * (1 - share) + coarse[1:, None] * share
