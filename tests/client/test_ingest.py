@@ -156,7 +156,7 @@ def test_a_map_that_is_one_file(
     assert len(frames) == result.views > 0
     assert {(one.session, *one.tags) for one in frames} == {("given", "virtual")}
     assert len(list(client.import_items(map_name, job.job_id))) == over.progress.views
-    with pytest.raises(InvalidRequest, match="`as` is `map`"):
+    with pytest.raises(InvalidRequest, match="`as` = `map`"):
         client.import_map(map_name, file, ImportOptions())
     with pytest.raises(UnreadableCloud, match="cannot be read"):
         client.import_map(map_name, tmp_path / "none.ply")
