@@ -1,8 +1,7 @@
-"""The image and its composition are held to what they promise, without a container engine.
+"""Tests of the image and of Compose, without a container engine.
 
-Three ways: hadolint and the Compose schema read the files as they are written; rules of our own
-read what those do not know; and the steps of the image are run, each in turn, in a folder that
-stands for its file system.
+hadolint and the Compose schema check the files, our own rules check further properties, and the
+steps of the image are run in a folder that represents its file system.
 """
 
 from __future__ import annotations

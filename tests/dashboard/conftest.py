@@ -1,7 +1,7 @@
-"""A real service with real workers, and a real Chromium that looks at it, for all files here.
+"""Fixtures of the dashboard tests: a service with workers, and Chromium.
 
-Playwright's loop runs in this process as long as `browser` lasts, so that is of the folder and has
-ended before tests of others begin loops of their own.
+Playwright's event loop runs in this process while `browser` exists. The folder's stack ends it
+before tests of other folders start their own loops.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The product on PostgreSQL, unchanged: a folder on PYTHONPATH that tests and their children have.
+"""Redirection of tests and their child processes to PostgreSQL, by a folder on PYTHONPATH.
 
-`Settings(data_dir=X)` without a database URL means SQLite in X. With this it means a database of
-PostgreSQL for X, made when somebody first connects to it, as the file would be. A copy of the
-folder gets a copy of the database: a file in it says which one is its own. See tests/conftest.py.
+`Settings(data_dir=X)` without a database URL normally selects SQLite in X. Here it selects a
+database of PostgreSQL for X, created at the first connection. A copy of the folder gets a copy of
+the database, whose name is in a file of the folder. See tests/conftest.py.
 """
 
 from __future__ import annotations

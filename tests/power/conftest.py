@@ -1,12 +1,13 @@
-"""A disk that loses power: what our own files may look like afterwards, by the letter of POSIX.
+"""Simulation of a disk that loses power, with all outcomes that POSIX allows.
 
-The code under test writes real files in a real folder. An audit hook and `os.fsync` tell in which
-order; from that log this makes the folders that may be left after every step:
+The code under test writes real files. An audit hook and `os.fsync` record the order of operations.
+From this log the simulation creates the possible folders after each step:
 
-* what a file holds is sure as of its last fsync; later writes may be there, in part, or not at all
-* a name that was made, changed or removed is sure once its folder was synced after that; before,
-  each such change may be there or not, whatever became of the others
-* a rename within one folder is one change; from one folder to another it is two
+* The content of a file is durable as of its last fsync. Later writes may be complete, partial or
+  missing.
+* A created, changed or removed name is durable once its folder is synced. Before that, each change
+  may be missing, independently of the others.
+* A rename within a folder is one change; a rename between folders is two.
 """
 
 from __future__ import annotations
