@@ -109,7 +109,7 @@ class Stop(NamedTuple):
         return T
 
 
-class ScanPlan(NamedTuple):
+class SurveyPlan(NamedTuple):
     """Locations of a site's scans; those of the map are in the order of a walk."""
 
     map: list[Stop]
@@ -405,7 +405,7 @@ def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
 
 # Locations of the scans.
 #
-# rng, index, queries, Scanner  --_PLANS[kind]-->  ScanPlan
+# rng, index, queries, Scanner  --_PLANS[kind]-->  SurveyPlan
 
 
 def _likeness(rng: np.random.Generator) -> Likeness:
@@ -456,19 +456,19 @@ class _Carrier:
 def _row(
     make: Callable[[np.random.Generator], Unit], counts: tuple[int, int], rng: np.random.Generator,
     queries: int, sensor: Scanner,
-) -> ScanPlan:  # fmt: skip
+) -> SurveyPlan:  # fmt: skip
     unit, count = make(rng), int(rng.integers(*counts))
     row = row_of(unit, count, _likeness(rng), rng)
     carrier = _Carrier(unit, count, sensor, rng)
     stops = [Stop(row, T) for T in carrier.along(MAP_SCANS)]
-    return ScanPlan(stops, [Stop(row, T) for T in carrier.anywhere(queries)])
+    return SurveyPlan(stops, [Stop(row, T) for T in carrier.anywhere(queries)])
 
 
-def _bays(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
+def _bays(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:  # noqa: ARG001
     return _row(bay, (5, 13), rng, queries, sensor)
 
 
-def _streets(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
+def _streets(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:  # noqa: ARG001
     return _row(block, (5, 9), rng, queries, sensor)
 
 
@@ -477,7 +477,7 @@ def _is_second_variant(index: int) -> bool:
     return index % 4 in (1, 2)
 
 
-def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:
+def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
     """Omit one of some equal rows, with queries that visibly differ from all of the map."""
     street = _is_second_variant(index)
     unit = block(rng) if street else bay(rng)
@@ -503,10 +503,10 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
         return found
 
     asked = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries)]
-    return ScanPlan(stops, _most_different(asked, rivals, queries, sensor)[0])
+    return SurveyPlan(stops, _most_different(asked, rivals, queries, sensor)[0])
 
 
-def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:
+def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
     """Map a hall with one to three details, or one half with enough details to distinguish it."""
     hall = _with_details(symmetric_hall(rng), rng)
     if not _is_second_variant(index):
@@ -526,7 +526,7 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
         if least >= DISTINCT_SHARE:
             break
         hall = _with_details(hall, rng)
-    return ScanPlan(in_half(walk(hall, MAP_SCANS, rng), 1), asked)
+    return SurveyPlan(in_half(walk(hall, MAP_SCANS, rng), 1), asked)
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
@@ -538,7 +538,7 @@ def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
     return Premises("hall", join([hall.mesh, things]), hall.floor)
 
 
-def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> ScanPlan:
+def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> SurveyPlan:
     """Map every second to fourth scan of a walk; query others, or some beside it."""
     step = int(rng.integers(2, 5))
     poses = walk(premises, step * MAP_SCANS, rng)
@@ -548,7 +548,7 @@ def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> Sc
     for number, k in enumerate(chosen):
         beside = _pose_beside(premises, poses[k], rng) if number % 3 == 2 else poses[k]
         asked.append(Stop(premises, beside))
-    return ScanPlan([Stop(premises, T) for T in poses[::step]], asked)
+    return SurveyPlan([Stop(premises, T) for T in poses[::step]], asked)
 
 
 def _pose_beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
@@ -563,12 +563,12 @@ def _pose_beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Flo
     return moved
 
 
-def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
+def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:  # noqa: ARG001
     makers = (make_hall, make_block, make_block, make_hall, make_storey)
     return _plan_walk(makers[index % len(makers)](rng), rng, queries)
 
 
-def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> ScanPlan:  # noqa: ARG001
+def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:  # noqa: ARG001
     """Return sites without common content, 200 m apart."""
     places = [(make(rng), (200.0 * k, 0.0, 0.0)) for k, make in enumerate((make_hall, make_block))]
     of_map = [
@@ -580,10 +580,10 @@ def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner)
     others = [makers[int(rng.integers(0, 3))](rng) for _ in range(max(2, queries // 8))]
     each = -(-queries // len(others))
     asked = [Stop(site, T) for site in others for T in walk(site, each, rng, 4.0)]
-    return ScanPlan(of_map, asked[:queries])
+    return SurveyPlan(of_map, asked[:queries])
 
 
-_PLANS: dict[str, Callable[[np.random.Generator, int, int, Scanner], ScanPlan]] = {
+_PLANS: dict[str, Callable[[np.random.Generator, int, int, Scanner], SurveyPlan]] = {
     "bays": _bays,
     "streets": _streets,
     "halls": _halls,
