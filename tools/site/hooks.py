@@ -129,9 +129,9 @@ def with_figures(text: str, page: str) -> str:
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Set the navigation, and anchors in the style of git hosts."""
-    made = generated_pages()
-    _Build.pages = {one.path: one for one in made}
-    config.nav = navigation_of((ROOT / INDEX).read_text(encoding="utf-8"), made)
+    generated = generated_pages()
+    _Build.pages = {one.path: one for one in generated}
+    config.nav = navigation_of((ROOT / INDEX).read_text(encoding="utf-8"), generated)
     config.mdx_configs.setdefault("toc", {})["slugify"] = heading_anchor
     return config
 

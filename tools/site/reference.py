@@ -57,18 +57,18 @@ def api_document() -> dict[str, Any]:
 def http_reference() -> list[GeneratedPage]:
     """Return the pages of the HTTP API."""
     document = api_document()
-    made = partial(GeneratedPage, group="HTTP API")
+    http_page = partial(GeneratedPage, group="HTTP API")
     return [
-        made(
+        http_page(
             "reference/http/index.md", "HTTP API", http_pages.index_page(document),
             "every operation: parameters, bodies, statuses",
         ),
         *(
-            made(
+            http_page(
                 f"reference/http/{name}.md", name.capitalize(),
                 http_pages.resource_page(name, document),
             )
             for name in http_pages.resources(document)
         ),
-        made("reference/http/records.md", "Records", http_pages.records_page(document)),
+        http_page("reference/http/records.md", "Records", http_pages.records_page(document)),
     ]  # fmt: skip

@@ -297,9 +297,9 @@ def _reserved(floor: Floor, place: PiecePose, width: float, depth: float) -> Ite
     """Reserve a rectangle of the floor until the context ends."""
     before = floor.claimed.copy()
     floor.take(place, width, depth)
-    kept = floor.claimed & ~before
+    reserved = floor.claimed & ~before
     yield
-    floor.claimed[kept] = False
+    floor.claimed[reserved] = False
 
 
 def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:

@@ -146,9 +146,9 @@ def synthesise_lookalike_survey(
     of_map = _thinned(planned.map, rng) if index % 3 == 1 else planned.map
     true = np.stack([stop.pose for stop in of_map])
     recorded = with_drift(true, rng) if index % 2 and not perfect else true
-    asked = [stop.pose for stop in planned.queries]
+    query_poses = [stop.pose for stop in planned.queries]
     if kind not in APART:
-        asked = [_drifted_pose(T, true, recorded) for T in asked]
+        query_poses = [_drifted_pose(T, true, recorded) for T in query_poses]
     if perfect:
         sensor = sensor.perfect()
     name = f"{kind}-{index:03d}"
@@ -165,7 +165,7 @@ def synthesise_lookalike_survey(
 
     return LookalikeSite(
         name, kind, seed, index, clouds("map", of_map, list(recorded)),
-        clouds("queries", planned.queries, asked), kind not in ELSEWHERE,
+        clouds("queries", planned.queries, query_poses), kind not in ELSEWHERE,
     )  # fmt: skip
 
 
@@ -502,8 +502,8 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
                 found += [(row, T) for row in mapped]
         return found
 
-    asked = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries)]
-    return SurveyPlan(stops, _most_different(asked, rivals, queries, sensor)[0])
+    query_stops = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries)]
+    return SurveyPlan(stops, _most_different(query_stops, rivals, queries, sensor)[0])
 
 
 def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
@@ -520,13 +520,13 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
         return [(hall, half_turn @ stop.T)]
 
     for _ in range(10):
-        asked, least = _most_different(
+        query_stops, least = _most_different(
             in_half(walk(hall, 3 * queries, rng), -1), rivals, queries, sensor
         )
         if least >= DISTINCT_SHARE:
             break
         hall = _with_details(hall, rng)
-    return SurveyPlan(in_half(walk(hall, MAP_SCANS, rng), 1), asked)
+    return SurveyPlan(in_half(walk(hall, MAP_SCANS, rng), 1), query_stops)
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
@@ -544,11 +544,11 @@ def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> Su
     poses = walk(premises, step * MAP_SCANS, rng)
     others = [k for k in range(len(poses)) if k % step]
     chosen = sorted(rng.choice(others, queries, replace=queries > len(others)).tolist())
-    asked = []
+    query_stops = []
     for number, k in enumerate(chosen):
         beside = _pose_beside(premises, poses[k], rng) if number % 3 == 2 else poses[k]
-        asked.append(Stop(premises, beside))
-    return SurveyPlan([Stop(premises, T) for T in poses[::step]], asked)
+        query_stops.append(Stop(premises, beside))
+    return SurveyPlan([Stop(premises, T) for T in poses[::step]], query_stops)
 
 
 def _pose_beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
@@ -579,8 +579,8 @@ def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner)
     makers = (make_hall, make_block, make_storey)
     others = [makers[int(rng.integers(0, 3))](rng) for _ in range(max(2, queries // 8))]
     each = -(-queries // len(others))
-    asked = [Stop(site, T) for site in others for T in walk(site, each, rng, 4.0)]
-    return SurveyPlan(of_map, asked[:queries])
+    query_stops = [Stop(site, T) for site in others for T in walk(site, each, rng, 4.0)]
+    return SurveyPlan(of_map, query_stops[:queries])
 
 
 _PLANS: dict[str, Callable[[np.random.Generator, int, int, Scanner], SurveyPlan]] = {

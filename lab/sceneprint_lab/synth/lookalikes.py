@@ -500,8 +500,8 @@ def _row(rng: np.random.Generator, index: int, queries: int) -> FramePlan:
         return FramePlan([(hall, T) for T in poses[:48]], [(hall, T) for T in poses[48:]])
     rooms = equal_offices(int(rng.integers(2, 4)), likeness, rng)
     map_of = [(room, T) for room in rooms for T in scattered_poses(room, 18, rng)]
-    asked = [rooms[k % len(rooms)] for k in range(queries)]
-    return FramePlan(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], _offsets(rooms))
+    targets = [rooms[k % len(rooms)] for k in range(queries)]
+    return FramePlan(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in targets], _offsets(rooms))
 
 
 def _offsets(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
@@ -541,15 +541,15 @@ def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> FrameP
     rooms = equal_offices(int(rng.integers(2, 4)), likeness, rng)
     *mapped, last = rooms
     map_of = [(room, T) for room in mapped for T in scattered_poses(room, 20, rng)]
-    asked: list[Floats] = []
+    query_poses: list[Floats] = []
     least = DISTINCT_SHARE
-    while len(asked) < queries:
+    while len(query_poses) < queries:
         for T in scattered_poses(last, queries, rng):
-            told = min(difference_share(last, room, T) for room in mapped)
-            if told >= least and len(asked) < queries:
-                asked.append(T)
+            difference = min(difference_share(last, room, T) for room in mapped)
+            if difference >= least and len(query_poses) < queries:
+                query_poses.append(T)
         least *= 0.9  # rooms that are too similar are queried all the same
-    return FramePlan(map_of, [(last, T) for T in asked], _offsets(rooms))
+    return FramePlan(map_of, [(last, T) for T in query_poses], _offsets(rooms))
 
 
 def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
@@ -566,8 +566,8 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Frame
         mesh = join([*_shell(outline, rng, float(height)), furnish(placed, 0, likeness, rng)])
         rooms.append(Room(mesh, outline, Ceiling(float(height), np.zeros(2))))
     first, second = rooms
-    asked = [(second, T) for T in scattered_poses(second, queries, rng)]
-    return FramePlan([(first, T) for T in scattered_poses(first, 24, rng)], asked)
+    query_views = [(second, T) for T in scattered_poses(second, queries, rng)]
+    return FramePlan([(first, T) for T in scattered_poses(first, 24, rng)], query_views)
 
 
 def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
@@ -599,12 +599,12 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Frame
     # Only views in which the two sides differ, since others have no correct answer.
     views = orbit(middle, radius, 6 * queries, rng, first=math.pi / 2 - sweep / 2, sweep=sweep)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    told = [difference_share(room, room, T, half_turn @ T) for T in views]
-    fair = [i for i, share in enumerate(told) if DISTINCT_SHARE <= share <= 0.5]
+    differences = [difference_share(room, room, T, half_turn @ T) for T in views]
+    fair = [i for i, share in enumerate(differences) if DISTINCT_SHARE <= share <= 0.5]
     if len(fair) < queries:
-        fair = sorted(range(len(views)), key=lambda i: -told[i])[:queries]
-    asked = [views[i] for i in sorted(rng.permutation(fair)[:queries].tolist())]
-    return FramePlan([(room, T) for T in seen], [(room, T) for T in asked])
+        fair = sorted(range(len(views)), key=lambda i: -differences[i])[:queries]
+    query_poses = [views[i] for i in sorted(rng.permutation(fair)[:queries].tolist())]
+    return FramePlan([(room, T) for T in seen], [(room, T) for T in query_poses])
 
 
 def _absent_places(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
@@ -637,14 +637,14 @@ def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Frame
     after = [with_things(room, int(rng.integers(0, most + 1)), rng) for room in rooms]
     each = int(rng.integers(8, 26))
     map_of = [(room, T) for room in before for T in scattered_poses(room, each, rng)]
-    asked = [after[k % len(after)] for k in range(queries)]
+    targets = [after[k % len(after)] for k in range(queries)]
     starts = np.cumsum([0.0, *(room.size[0] + 0.2 for room in rooms)])
 
     def shift(room: Room) -> Floats:
         k = next(i for i in range(len(rooms)) if room is before[i] or room is after[i])
         return np.array([starts[k], 0.0, 0.0])
 
-    return FramePlan(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in asked], shift)
+    return FramePlan(map_of, [(r, scattered_poses(r, 1, rng)[0]) for r in targets], shift)
 
 
 def with_things(room: Room, count: int, rng: np.random.Generator) -> Room:

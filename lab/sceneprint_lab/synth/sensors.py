@@ -240,10 +240,10 @@ def _loss_probability(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -
     steep = (math.cos(p.grazing_start) - cosine) / (
         math.cos(p.grazing_start) - math.cos(p.grazing_end)
     )
-    kept = (1 - np.float32(p.speckle)) * (1 - np.clip(steep, 0, 1, dtype=np.float32))
+    valid = (1 - np.float32(p.speckle)) * (1 - np.clip(steep, 0, 1, dtype=np.float32))
     if loss is not None:
-        kept *= 1 - loss
-    return np.asarray(1 - kept, np.float32)
+        valid *= 1 - loss
+    return np.asarray(1 - valid, np.float32)
 
 
 def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats32:
@@ -460,7 +460,7 @@ def scan(
     held *= (1 - sensor.loss) * (1 - np.append(caster.mesh.loss, np.float32(0))[hits.face])
     noise = rng.normal(0, sensor.sigma, len(rays)).astype(np.float32)
     measured = distance + noise + sensor.offsets(rng)
-    kept = (hits.face >= 0) & (rng.random(len(rays)) < held)
-    kept &= (measured >= sensor.minimum) & (measured <= sensor.maximum)
-    kept &= ~sensor.hidden()
-    return np.asarray(rays[kept] * measured[kept, None], np.float32)
+    valid = (hits.face >= 0) & (rng.random(len(rays)) < held)
+    valid &= (measured >= sensor.minimum) & (measured <= sensor.maximum)
+    valid &= ~sensor.hidden()
+    return np.asarray(rays[valid] * measured[valid, None], np.float32)
