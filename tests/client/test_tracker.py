@@ -143,7 +143,7 @@ def test_weak_answers_are_no_fix_alone() -> None:
     told = answer("found", 5.0, verified_by="prior")
     assert Tracker(fake(told), "m", camera=K).update(DEPTH, ahead(0)).status == "lost"
     no_poses = Tracker(fake(answer("found", pose=None)), "m", camera=K)
-    assert "no frame" in no_poses.update(DEPTH, ahead(0)).reason.lower()
+    assert "no matching frame" in no_poses.update(DEPTH, ahead(0)).reason.lower()
 
 
 def test_a_service_that_is_away_leaves_it_to_odometry() -> None:
