@@ -350,8 +350,8 @@ def write_segment(
         places = order[start : start + len(each)]
         start += len(each)
         for first in range(0, len(each), step):
-            some = slice(first, first + step)
-            vectors[places[some]] = each.vectors[each.rows[some]]
+            block = slice(first, first + step)
+            vectors[places[block]] = each.vectors[each.rows[block]]
     recall = _flat_recall(len(keys))
     files = [
         put(folder, "keys", lambda take: take(keys.astype("<i8").tobytes())),

@@ -85,8 +85,8 @@ class Sketches:
         size : number of nearest rows to find
         free : (N,) which rows are searchable; None selects all
         """
-        there = len(self) if free is None else int(np.count_nonzero(free))
-        return np.sort(self.nearest(query, min(max(self.probes, TIMES_WANTED * size), there), free))
+        n = len(self) if free is None else int(np.count_nonzero(free))
+        return np.sort(self.nearest(query, min(max(self.probes, TIMES_WANTED * size), n), free))
 
 
 def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:

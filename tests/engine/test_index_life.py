@@ -175,7 +175,7 @@ def test_a_tail_that_finds_no_room_is_as_it_was(
         raise UnusableStore("no room")
 
     with monkeypatch.context() as patch:
-        patch.setattr(AppendBuffer, "_room", full)
+        patch.setattr(AppendBuffer, "_allocate", full)
         with pytest.raises(UnusableStore):
             tail.append(SignatureChange(64, "", 65, None), row)
     assert len(tail.tail()) == 64

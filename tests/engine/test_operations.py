@@ -172,10 +172,10 @@ def test_of_a_large_store_what_was_counted_is_told_while_a_thread_counts_again(
     for upload in uploads[:3]:
         engine.add_frame("hall", upload.data, upload.meta)
     seen = engine.statistics
-    first = seen.tell()
+    first = seen.collect()
     assert (first.frames, first.counted_at) == ({"received": 3}, first.counted_at)
     engine.add_frame("hall", uploads[3].data, uploads[3].meta)
-    assert seen.tell().frames == {"received": 4}  # few are counted anew
+    assert seen.collect().frames == {"received": 4}  # few are counted anew
     monkeypatch.setattr(statistics, "MANY", 8)  # four frames and their jobs
     threads, begin = [], statistics.threading.Thread.start
     monkeypatch.setattr(
@@ -184,19 +184,19 @@ def test_of_a_large_store_what_was_counted_is_told_while_a_thread_counts_again(
         lambda one: threads.append(one) if one.name == "counts" else begin(one),
     )
     monkeypatch.setattr(statistics, "COUNTING", 1e-12)  # what was counted is young for years
-    known = seen.tell()
+    known = seen.collect()
     engine.add_frame("hall", uploads[4].data, uploads[4].meta)
-    again = seen.tell()
+    again = seen.collect()
     assert (again.frames, again.waiting, threads) == ({"received": 4}, 5, [])
     assert again.counted_at == known.counted_at < again.at
     assert engine.statistics.state_counts()[0] == {"received": 4}
     monkeypatch.setattr(statistics, "COUNTING", 1e12)  # and old at once
-    assert seen.tell().frames == {"received": 4}
-    assert seen.tell().frames == {"received": 4}
+    assert seen.collect().frames == {"received": 4}
+    assert seen.collect().frames == {"received": 4}
     (counter,) = threads  # one of those that asked began it
     monkeypatch.setattr(statistics, "COUNTING", 1e-12)
     counter.run()
-    fresh = seen.tell()
+    fresh = seen.collect()
     assert fresh.frames == {"received": 5}
     assert fresh.counted_at > again.counted_at
 

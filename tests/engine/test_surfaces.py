@@ -369,7 +369,7 @@ def test_a_surface_that_failed_is_not_begun_again_unasked(
     def broken(*_: object) -> None:
         raise NotFound("It cannot be.")
 
-    monkeypatch.setattr(surface_job.SurfaceHandler, "_take_out", broken)
+    monkeypatch.setattr(surface_job.SurfaceHandler, "_remove_frames", broken)
     while (taken := engine.claim("w")) is not None:
         state = engine.run(taken)
     assert state is JobState.FAILED

@@ -372,8 +372,8 @@ class Statistics:
     def state_counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return how many frames and how many jobs are in each state; see `counts`."""
         with self._store.database.read() as connection:
-            found = self.counts(connection)
-        return dict(found.frames), dict(found.jobs)
+            counts = self.counts(connection)
+        return dict(counts.frames), dict(counts.jobs)
 
     def _count_again(self) -> None:
         try:

@@ -359,8 +359,8 @@ class Imports:
         if row.quota_bytes is None or row.used_bytes + incoming <= row.quota_bytes:
             return
         with self._store.database.write(map_number=row.number) as connection:
-            gone = make_room(connection, current_map(connection, row), incoming, new=False)
-        collect_deleted_blobs(self._store, gone)
+            unused = make_room(connection, current_map(connection, row), incoming, new=False)
+        collect_deleted_blobs(self._store, unused)
 
     def begin(
         self, map_name: str, archive: queue.JobFile, options: ImportOptions,
@@ -430,8 +430,8 @@ class Imports:
         except errors.UnreadableArchive:  # a retry does not help, and the archive may be large
             with self._store.database.write() as connection:
                 number = task.job.number
-                gone = queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
-            collect_deleted_blobs(self._store, gone)
+                unused = queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
+            collect_deleted_blobs(self._store, unused)
             raise
 
     def tidy(self) -> int:
@@ -448,13 +448,13 @@ class Imports:
             if not queue.finished_with_file(connection, ARCHIVE):
                 return 0
         with self._store.database.write() as connection:
-            gone = [
+            unused = [
                 blob
                 for number in queue.finished_with_file(connection, ARCHIVE)
                 for blob in queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
             ]
-        collect_deleted_blobs(self._store, gone)
-        return len(gone)
+        collect_deleted_blobs(self._store, unused)
+        return len(unused)
 
     @contextmanager
     def _open(self, file: queue.JobFile, name: str) -> Iterator[Archive]:

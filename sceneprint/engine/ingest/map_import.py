@@ -216,11 +216,11 @@ class MapImporter:
         del is_over, task
         axis = options.up if isinstance(options.up, str) else None
         surface_options = SurfaceOptions(units_per_metre=options.units_per_metre, up=axis)
-        with self._opened(file) as opened, tempfile.TemporaryFile() as local:
+        with self._open_file(file) as source, tempfile.TemporaryFile() as local:
             try:
-                descriptor = opened.fileno()
+                descriptor = source.fileno()
             except OSError:  # a file of an object store has no descriptor
-                shutil.copyfileobj(opened, local)
+                shutil.copyfileobj(source, local)
                 local.flush()
                 descriptor = local.fileno()
             try:
@@ -340,7 +340,7 @@ class MapImporter:
     def _views(self, task: LongJob, options: ImportOptions, stored: StoredSurface) -> _Views:
         return _Views(stored, self._parameters(task.of_map, options), options)
 
-    def _opened(self, file: queue.JobFile) -> BinaryIO:
+    def _open_file(self, file: queue.JobFile) -> BinaryIO:
         try:
             return self._store.blobs.open(file.blob)
         except FileNotFoundError as error:
@@ -349,8 +349,8 @@ class MapImporter:
             raise unusable("The file of the map cannot be read", error) from error
 
     def _stored(self, file: queue.JobFile) -> StoredSurface:
-        with self._opened(file) as opened:
-            return StoredSurface.read(opened)
+        with self._open_file(file) as source:
+            return StoredSurface.read(source)
 
     def _store_surface(self, stored: StoredSurface) -> queue.JobFile:
         with self._store.blobs.incoming() as blob:
@@ -379,10 +379,10 @@ class MapImporter:
         """Check that the quota has room for all views."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
-            held = map_usage(connection, row.number).frames
-        if row.quota_frames is not None and held + views > row.quota_frames:
+            frames = map_usage(connection, row.number).frames
+        if row.quota_frames is not None and frames + views > row.quota_frames:
             raise QuotaExceeded(
-                f"The import has {views} views, but the map has {held} of at most "
+                f"The import has {views} views, but the map has {frames} of at most "
                 f"{row.quota_frames} frames. Ask the operator for a larger quota (PATCH "
                 f"/v1/maps/{row.name})."
             )

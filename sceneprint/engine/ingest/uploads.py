@@ -570,9 +570,9 @@ def _store_one(
         return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
     # the quota counts a failed frame already, but the size of the upload may differ
-    held = 0 if frame is None or new else frame.bytes
+    counted = 0 if frame is None or new else frame.bytes
     try:
-        left.extend(make_room(connection, row, ready.size - held, new=new))
+        left.extend(make_room(connection, row, ready.size - counted, new=new))
     except errors.QuotaExceeded as error:
         left.append(ready.blob)
         return UploadResult(None, error=error)

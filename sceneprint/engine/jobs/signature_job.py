@@ -101,11 +101,11 @@ def run(
     start = time.perf_counter()
     state: JobState | None
     result: SigningResult | None = None
-    gone: list[str] = []
+    unused: list[str] = []
     try:
         with lifecycle.renewed(store, work.job, lease_s, longest_s):
             result = _sign(store, signers, work)
-            gone = _store_patiently(store, signers, readers, work, result)
+            unused = _store_patiently(store, signers, readers, work, result)
         state = JobState.SUCCEEDED
     except errors.LostLease as error:
         log.warning("lease lost", extra=lifecycle.about(work, error=str(error)))
@@ -126,9 +126,9 @@ def run(
         if broke is not None and not isinstance(error, errors.SceneprintError):
             broke()
     if result is not None and state != JobState.SUCCEEDED:
-        gone = [result.signature.geometry]  # nothing refers to it
-    if gone:
-        collect_blobs(store, gone)
+        unused = [result.signature.geometry]  # nothing refers to it
+    if unused:
+        collect_blobs(store, unused)
     if state is None:
         return None
     milliseconds = round(1e3 * (time.perf_counter() - start), 1)

@@ -319,8 +319,8 @@ def _make_room(
     [size] = [one.bytes for one in files if one.name == ARCHIVE] or [0]
     if row is None or size == 0:
         return []
-    held = before[ARCHIVE].bytes if ARCHIVE in before else 0
-    return make_room(connection, current_map(connection, row), size - held, new=False)
+    size_before = before[ARCHIVE].bytes if ARCHIVE in before else 0
+    return make_room(connection, current_map(connection, row), size - size_before, new=False)
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:

@@ -96,7 +96,7 @@ def living(row: MapRow, frame: FrameRow) -> FrameRow:
     return frame
 
 
-def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry:
+def geometry_of(store: Store, signers: Signers, indexed: IndexedFrame) -> Geometry:
     """Return the geometry of a frame; rebuild a damaged one from the upload.
 
     Raises
@@ -105,15 +105,15 @@ def geometry_of(store: Store, signers: Signers, found: IndexedFrame) -> Geometry
     UnknownFrame, NotIndexed, Busy : See `check_unchanged`.
     """
     try:
-        return read_geometry(store.blobs.get(found.artifact))
+        return read_geometry(store.blobs.get(indexed.artifact))
     except (errors.DamagedBlob, errors.UnreadableGeometry):
-        check_unchanged(store, found)
-        resign_frames(store, found.row, [found.frame.number], found.row.model_id)
-    _, artifact = rebuild_frame(store, signers(found.row.model_id), found.frame)
+        check_unchanged(store, indexed)
+        resign_frames(store, indexed.row, [indexed.frame.number], indexed.row.model_id)
+    _, artifact = rebuild_frame(store, signers(indexed.row.model_id), indexed.frame)
     return read_geometry(artifact)
 
 
-def check_unchanged(store: Store, found: IndexedFrame) -> None:
+def check_unchanged(store: Store, indexed: IndexedFrame) -> None:
     """Check that a frame has not changed since it was read.
 
     Raises
@@ -121,10 +121,10 @@ def check_unchanged(store: Store, found: IndexedFrame) -> None:
     UnknownFrame, NotIndexed : If the frame was deleted or lost its geometry.
     Busy : If the frame was signed with another model.
     """
-    now = find_indexed(store, found.row.name, found.frame.id)
-    if (now.frame.number, now.artifact) != (found.frame.number, found.artifact):
+    now = find_indexed(store, indexed.row.name, indexed.frame.id)
+    if (now.frame.number, now.artifact) != (indexed.frame.number, indexed.artifact):
         raise errors.Busy(
-            f"Frame {found.frame.id} was signed with another model meanwhile. Try again."
+            f"Frame {indexed.frame.id} was signed with another model meanwhile. Try again."
         )
 
 
@@ -402,14 +402,14 @@ class FrameFiles:
         NotIndexed : If the frame is not indexed.
         InvalidRequest : If the frame's pose or base is not known.
         """
-        found = find_indexed(self._store, map_name, frame_id)
-        frame, optical = found.frame, sensor_of(found.frame)
+        indexed = find_indexed(self._store, map_name, frame_id)
+        frame, optical = indexed.frame, sensor_of(indexed.frame)
         name, matrix = placed(frame, within)
-        comments = [f"frame {name}", f"points of {optical} of map {found.row.name}, metres",
-                    f"model {found.label}"]  # fmt: skip
+        comments = [f"frame {name}", f"points of {optical} of map {indexed.row.name}, metres",
+                    f"model {indexed.label}"]  # fmt: skip
 
         def make() -> bytes:
-            points, normals = points_of(geometry_of(self._store, self._signers, found).surface)
+            points, normals = points_of(geometry_of(self._store, self._signers, indexed).surface)
             if within == "optical":
                 return write_ply(points, normals, comments=comments)
             to_name = np.array(matrix)
@@ -418,7 +418,7 @@ class FrameFiles:
                 transform_points(to_name, points.astype(np.float64)), turned, comments=comments
             )
 
-        return Output(found.tag("cloud", frame.id, found.row.name, name, matrix), make)
+        return Output(indexed.tag("cloud", frame.id, indexed.row.name, name, matrix), make)
 
     def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = 320
@@ -430,34 +430,34 @@ class FrameFiles:
         UnknownMap, UnknownFrame, NotIndexed : See `cloud`.
         DamagedBlob : If the upload, which pictures of patches need, is lost.
         """
-        found = find_indexed(self._store, map_name, frame_id)
+        indexed = find_indexed(self._store, map_name, frame_id)
 
         def make() -> bytes:
             if view == "patches":
-                colours, text = patches_view(self._labels(found))
+                colours, text = patches_view(self._labels(indexed))
             else:
-                surface = geometry_of(self._store, self._signers, found).surface
+                surface = geometry_of(self._store, self._signers, indexed).surface
                 colours, text = (depth_view if view == "depth" else normals_view)(surface)
-            metadata = {"view": view, "frame": sensor_of(found.frame), "model": found.label}
+            metadata = {"view": view, "frame": sensor_of(indexed.frame), "model": indexed.label}
             return picture(colours, width, {**metadata, **text})
 
-        return Output(found.tag("preview", found.frame.id, view, width), make)
+        return Output(indexed.tag("preview", indexed.frame.id, view, width), make)
 
     def patches(self, map_name: str, frame_id: str) -> Output[FramePatches]:
         """Return the patches of a frame; see `preview` for errors."""
-        found = find_indexed(self._store, map_name, frame_id)
+        indexed = find_indexed(self._store, map_name, frame_id)
 
         def make() -> FramePatches:
             return FramePatches(
-                frame_id=found.frame.id,
-                map=found.row.name,
-                frame=sensor_of(found.frame),
-                model=found.label,
-                levels=[level_of(one) for one in self._hierarchy(found)[1].levels],
-                validation=level_of(geometry_of(self._store, self._signers, found).patches),
+                frame_id=indexed.frame.id,
+                map=indexed.row.name,
+                frame=sensor_of(indexed.frame),
+                model=indexed.label,
+                levels=[level_of(one) for one in self._hierarchy(indexed)[1].levels],
+                validation=level_of(geometry_of(self._store, self._signers, indexed).patches),
             )
 
-        return Output(found.tag("patches", found.frame.id, found.row.name), make)
+        return Output(indexed.tag("patches", indexed.frame.id, indexed.row.name), make)
 
     def signature(self, map_name: str, frame_id: str) -> Output[FrameSignature]:
         """Return the signature of a frame.
@@ -467,32 +467,32 @@ class FrameFiles:
         UnknownMap, UnknownFrame, NotIndexed : See `cloud`.
         DamagedSignature : If the signature is damaged; the frame is then signed again.
         """
-        found = find_indexed(self._store, map_name, frame_id)
+        indexed = find_indexed(self._store, map_name, frame_id)
 
         def make() -> FrameSignature:
-            vector, (n_patches, n_pairs) = self._signature(found)
+            vector, (n_patches, n_pairs) = self._signature(indexed)
             return FrameSignature(
-                frame_id=found.frame.id,
-                map=found.row.name,
-                model=found.label,
-                model_id=found.row.model_id,
+                frame_id=indexed.frame.id,
+                map=indexed.row.name,
+                model=indexed.label,
+                model_id=indexed.row.model_id,
                 length=len(vector),
                 n_patches=n_patches,
                 n_pairs=n_pairs,
                 base64=base64.b64encode(vector).decode(),
             )
 
-        return Output(found.tag("signature", found.frame.id, found.row.name), make)
+        return Output(indexed.tag("signature", indexed.frame.id, indexed.row.name), make)
 
     def vector(self, map_name: str, frame_id: str, media_type: str = BYTES) -> Output[bytes]:
         """Return the bytes of a signature, raw or as an NPY file; see `signature` for errors."""
-        found = find_indexed(self._store, map_name, frame_id)
+        indexed = find_indexed(self._store, map_name, frame_id)
 
         def make() -> bytes:
-            vector, _ = self._signature(found)
+            vector, _ = self._signature(indexed)
             return vector if media_type == BYTES else npy_of(vector)
 
-        return Output(found.tag("vector", media_type), make)
+        return Output(indexed.tag("vector", media_type), make)
 
     def upload(self, map_name: str, frame_id: str) -> Output[bytes]:
         """Return the unchanged bytes of a frame's upload.
@@ -514,37 +514,37 @@ class FrameFiles:
         blob = frame.blob
         return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
 
-    def _hierarchy(self, found: IndexedFrame) -> tuple[Surface, Hierarchy]:
+    def _hierarchy(self, indexed: IndexedFrame) -> tuple[Surface, Hierarchy]:
         """Return the hierarchy of the upload, since points of the stored geometry are rounded."""
-        p = self._signers(found.row.model_id).model.parameters
+        p = self._signers(indexed.row.model_id).model.parameters
         frame = read_stored(
-            self._store.blobs.get(found.frame.blob), found.frame, self._store.decoders
+            self._store.blobs.get(indexed.frame.blob), indexed.frame, self._store.decoders
         )
         seen = see(frame, p)
-        return seen, hierarchy_of(seen, p, found.frame.id)
+        return seen, hierarchy_of(seen, p, indexed.frame.id)
 
-    def _labels(self, found: IndexedFrame) -> Ints32:
+    def _labels(self, indexed: IndexedFrame) -> Ints32:
         """Return the finest patches as an image, onto which points of a cloud are projected."""
-        seen, hierarchy = self._hierarchy(found)
+        seen, hierarchy = self._hierarchy(indexed)
         labels = hierarchy.labels[0]
         if isinstance(seen.camera, Intrinsics):
             return labels
-        drawn = geometry_of(self._store, self._signers, found).surface
+        drawn = geometry_of(self._store, self._signers, indexed).surface
         return project_labels(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
 
-    def _signature(self, found: IndexedFrame) -> tuple[bytes, tuple[list[int], list[int]]]:
-        number, model_id = found.frame.number, found.row.model_id
+    def _signature(self, indexed: IndexedFrame) -> tuple[bytes, tuple[list[int], list[int]]]:
+        number, model_id = indexed.frame.number, indexed.row.model_id
         try:
             with self._store.database.read() as connection:
                 vector = stored_vector(connection, number, model_id)
                 sizes = patch_counts(connection, number, model_id)
         except errors.DamagedSignature:
-            resign_frames(self._store, found.row, [number], model_id)
+            resign_frames(self._store, indexed.row, [number], model_id)
             raise
         if vector is None or sizes is None:
-            check_unchanged(self._store, found)
+            check_unchanged(self._store, indexed)
             raise errors.DamagedSignature(
-                f"The signature of frame {found.frame.id} is missing. Run `sceneprint fsck` to "
+                f"The signature of frame {indexed.frame.id} is missing. Run `sceneprint fsck` to "
                 "find out why."
             )
         return vector, sizes

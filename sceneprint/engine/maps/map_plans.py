@@ -115,17 +115,17 @@ def _places(flat: Floats, cell_m: float) -> list[Place]:
 
 
 def _cells(
-    taken: Mapping[Place, int], queried: Sequence[Place], outcomes: Sequence[CoverageOutcome]
+    frames: Mapping[Place, int], queried: Sequence[Place], outcomes: Sequence[CoverageOutcome]
 ) -> list[CoverageCell]:
     counted: dict[Place, Counter[str]] = {}
     for place, outcome in zip(queried, outcomes, strict=True):
         counted.setdefault(place, Counter())[outcome] += 1
     return [
         CoverageCell(
-            column=column, row=row, frames=taken.get((column, row), 0),
+            column=column, row=row, frames=frames.get((column, row), 0),
             **{name: counted.get((column, row), Counter())[name] for name in COVERAGE_OUTCOMES},
         )
-        for column, row in sorted({*taken, *counted}, key=lambda place: place[::-1])
+        for column, row in sorted({*frames, *counted}, key=lambda place: place[::-1])
     ]  # fmt: skip
 
 
@@ -248,14 +248,14 @@ def surface_picture(
     )
     counts = np.zeros((rows, columns))
     up = np.cross(axes[0], axes[1])
-    for some in points:
-        height = some @ up
-        inside = np.ones(len(some), bool)
+    for tile in points:
+        height = tile @ up
+        inside = np.ones(len(tile), bool)
         if heights[0] is not None:
             inside &= height >= heights[0]
         if heights[1] is not None:
             inside &= height <= heights[1]
-        flat = some[inside] @ axes.T
+        flat = tile[inside] @ axes.T
         x = np.floor((flat[:, 0] - plan.left) / step).astype(np.int64).clip(0, columns - 1)
         y = np.floor((plan.top - flat[:, 1]) / step).astype(np.int64).clip(0, rows - 1)
         np.add.at(counts, (y, x), 1.0)

@@ -533,9 +533,9 @@ def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | N
         last_taken=when(surface.last_taken), taken_from=when(surface.taken_from),
         taken_step_s=surface.taken_step_s,
         parents=[
-            _parent_record(surface, told, own)
-            for told in surface.parents
-            if (own := [one for one in totals if one.parent == told["parent_frame"]])
+            _parent_record(surface, parent, own)
+            for parent in surface.parents
+            if (own := [one for one in totals if one.parent == parent["parent_frame"]])
         ],
     )  # fmt: skip
 

@@ -276,14 +276,14 @@ class SurfaceHandler:
         parts: dict[_Key, list[CellSums]] = {}
         touches: list[tuple[_Key, int]] = []
         added: list[FusedFrame] = []
-        held = 0
+        cell_count = 0
         for one in new:
             for key, cells in self._cells(surface, one, sessions).items():
                 parts.setdefault(key, []).append(cells)
                 touches.append((key, one.number))
-                held += len(cells)
+                cell_count += len(cells)
             added.append(one)
-            if is_over() or held > _CELLS or len(parts) > _TILES:
+            if is_over() or cell_count > _CELLS or len(parts) > _TILES:
                 break
         done = _Slice()
         with self._store.database.read() as connection:
@@ -458,9 +458,9 @@ class _Addition:
 class _Sessions:
     """Names of sessions by their index in cells; new names are appended."""
 
-    def __init__(self, known: Sequence[str]) -> None:
-        self.names = list(known)
-        self._index = {name: i for i, name in enumerate(known)}
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = list(names)
+        self._index = {name: i for i, name in enumerate(names)}
 
     def index(self, name: str | None) -> int:
         """Return the index of a session; NO_SESSION without a name or beyond MOST_SESSIONS."""

@@ -65,19 +65,19 @@ def finish_association(
         np.array([1.0 if item["strength"] == "strong" else _WEAK for item in items]),
     )
     cycles = CycleParameters().scaled(scale)
-    judged = judge_edges(edges, *runs, cycles, within_run=len(request.sessions) == 1)
+    verdict = judge_edges(edges, *runs, cycles, within_run=len(request.sessions) == 1)
     numbers = JoiningParameters(view_m=cycles.view_m)
-    joins, agree = _joins(items, edges, runs, judged, stops, request, numbers)
-    confirmed = judged.supported | agree
+    joins, agree = _joins(items, edges, runs, verdict, stops, request, numbers)
+    confirmed = verdict.supported | agree
     counts = {
-        "consistent": int(confirmed.sum()), "inconsistent": int((~judged.accepted).sum()),
-        "unchecked": int((judged.accepted & ~confirmed).sum()),
+        "consistent": int(confirmed.sum()), "inconsistent": int((~verdict.accepted).sum()),
+        "unchecked": int((verdict.accepted & ~confirmed).sum()),
     }  # fmt: skip
     verdicts = [
         {"consistent": True if sure else None if ok else False, "loops": loops, "closed": closed}
         for sure, ok, loops, closed in zip(
-            confirmed.tolist(), judged.accepted.tolist(), judged.loops.tolist(),
-            judged.closed.tolist(), strict=True,
+            confirmed.tolist(), verdict.accepted.tolist(), verdict.loops.tolist(),
+            verdict.closed.tolist(), strict=True,
         )
     ]  # fmt: skip
     return verdicts, counts, joins
@@ -94,12 +94,12 @@ def _run(numbers: list[int], stops: dict[int, PathFrame], parents: dict[str, int
 
 def _joins(
     items: list[dict[str, Any]], edges: LoopEdges, runs: tuple[RobotPath, RobotPath],
-    judged: EdgeVerdicts, stops: dict[int, PathFrame], request: NewAssociation,
+    verdict: EdgeVerdicts, stops: dict[int, PathFrame], request: NewAssociation,
     numbers: JoiningParameters,
 ) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:  # fmt: skip
     """Return the join of each pair of parent frames with edges, and which edges agree with it."""
     between: dict[tuple[str, str], list[int]] = {}
-    for i in np.flatnonzero(judged.accepted).tolist():
+    for i in np.flatnonzero(verdict.accepted).tolist():
         ends = [stops.get(items[i][side]) for side in ("from", "to")]
         a, b = (None if end is None or end.pose is None else end.parent for end in ends)
         # loop closures within one parent frame do not join frames

@@ -112,10 +112,10 @@ def _placed(
         waiting = deque([root])
         while waiting:
             here = waiting.popleft()
-            for there, T in _joined(here, joins):
-                if there not in into:
-                    into[there] = (root, into[here][1] @ T)
-                    waiting.append(there)
+            for neighbour, T in _joined(here, joins):
+                if neighbour not in into:
+                    into[neighbour] = (root, into[here][1] @ T)
+                    waiting.append(neighbour)
     poses: list[Floats | None] = [None] * len(stops)
     frames: list[str | None] = [None] * len(stops)
     for i, stop in enumerate(stops):

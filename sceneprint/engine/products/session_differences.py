@@ -153,7 +153,7 @@ class Differences(Products[NewDifference, Difference]):
     def _fuse(self, row: MapRow, progress: dict[str, Any], state: _State, is_over: IsOver) -> None:
         """Merge views of frames into the cells of their sessions, while time allows."""
         views: dict[Side, list[SessionCells]] = {side: [] for side in SIDES}
-        held = 0
+        cell_count = 0
         for side, number in _order(progress["frames"])[progress["done"] :]:
             posed = self._posed(row, number, progress["parent"])
             if posed is None:
@@ -162,9 +162,9 @@ class Differences(Products[NewDifference, Difference]):
                 points = transform_points(posed[1], surface_points(posed[0]))
                 stamp = ViewStamp(number, None, NO_SESSION)
                 views[side].append(view_cells(points, progress["cell_m"], stamp))
-                held += count_cells(views[side][-1])
+                cell_count += count_cells(views[side][-1])
             progress["done"] += 1
-            if is_over() or held > _HELD:
+            if is_over() or cell_count > _HELD:
                 break
         for side in SIDES:
             state.cells[side] = merge_views(state.cells[side], views[side])

@@ -192,21 +192,21 @@ class _ValidationCache:
 
     def get(self, key: tuple[str, str], make: Callable[[], PairValidation]) -> PairValidation:
         with self._lock:
-            found = self._made.get(key)
-            mine = found is None
-            if found is None:
-                found = self._made[key] = Future()
+            future = self._made.get(key)
+            mine = future is None
+            if future is None:
+                future = self._made[key] = Future()
             self._made.move_to_end(key)
             while len(self._made) > _CACHE_SIZE:
                 self._made.popitem(last=False)
         if mine:
             try:
-                found.set_result(make())
+                future.set_result(make())
             except BaseException as error:
                 with self._lock:
                     self._made.pop(key, None)
-                found.set_exception(error)
-        return found.result()
+                future.set_exception(error)
+        return future.result()
 
 
 def check_geometry(stored: StoredAnswer, needs: str = "the stage") -> bytes:
@@ -442,15 +442,15 @@ class PointClouds:
         self, map_name: str, frame_id: str, within: CloudFrame = "optical", limit: int = LIMIT
     ) -> Output[bytes]:
         """Return points, normals and patches of a frame; see `FrameFiles.cloud`."""
-        found = find_indexed(self._store, map_name, frame_id)
-        name, matrix = placed(found.frame, within)
+        indexed = find_indexed(self._store, map_name, frame_id)
+        name, matrix = placed(indexed.frame, within)
 
         def make() -> bytes:
-            geometry = geometry_of(self._store, self._signers, found)
+            geometry = geometry_of(self._store, self._signers, indexed)
             points, total = _some(geometry, limit)
             return _encoded(geometry, points, total, np.array(matrix))
 
-        tag = found.tag("points", found.frame.id, found.row.name, name, matrix, limit)
+        tag = indexed.tag("points", indexed.frame.id, indexed.row.name, name, matrix, limit)
         return Output(tag, make)
 
     def query(self, query_id: str, limit: int = LIMIT) -> Output[bytes]:

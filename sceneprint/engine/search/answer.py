@@ -94,7 +94,7 @@ class _Attempt:
     selection : C; None if it was not requested
     among, scales : distances within R, and parameters of the selection
     chosen : positions in R of the candidates: C, or the first frames of R
-    tried : validations of the candidates that decide the pose, regardless of `k`
+    checks : validations of the candidates that decide the pose, regardless of `k`
     rows : rows of the frames in the answer, by number
     matches : validated candidates that still exist
     rivals : matches with frames beyond `chosen`, which show other places than the best pose
@@ -107,7 +107,7 @@ class _Attempt:
     among: Ints64 | None
     scales: DiversityParameters | None
     chosen: Sequence[int]
-    tried: Validated
+    checks: Validated
     rows: dict[int, FrameRow]
     matches: list[PairMatch]
     rivals: list[PairMatch] = field(default_factory=list)
@@ -171,7 +171,7 @@ class _StoredDatabase:
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         rows = {number: row for one in self.attempts for number, row in one.rows.items()}
-        geometries = {n: g for one in self.attempts for n, g in one.tried.geometries.items()}
+        geometries = {n: g for one in self.attempts for n, g in one.checks.geometries.items()}
         return placed(
             self._store, self.attempts[-1].searched, geometries, rows, frames, self._prior,
             self._model, self._query,
@@ -179,13 +179,13 @@ class _StoredDatabase:
 
     def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
         before = self.attempts[frame]
-        tried = self._validated(before, before.tried.chosen, known)
-        if tried.late:
+        checks = self._validated(before, before.checks.chosen, known)
+        if checks.late:
             return None
         self.attempts[frame] = replace(
             before,
-            tried=replace(tried, geometries=before.tried.geometries | tried.geometries),
-            matches=[one for one in tried.matches if one.index in before.rows],
+            checks=replace(checks, geometries=before.checks.geometries | checks.geometries),
+            matches=[one for one in checks.matches if one.index in before.rows],
         )
         return self.attempts[frame].matches
 
@@ -204,7 +204,7 @@ class _StoredDatabase:
             known = frames_of(connection, [one.index for one in more.matches])
         self.attempts[-1] = replace(
             last,
-            tried=replace(last.tried, geometries=last.tried.geometries | more.geometries),
+            checks=replace(last.checks, geometries=last.checks.geometries | more.geometries),
             rows=last.rows | known,
             rivals=[one for one in more.matches if one.index in known],
             late=bool(more.late),
@@ -244,13 +244,13 @@ def _attempt(
     if prior is not None:
         first = nearest_first(store, ranking, first, prior, model.answer.map)
     p = model.parameters.validation
-    tried = validated(store, searched, first, prepared.geometry, query, deadline, p, prepared.up)
+    checks = validated(store, searched, first, prepared.geometry, query, deadline, p, prepared.up)
     clock.stage("validate")
     shown = range(len(ranking)) if query.explain else chosen
     with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
-    matches = [one for one in tried.matches if one.index in rows]  # without deleted frames
-    return _Attempt(prepared, searched, selection, among, scales, chosen, tried, rows, matches)
+    matches = [one for one in checks.matches if one.index in rows]  # without deleted frames
+    return _Attempt(prepared, searched, selection, among, scales, chosen, checks, rows, matches)
 
 
 def _answer(
@@ -259,34 +259,34 @@ def _answer(
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
     """Return the answer for the last frame of a query, and the numbers of the frames of R."""
     prepared, searched, p = last.prepared, last.searched, model.parameters.validation
-    ranking, tried = searched.ranking, _validate_more(store, last, query, deadline, p)
+    ranking, checks = searched.ranking, _validate_more(store, last, query, deadline, p)
     clock.stage("validate")
     # rejected rivals are not matches
     rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
-    matches = [*(one for one in tried.matches if one.index in last.rows), *rivals_left]
+    matches = [*(one for one in checks.matches if one.index in last.rows), *rivals_left]
     names = {place.row.number: place.row.name for place in places}
     own = query_sensor(prepared.name, prepared.kind, list(names.values()))
     candidates = Candidates(
-        names, ranking, last.selection, last.rows, tried.unreadable, tried.untried, own,
+        names, ranking, last.selection, last.rows, checks.unreadable, checks.untried, own,
         p.covariance, prepared.base,
     )  # fmt: skip
     explanations = explained = None
     if query.explain:
-        compared = replace(tried, matches=[*tried.matches, *last.rivals])
+        compared = replace(checks, matches=[*checks.matches, *last.rivals])
         explanations = explain(candidates, compared, last.among, last.scales)
     if query.explain_frame is not None:
-        whole = ExplainedQuery(store, searched, prepared, query, candidates, tried, model, deadline)
-        explained = why(whole, query.explain_frame)
+        case = ExplainedQuery(store, searched, prepared, query, candidates, checks, model, deadline)
+        explained = why(case, query.explain_frame)
     if query.explain or explained is not None:
         clock.stage("explain")
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
-    counts = [_counts(searched, i, candidates, tried, matches) for i in range(len(places))]
+    counts = [_counts(searched, i, candidates, checks, matches) for i in range(len(places))]
     total = _sum(counts)
     deciding = [*last.matches, *rivals_left]
     accepted = [last.rows[m.index] for m in deciding if m.validation.status == "accepted"]
     posed = any(row.pose is not None for row in accepted)
     outcome = answer_status(
-        query, estimate, last.tried, deciding, total, prepared.geometry, p, posed=posed
+        query, estimate, last.checks, deciding, total, prepared.geometry, p, posed=posed
     )
     others = alternative_records(candidates, estimate) if outcome.status == "ambiguous" else []
     response = Answer(
@@ -294,7 +294,7 @@ def _answer(
         status=outcome.status,
         reason=outcome.reason,
         cause=outcome.cause,
-        matches=_listed_matches(candidates, last, tried, rivals_left, query.k),
+        matches=_listed_matches(candidates, last, checks, rivals_left, query.k),
         location=location_record(candidates, estimate) if outcome.status == "found" else None,
         alternatives=others,
         seed=query.seed,
@@ -308,7 +308,7 @@ def _answer(
         kind=prepared.kind,
         frames=1 + earlier,
         per_map=_per_map(places, counts) if len(places) > 1 else None,
-        deadline_reached=None if tried.late is None else tried.late or last.late,
+        deadline_reached=None if checks.late is None else checks.late or last.late,
         explanations=explanations,
         explained_frame=explained,
     )
@@ -316,31 +316,31 @@ def _answer(
 
 
 def _listed_matches(
-    candidates: Candidates, last: _Attempt, tried: Validated, elsewhere: Sequence[PairMatch], k: int
+    candidates: Candidates, last: _Attempt, checks: Validated, rivals: Sequence[PairMatch], k: int
 ) -> list[Match]:
     """Return the records of the candidates, of at most `k` accepted ones, and of the rivals."""
-    shown = listed([one for one in tried.matches if one.index in last.rows], k)
-    hidden = {one.index for one in tried.matches} - {one.index for one in shown}
+    shown = listed([one for one in checks.matches if one.index in last.rows], k)
+    hidden = {one.index for one in checks.matches} - {one.index for one in shown}
     order = candidates.ranking.indices.tolist()
     chosen = [position for position in last.chosen if order[position] not in hidden]
-    beyond = [order.index(one.index) for one in elsewhere]
-    return match_records(candidates, [*chosen, *beyond], [*shown, *elsewhere])
+    beyond = [order.index(one.index) for one in rivals]
+    return match_records(candidates, [*chosen, *beyond], [*shown, *rivals])
 
 
 def _validate_more(
     store: Store, last: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
 ) -> Validated:
     """Return the validations of all candidates, and validate more of them if `k` requires it."""
-    tried = last.tried
-    accepted = sum(one.validation.status == "accepted" for one in tried.matches)
-    rest = [position for position in last.chosen if position not in tried.chosen]
-    if query.k > VERDICT_MATCHES and (rest or accepted == VERDICT_MATCHES) and not tried.late:
-        known = {one.index: one.validation for one in tried.matches}
+    checks = last.checks
+    accepted = sum(one.validation.status == "accepted" for one in checks.matches)
+    rest = [position for position in last.chosen if position not in checks.chosen]
+    if query.k > VERDICT_MATCHES and (rest or accepted == VERDICT_MATCHES) and not checks.late:
+        known = {one.index: one.validation for one in checks.matches}
         return validated(
-            store, last.searched, [*tried.chosen, *rest], last.prepared.geometry, query, deadline,
+            store, last.searched, [*checks.chosen, *rest], last.prepared.geometry, query, deadline,
             p, last.prepared.up, known, k=query.k, retry=False,
         )  # fmt: skip
-    return replace(tried, chosen=last.chosen)
+    return replace(checks, chosen=last.chosen)
 
 
 def _selections(
@@ -373,7 +373,7 @@ def _counts(
     searched: Searched,
     i: int,
     candidates: Candidates,
-    tried: Validated,
+    checks: Validated,
     matches: Sequence[PairMatch],
 ) -> Counts:
     """Return the number of frames of one map that reached each stage."""
@@ -388,7 +388,7 @@ def _counts(
         passed=part.passed,
         compared=hits.compared,
         ranked=int(own.sum()),
-        selected=0 if candidates.selection is None else int(own[list(tried.chosen)].sum()),
+        selected=0 if candidates.selection is None else int(own[list(checks.chosen)].sum()),
         validated=len(statuses),
         accepted=statuses.count("accepted"),
     )
@@ -419,7 +419,7 @@ class Outcome:
 
 
 def answer_status(
-    query: Query, estimate: PoseEstimate | None, tried: Validated, matches: Sequence[PairMatch],
+    query: Query, estimate: PoseEstimate | None, checks: Validated, matches: Sequence[PairMatch],
     counts: Counts, geometry: Geometry | None, p: ValidationParameters, *, posed: bool,
 ) -> Outcome:  # fmt: skip
     """Return the status of an answer, with its reason and cause.
@@ -427,7 +427,7 @@ def answer_status(
     Parameters
     ----------
     estimate : result of `decide`; None if no match has a pose
-    tried : result of `validated`
+    checks : result of `validated`
     matches : validated candidates that still exist
     counts : sums over all maps
     geometry : geometry of the query; None without validation
@@ -448,18 +448,18 @@ def answer_status(
         return Outcome(estimate.status, estimate.reason)
     if unsure is not None:
         return Outcome("ambiguous", f"the best fit is not unique: {unsure.validation.reason}")
-    if tried.late:
+    if checks.late:
         explanation = (
             f"the deadline passed before a match was accepted: {counts.validated} of "
-            f"{len(tried.chosen)} candidates were validated. Allow more time"
+            f"{len(checks.chosen)} candidates were validated. Allow more time"
         )
         return Outcome("unvalidated", explanation, "deadline")
-    cause, reason = _likeliest_cause(tried, matches, counts, geometry, p)
+    cause, reason = _likeliest_cause(checks, matches, counts, geometry, p)
     return Outcome("not_found", reason, cause)
 
 
 def _likeliest_cause(
-    tried: Validated, matches: Sequence[PairMatch], counts: Counts, geometry: Geometry | None,
+    checks: Validated, matches: Sequence[PairMatch], counts: Counts, geometry: Geometry | None,
     p: ValidationParameters,
 ) -> tuple[Cause, str]:  # fmt: skip
     """Return the most likely cause of `not_found`, and the next step as a sentence."""
@@ -471,7 +471,7 @@ def _likeliest_cause(
     if tilted is not None:
         return "gravity", tilted.validation.reason
     if geometry is not None:
-        own = _cause_in_view(geometry, tried, p)
+        own = _cause_in_view(geometry, checks, p)
         if own is not None:
             return own
     first = matches[0].validation.reason if matches else ""
@@ -484,7 +484,7 @@ def _likeliest_cause(
 
 
 def _cause_in_view(
-    geometry: Geometry, tried: Validated, p: ValidationParameters
+    geometry: Geometry, checks: Validated, p: ValidationParameters
 ) -> tuple[Cause, str] | None:
     """Return a cause in the query frame itself, and the next step; None if there is none."""
     if len(geometry.patches) < p.minimum_patches:
@@ -500,7 +500,7 @@ def _cause_in_view(
             f"the frame shows {planes:.0f} planes, too few to distinguish places. Turn the sensor "
             "towards furniture or a corner, and send another query",
         )
-    others = list(tried.geometries.values())
+    others = list(checks.geometries.values())
     if not others:
         return None
     if all(type(one.surface.camera) is not type(geometry.surface.camera) for one in others):

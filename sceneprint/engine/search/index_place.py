@@ -342,13 +342,13 @@ class IndexPlace:
         if self._store is None:
             return
         self.remove_unknown()
-        known = self._known()
+        rows = self._known()
         for folder in self._folders():
-            if folder.name in known and manifests(folder):
+            if folder.name in rows and manifests(folder):
                 try:
-                    self._purge_folder(known[folder.name], folder)
+                    self._purge_folder(rows[folder.name], folder)
                 except (OSError, SceneprintError) as error:
-                    extra = {"map": known[folder.name].name, "error": str(error)}
+                    extra = {"map": rows[folder.name].name, "error": str(error)}
                     log.warning("purge incomplete", extra=extra)
 
     def _purge_folder(self, row: MapRow, folder: Path) -> None:

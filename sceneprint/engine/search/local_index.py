@@ -399,11 +399,11 @@ class Reader:
     def _publish(self, version: IndexVersion | None, revision: int) -> None:
         tail, both = self._tail.tail(), 0
         deleted = np.fromiter(self._dead, np.int64, len(self._dead))
-        held = np.isin(deleted, tail.keys)
+        included = np.isin(deleted, tail.keys)
         if version is not None:
-            held |= version.has(deleted)
+            included |= version.has(deleted)
             both = int(version.has(tail.keys).sum())  # frames that were signed again
-        dead = frozenset(deleted[held].tolist())
+        dead = frozenset(deleted[included].tolist())
         size = len(version or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)
         self._view = IndexView(model.id, model.metric, revision, size, dead, damaged, version, tail)

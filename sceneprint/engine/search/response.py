@@ -107,19 +107,19 @@ def match_records(
 ) -> list[MatchRecord]:
     """Return the records of the validated candidates in their order, then of the others by rank."""
     position = {int(candidates.ranking.indices[i]): i for i in chosen}
-    tried = {match.index: match.validation for match in matches}
-    order = [*tried, *(number for number in position if number not in tried)]
+    checks = {match.index: match.validation for match in matches}
+    order = [*checks, *(number for number in position if number not in checks)]
     records = []
     for number in order:
         if number not in candidates.rows:
             continue
-        if number in tried:
-            validation = validation_record(tried[number])
+        if number in checks:
+            validation = validation_record(checks[number])
         elif number in candidates.unreadable:
             validation = ValidationRecord(status="skipped", reason=candidates.unreadable[number])
         else:
             validation = ValidationRecord(status="skipped", reason=candidates.untried)
-        records.append(_match(candidates, position[number], number, tried.get(number), validation))
+        records.append(_match(candidates, position[number], number, checks.get(number), validation))
     return records
 
 
@@ -179,7 +179,7 @@ def _match(
     candidates: Candidates,
     position: int,
     number: int,
-    tried: PairValidation | None,
+    checks: PairValidation | None,
     validation: ValidationRecord,
 ) -> MatchRecord:
     row, gain = candidates.rows[number], None
@@ -188,7 +188,7 @@ def _match(
         places = candidates.selection.indices.tolist()
         selected = position in places
         gain = float(candidates.selection.gains[places.index(position)]) if selected else None
-    T = None if tried is None else tried.T_match_query
+    T = None if checks is None else checks.T_match_query
     in_map: Floats | None = None
     if T is not None and row.pose is not None and validation.status != "rejected":
         in_map = np.array(row.pose) @ T
@@ -208,8 +208,8 @@ def _match(
         transform=None if T is None else transform(T, sensor_of(row), candidates.query_frame),
         predicted=(
             None
-            if tried is None or tried.predicted is None
-            else transform(tried.predicted, sensor_of(row), candidates.query_frame)
+            if checks is None or checks.predicted is None
+            else transform(checks.predicted, sensor_of(row), candidates.query_frame)
         ),
         parent_frame=row.sent_parent or row.pose_parent,
         pose_in_map=(
@@ -219,8 +219,8 @@ def _match(
         ),
         uncertainty=(
             None
-            if tried is None
-            else uncertainty_record(tried.covariance, PAIR_METHOD, candidates.covariance)
+            if checks is None
+            else uncertainty_record(checks.covariance, PAIR_METHOD, candidates.covariance)
         ),
         base_in_map=candidates.base_of(in_map, str(row.pose_parent)),
     )
@@ -272,22 +272,22 @@ def validation_record(v: PairValidation) -> ValidationRecord:
 
 
 def explain(
-    candidates: Candidates, tried: Validated, among: Ints64 | None, p: DiversityParameters | None
+    candidates: Candidates, checks: Validated, among: Ints64 | None, p: DiversityParameters | None
 ) -> list[Explanation]:
     """Return for each frame of R the last stage that it reached, and the reason.
 
     Parameters
     ----------
     candidates : candidates with the rows of all frames of R
-    tried : validations of the candidates
+    checks : validations of the candidates
     among : (R, R) distances within R; None if diversification was not requested
     p : parameters of the selection
     """
     left = None
     if among is not None and len(candidates.ranking):
-        left = remaining_gains(among, np.asarray(tried.chosen, np.intp), p)
-    records = {match.index: validation_record(match.validation) for match in tried.matches}
-    return list(_each(candidates, tried, records, among, left))
+        left = remaining_gains(among, np.asarray(checks.chosen, np.intp), p)
+    records = {match.index: validation_record(match.validation) for match in checks.matches}
+    return list(_each(candidates, checks, records, among, left))
 
 
 def figures(v: ValidationRecord) -> str:
@@ -305,10 +305,10 @@ def figures(v: ValidationRecord) -> str:
 
 
 def _each(
-    candidates: Candidates, tried: Validated, records: dict[int, ValidationRecord],
+    candidates: Candidates, checks: Validated, records: dict[int, ValidationRecord],
     among: Ints64 | None, left: np.ndarray | None,
 ) -> Iterator[Explanation]:  # fmt: skip
-    chosen = set(tried.chosen)
+    chosen = set(checks.chosen)
     for position, number in enumerate(candidates.ranking.indices.tolist()):
         if number not in candidates.rows:  # deleted in the meantime
             continue
@@ -319,11 +319,11 @@ def _each(
             reason = figures(records[number])
         elif position in chosen:
             stage = "retrieve" if candidates.selection is None else "diversify"
-            was_requested = tried.untried != NOT_ASKED
+            was_requested = checks.untried != NOT_ASKED
             outcome = "skipped" if was_requested else "ranked"
-            reason = tried.unreadable.get(number, tried.untried)
+            reason = checks.unreadable.get(number, checks.untried)
         elif among is not None and left is not None:
-            reason = _not_selected(candidates, tried, among, position, float(left[position]))
+            reason = _not_selected(candidates, checks, among, position, float(left[position]))
         else:
             reason = f"not among the first {len(chosen)} of the ranking, which were the candidates"
         yield Explanation(
@@ -340,11 +340,11 @@ def _each(
 
 
 def _not_selected(
-    candidates: Candidates, tried: Validated, among: Ints64, position: int, gain: float
+    candidates: Candidates, checks: Validated, among: Ints64, position: int, gain: float
 ) -> str:
     """Return why a frame was not selected: its most similar selected frame, and its gain."""
-    own = among[position, list(tried.chosen)]
-    nearest = tried.chosen[int(np.argmin(own))]
+    own = among[position, list(checks.chosen)]
+    nearest = checks.chosen[int(np.argmin(own))]
     row = candidates.rows.get(int(candidates.ranking.indices[nearest]))
     name = "frame, which was deleted" if row is None else f"frame {row.id}"
     if gain <= DUPLICATE:
@@ -364,7 +364,7 @@ class ExplainedQuery:
     prepared: retrieval.PreparedQuery
     query: Query
     candidates: Candidates
-    tried: Validated
+    checks: Validated
     model: Model
     deadline: retrieval.Deadline
 
@@ -393,7 +393,7 @@ def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     passes = part.among is None or row.number in part.among
     # an approximate index does not report which frames it compared
     missed = not at and passes and not case.searched.exact and rank <= case.searched.size
-    selected = bool(at) and at[0] in case.tried.chosen
+    selected = bool(at) and at[0] in case.checks.chosen
     validation, T = _aligned(case, part, row)
     if missed:
         lost: Lost | None = "shortlist"
@@ -469,18 +469,18 @@ def _lost(
     case: ExplainedQuery, row: FrameRow, rank: int, passes: bool, ranked: bool, selected: bool
 ) -> tuple[Lost | None, str]:
     """Return the stage at which a frame dropped out, and the reason."""
-    size, tried = len(case.searched.ranking), case.tried
+    size, checks = len(case.searched.ranking), case.checks
     if not passes:
         return "filter", "it does not pass the filter"
     if not ranked:
         return "ranking", f"its rank is {rank}, and only {size} frames are ranked"
     if not selected:
         return "selection", (
-            f"its rank is {rank}, and it is not among the {len(tried.chosen)} candidates; query "
+            f"its rank is {rank}, and it is not among the {len(checks.chosen)} candidates; query "
             "with more `candidates`, or with `explain` to see which candidate it resembles"
         )
-    status = {match.index: match.validation for match in tried.matches}.get(row.number)
-    shown = {match.index for match in listed(tried.matches, case.query.k)}
+    status = {match.index: match.validation for match in checks.matches}.get(row.number)
+    shown = {match.index for match in listed(checks.matches, case.query.k)}
     if status is not None and row.number not in shown:
         return "turn", (
             "more than `k` matches are accepted, and others are listed before it; "
@@ -492,9 +492,9 @@ def _lost(
         return "validation", figures(validation_record(status))
     if "validate" not in case.query.stages:
         return None, f"it is a match with rank {rank}; validation was not requested"
-    if row.number in tried.unreadable:
-        return "validation", tried.unreadable[row.number]
-    return "deadline" if tried.late else "turn", tried.untried
+    if row.number in checks.unreadable:
+        return "validation", checks.unreadable[row.number]
+    return "deadline" if checks.late else "turn", checks.untried
 
 
 def _aligned(
@@ -504,7 +504,7 @@ def _aligned(
     geometry = case.prepared.geometry
     if geometry is None:
         return None, None
-    earlier: dict[int, PairValidation] = {one.index: one.validation for one in case.tried.matches}
+    earlier: dict[int, PairValidation] = {one.index: one.validation for one in case.checks.matches}
     aligned = earlier.get(row.number)
     if aligned is None:
         if not case.deadline.allows():

@@ -68,9 +68,9 @@ class Readers:
             if self._history != self._database.history:  # a restored database reuses revisions
                 self._history = self._database.history
                 self._open.clear()
-            held, reader = self._open.get(row.name, (None, None))
+            open_key, reader = self._open.get(row.name, (None, None))
             key = (row.number, row.model_id)
-            if reader is None or held != key:  # a new map, or another model
+            if reader is None or open_key != key:  # a new map, or another model
                 model = self._signers(row.model_id).model
                 reader = Reader(connection, row, self._place.folder(row), model)
                 self._open[row.name] = (key, reader)
@@ -93,11 +93,11 @@ class Readers:
         """Remove deleted frames from memory, except those in the newest indexes."""
         self.tidy(connection)
         with self._lock:
-            held = list(self._open.items())
+            readers = list(self._open.items())
         rows = {row.name: row for row in list_maps(connection)}
-        for name, (wanted, reader) in held:
+        for name, (key, reader) in readers:
             row = rows.get(name)
-            if row is not None and (row.number, row.model_id) == wanted:
+            if row is not None and (row.number, row.model_id) == key:
                 reader.purge(connection, row)
 
     def tidy(self, connection: Connection) -> None:
@@ -109,7 +109,7 @@ class Readers:
         rows = {row.name: (row.number, row.model_id) for row in connection.execute(statement)}
         with self._lock:
             self._tidied = time.monotonic()
-            for name in [name for name, (held, _) in self._open.items() if rows.get(name) != held]:
+            for name in [name for name, (key, _) in self._open.items() if rows.get(name) != key]:
                 del self._open[name]
             for name, (_, reader) in list(self._open.items()) if self._place.is_shared else ():
                 if reader.lost_index(IN_USE_S):  # mapped files still occupy disk space

@@ -76,8 +76,8 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
     try:
         with store.database.read() as connection:  # usually no repair is due, so no lock
             # a random sample, so that irreparable frames do not prevent other repairs
-            some = random.sample(list(numbers), min(MOST, len(numbers)))
-            due = _due(connection, some, model_id)
+            sample = random.sample(list(numbers), min(MOST, len(numbers)))
+            due = _due(connection, sample, model_id)
         if not due:
             return 0
         with store.database.write() as connection:
