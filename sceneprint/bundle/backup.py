@@ -47,7 +47,7 @@ from sceneprint_client.api import FrameState
 
 #: Number of parts and blobs to write concurrently, since writers wait for the disk or the network.
 THREADS = 8
-#: Number of blobs in a task of a thread; most of them exist in the place.
+#: Number of blobs that one task of a thread copies; most of them are already in the place.
 _BATCH = 256
 #: Size in bytes above which a blob is streamed instead of read into memory.
 LARGE = 8 << 20

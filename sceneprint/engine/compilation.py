@@ -26,7 +26,7 @@ from sceneprint.geometry.signature import pair_features
 from sceneprint.geometry.views import plan
 from sceneprint.models import PRESETS, read_model
 
-#: One of the last kernels to be compiled of each part, whose machine code shows that all exist.
+#: Kernel of each part that is compiled last; if its machine code exists, the part is compiled.
 _LAST = {"signing": pair_features._count, "validation": icp.refine_in_place, "clouds": plan._add}
 #: Parts that a service for depth images needs, and those that a service for clouds needs.
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")

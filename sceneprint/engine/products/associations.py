@@ -251,7 +251,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     def _view(self, of: MapRow) -> tuple[MapRow, Model, IndexView]:
         """Return the current row, model and view of a map; raise UnknownMap if it was deleted."""
         row = of
-        while True:  # until the signer, which is loaded outside of a transaction, fits
+        while True:  # the map may switch its model while the signer is loaded
             model = self._context.signers(row.model_id).model
             with self._store.database.read() as connection:
                 row = find_map(connection, of.name)

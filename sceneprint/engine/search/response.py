@@ -310,7 +310,7 @@ def _each(
 ) -> Iterator[Explanation]:  # fmt: skip
     chosen = set(checks.chosen)
     for position, number in enumerate(candidates.ranking.indices.tolist()):
-        if number not in candidates.rows:  # deleted in the meantime
+        if number not in candidates.rows:  # the frame was deleted during the query
             continue
         stage: Stage = "retrieve"
         outcome: Outcome = "not_selected"
