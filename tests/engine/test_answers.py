@@ -225,7 +225,7 @@ def test_what_is_not_there_cannot_be_asked(full: Engine, uploads: Any) -> None:
         full.queries.upload(["attic"], uploads[0].data, uploads[0].meta, Query())
     with pytest.raises(UnknownFrame, match="in map 'hall'"):
         full.query_frame("hall", added.frame_id, Query())
-    with pytest.raises(InvalidRequest, match="is received: Stored durably") as caught:
+    with pytest.raises(InvalidRequest, match="is received: The frame is stored durably") as caught:
         full.query_frame("other", added.frame_id, Query())
     assert caught.value.fields == (("frame_id", "is received"),)
 

@@ -181,7 +181,7 @@ def test_what_is_not_there_is_said(
     waiting, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     for name, find in every_output(empty, waiting.frame_id).items():
         if name != "upload":
-            with pytest.raises(NotIndexed, match="is received: Stored durably"):
+            with pytest.raises(NotIndexed, match="is received: The frame is stored durably"):
                 find()
     assert empty.outputs.upload("hall", waiting.frame_id).make() == uploads[0].data
     bare = FrameMeta(intrinsics=uploads[1].meta.intrinsics)

@@ -351,7 +351,7 @@ def stand_still(*given, **more):
     time.sleep(600)
 
 setattr(module, name, stand_still)
-engine = Engine(Settings(data_dir=Path(sys.argv[1]), lease_s=0.3, tail_frames=5))
+engine = Engine(Settings(data_dir=Path(sys.argv[1]), job_lease_s=0.3, unindexed_frames=5))
 while True:
     held = engine.claim("doomed")
     if held is None:
