@@ -1,8 +1,8 @@
-"""Decode uploads, in confined processes that can only compute, or in this process.
+"""Decode uploads in confined processes, or trusted data in this process.
 
 untrusted bytes  --Decoders.place-->  Decoder  --samples | points-->  arrays, checked again
 
-`DecoderPool` (pool.py) uses processes, and `LocalDecoders` this process, for trusted data.
+`DecoderPool` (pool.py) uses confined processes. `LocalDecoders` uses this process.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sceneprint_client.sidecars import Position, Unsaid
 
 
 class Decoder(Protocol):
-    """Turns bytes of an upload into arrays."""
+    """Decoder that converts the bytes of an upload to arrays."""
 
     def samples(self, data: bytes) -> Samples:
         """Return the samples of a depth image; see `decode_samples`."""
@@ -32,26 +32,28 @@ class Decoder(Protocol):
 
 
 class Decoders(Protocol):
-    """A number of decoders; safe to share between threads."""
+    """Set of decoders that threads may share."""
 
     def place(self) -> AbstractContextManager[Decoder]:
-        """Wait for a decoder and hold it. Process the arrays while you hold it, so that the number
-        of decoders bounds memory and processors as well.
+        """Wait for a decoder and hold it.
+
+        Process the arrays within the context, so that the number of decoders also limits the use
+        of memory and processors.
         """
 
     def start(self) -> None:
-        """Start what the first upload would otherwise wait for."""
+        """Start a decoder before the first upload needs it."""
 
     def close(self) -> None:
-        """End all decoders."""
+        """Stop all decoders."""
 
 
 class LocalDecoders:
-    """Decodes in this process.
+    """Decoders that run in this process.
 
     Parameters
     ----------
-    count : number of uploads that are decoded at once
+    count : maximum number of concurrent uploads
     """
 
     def __init__(self, count: int) -> None:

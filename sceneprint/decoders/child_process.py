@@ -1,10 +1,10 @@
-"""The process of a decoder: it loads code, gives up all rights, and decodes until it is ended.
+"""Decoder process, which loads its code, gives up all rights, and decodes until it is killed.
 
     python -m sceneprint.decoders.child_process CONTROL MEMORY PARENT BYTES plain|kernels [MORE]
 
-CONTROL is a socket for one JSON message each way per task. MEMORY is shared with the parent: it
-holds the bytes of the upload, and then the array. MORE is for other programs that serve tasks.
-Nothing is pickled, and the parent checks every reply.
+CONTROL is a socket that carries one JSON request and one JSON reply per task. MEMORY is shared with
+the parent and holds the bytes of the upload, and then the array. MORE stands for the arguments of
+other programs that serve tasks. Nothing is pickled, and the parent checks every reply.
 """
 
 from __future__ import annotations
@@ -33,44 +33,49 @@ from sceneprint.geometry.kernel import Kernel
 from sceneprint_client.formats import formats_of, function_at
 from sceneprint_client.sidecars import UNSAID
 
-#: Size of the shared memory, bytes: that of the largest upload, whose arrays are smaller.
+#: Size of the shared memory, bytes. It holds the largest upload; arrays are smaller.
 SHARED_BYTES = 512 << 20
-#: Maximum size of a message, bytes, and of an error or traceback in it, characters.
+#: Maximum size of a message, bytes, and maximum length of an error or traceback, characters.
 MESSAGE_BYTES, MOST_TEXT = 1 << 16, 8000
 
-#: One array, or several that follow each other.
+#: One array, or several arrays that follow each other.
 Arrays = NDArray[Any] | tuple[NDArray[Any], ...] | None
-#: Function of the upload's bytes and the request that returns the reply and its arrays.
+#: Function that takes an upload's bytes and the request, and returns the reply and its arrays.
 Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], Arrays]]
 
 
 def _samples(data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
-    found = decode_samples(data)
-    return {"type": found.dtype.str, "shape": found.shape}, found
+    samples = decode_samples(data)
+    return {"type": samples.dtype.str, "shape": samples.shape}, samples
 
 
 def _points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
-    told = request["viewpoint"]
-    viewpoint = UNSAID if told == UNSAID.value else None if told is None else tuple(told)
-    found = read_points(data, request["format"], viewpoint, request["units_per_metre"])
-    reply = {"shape": found.points.shape, "viewpoint": found.viewpoint, "given": found.given}
-    return reply, found.points
+    position = request["viewpoint"]
+    viewpoint = (
+        UNSAID if position == UNSAID.value else None if position is None else tuple(position)
+    )
+    cloud = read_points(data, request["format"], viewpoint, request["units_per_metre"])
+    reply = {
+        "shape": cloud.points.shape, "viewpoint": cloud.viewpoint,
+        "file_points": cloud.file_points,
+    }  # fmt: skip
+    return reply, cloud.points
 
 
 TASKS: Mapping[str, Task] = {"samples": _samples, "points": _points}
 
 
 def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None) -> None:
-    """Run tasks until the parent closes the socket or ends.
+    """Run tasks until the parent closes the socket or exits.
 
     Parameters
     ----------
     tasks : functions by name
-    warm : loads what the tasks need, with kernels if its argument is true; default:
-        `load_decoders`
+    warm : function that loads the code of the tasks, including kernels if its argument is true;
+        default: `load_decoders`
     """
     control, memory, parent, more_bytes = map(int, sys.argv[1:5])
-    # signals that stop a service reach its whole group, while uploads are still in progress
+    # a signal that stops the service reaches its whole process group; uploads must still finish
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     if not die_with_parent(parent):
@@ -78,18 +83,20 @@ def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None)
     shared = mmap.mmap(memory, SHARED_BYTES)
     try:
         (warm or load_decoders)(sys.argv[5] == "kernels")
-        _to_nowhere()
+        _redirect_to_null()
         protections = asdict(close_process(more_bytes))
     except Exception:
-        _tell(control, {"broke": traceback.format_exc()[-MOST_TEXT:]})
+        _send(control, {"broke": traceback.format_exc()[-MOST_TEXT:]})
         return
-    _tell(control, {"ready": protections})
+    _send(control, {"ready": protections})
     while message := os.read(control, MESSAGE_BYTES):
-        _tell(control, _done(tasks, json.loads(message), shared))
+        _send(control, _run_task(tasks, json.loads(message), shared))
 
 
-def _done(tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap) -> dict[str, Any]:
-    """Run a task and return its reply, which may be an error of the upload."""
+def _run_task(
+    tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap
+) -> dict[str, Any]:
+    """Run a task and return its reply, or the error of the upload."""
     try:
         reply, arrays = tasks[request["task"]](shared[: request["bytes"]], request)
         if arrays is None:
@@ -110,30 +117,29 @@ def _done(tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap)
     return reply
 
 
-def _tell(control: int, reply: dict[str, Any]) -> None:
+def _send(control: int, reply: dict[str, Any]) -> None:
     os.write(control, json.dumps(reply).encode())
 
 
-def _to_nowhere() -> None:
-    """Redirect standard input, output and error to the null device."""
+def _redirect_to_null() -> None:
     nowhere = os.open(os.devnull, os.O_RDWR)
     for number in (0, 1, 2):
         os.dup2(nowhere, number)
     os.close(nowhere)
 
 
-# Everything that is imported or compiled on first use is used once before the process is confined.
+# A confined process can neither import nor compile, so all code is used once before confinement.
 
 
 def load_decoders(kernels: bool) -> None:
-    """Read a file of each format; PCD and PLY, whose readers are compiled, only with kernels."""
+    """Load the readers of all formats; the compiled ones (PCD and PLY) only if `kernels`."""
     for data in _images():
         decode_samples(data)
     for data, form in array_samples():
         read_points(data, form, UNSAID, 1.0)
     for one in formats_of("depth", "cloud"):
         function_at(one.reader)
-    with suppress(ImportError):  # an extra, which a LAZ file's error names
+    with suppress(ImportError):  # lazrs is an optional dependency
         import lazrs  # noqa: F401
     for wrong in (b"\x89PNG\r\n\x1a\n" + bytes(40), b"\x93NUMPY\x01\x00\x02\x00{}", b"no image"):
         with suppress(SceneprintError):
@@ -144,19 +150,19 @@ def load_decoders(kernels: bool) -> None:
         read_points(data, form, UNSAID, 1.0)
     for module in (rows, pcd, ply):
         for one in vars(module).values():
-            # an uncompiled variant raises an error; kernels without signatures are inlined
+            # kernels without signatures are inlined
             if isinstance(one, Kernel) and one.compiler.signatures:
                 one.compiler.disable_compile()
 
 
 def _images() -> list[bytes]:
-    found = [encode_png(np.ones((2, 2), np.uint16))]
-    found.append(bytes(12) + found[0])  # compressedDepth
-    return found + [encode_npy(np.ones((2, 2), kind)) for kind in ("f2", "f4", "f8", "u2")]
+    images = [encode_png(np.ones((2, 2), np.uint16))]
+    images.append(bytes(12) + images[0])  # compressedDepth
+    return images + [encode_npy(np.ones((2, 2), kind)) for kind in ("f2", "f4", "f8", "u2")]
 
 
 def array_samples() -> list[tuple[bytes, Any]]:
-    """Return files whose readers need no kernels, with their formats."""
+    """Return small files, with their formats, whose readers need no kernels."""
     points = np.ones((12, 3), np.float32)
     header = bytearray(227)
     struct.pack_into("<4s", header, 0, b"LASF")
@@ -169,7 +175,7 @@ def array_samples() -> list[tuple[bytes, Any]]:
 
 
 def text_samples() -> list[tuple[bytes, Any]]:
-    """Return files of PCD and PLY, whose readers are compiled, with their formats."""
+    """Return small PCD and PLY files, with their formats; their readers are compiled."""
     row = b"1 2 3\n"
     head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"
     head += b"POINTS 12\nDATA "
@@ -180,13 +186,13 @@ def text_samples() -> list[tuple[bytes, Any]]:
     vertex = b"element vertex 12\nproperty float x\nproperty float y\nproperty float z\n"
     listed = b"property list uchar int n\n"
     other = b"element other 1\nproperty list uchar int n\n"
-    found: list[tuple[bytes, Any]] = [
+    samples: list[tuple[bytes, Any]] = [
         (head + b"ascii\n" + 12 * row, "pcd"),
         (head + b"binary\n" + plain, "pcd"),
         (head + b"binary_compressed\n" + sizes + packed, "pcd"),
     ]
     for form in (b"ascii", b"binary_little_endian", b"binary_big_endian"):
-        begin = b"ply\nformat " + form + b" 1.0\n"
+        header = b"ply\nformat " + form + b" 1.0\n"
         text = form == b"ascii"
         body, lists, before = 12 * row, 12 * b"1 2 3 1 7\n", b"2 5 6\n"
         if not text:
@@ -195,10 +201,10 @@ def text_samples() -> list[tuple[bytes, Any]]:
             lists = struct.pack(f"{order}3fBi", 1, 2, 3, 1, 7) * 12
             before = struct.pack(f"{order}B2i", 2, 5, 6)
         end = b"end_header\n"
-        found.append((begin + vertex + end + body, "ply"))
-        found.append((begin + vertex + listed + end + lists, "ply"))
-        found.append((begin + other + vertex + end + before + body, "ply"))
-    return found
+        samples.append((header + vertex + end + body, "ply"))
+        samples.append((header + vertex + listed + end + lists, "ply"))
+        samples.append((header + other + vertex + end + before + body, "ply"))
+    return samples
 
 
 if __name__ == "__main__":

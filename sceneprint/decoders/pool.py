@@ -1,10 +1,10 @@
-"""A pool of decoder processes: started when needed, shared fairly, replaced after failures.
+"""Pool of decoder processes, which start when needed, are shared fairly and replaced if they fail.
 
     DecoderPool.place  -->  a decoder for one upload  --samples | points-->  arrays
 
-A compromised decoder can send any reply. Replies are therefore JSON and plain arrays, which are
-copied from the shared memory before they are checked. The memory is sealed: a decoder that shrank
-it would crash the service.
+A compromised decoder can send any reply. Replies are therefore JSON and plain arrays, and the pool
+copies the arrays from the shared memory before it checks them. The memory is sealed, because a
+decoder that shrinks it would crash the service.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from sceneprint_client.sidecars import Position, Unsaid
 log = logging.getLogger(__name__)
 
 PROGRAM = "sceneprint.decoders.child_process"
-#: Formats with compiled readers: their process takes 1 s and 140 MB more.
+#: Formats with compiled readers, whose process takes 1 s longer to start and 140 MB more memory.
 _COMPILED = ("ply", "pcd")
-#: Errors of an upload that a decoder may report.
+#: Errors of an upload that a decoder may report, by name.
 _ERRORS = {
     one.__name__: one
     for one in (
@@ -57,17 +57,17 @@ _ERRORS = {
         errors.InvalidIntrinsics, errors.MissingDependency,
     )
 }  # fmt: skip
-#: Maximum seconds until a process is ready, which may compile first; seconds between two looks at
-#: its processor time; and maximum seconds until an upload gets a decoder.
+#: Time limit for the start of a process, which may compile kernels; interval between checks of its
+#: processor time; and time limit for an upload that waits for a decoder, seconds.
 _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
-#: Maximum ratio of a task's wall time to its limit of processor time, for busy machines.
+#: Maximum ratio of a task's wall time to its limit of processor time. Machines may be busy.
 _PATIENCE = 8
-#: Size of a task above which its shared memory is given back, and not erased, bytes.
-_KEPT_BYTES = 8 << 20
-#: Sizes of glibc up to which a process keeps freed memory: half a decoder's time went into pages
-#: that it returned after each image and got back for the next.
+#: Maximum size of the shared memory that is erased after a task, bytes. Larger memory is freed.
+_ERASED_BYTES = 8 << 20
+#: Variables of glibc that set the maximum size of freed memory that a process keeps. Otherwise half
+#: of a decoder's time is spent on pages that it frees after each image and allocates for the next.
 _MALLOC = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
-#: Variables that a decoder needs to find its code; others may be secrets.
+#: Environment variables that a decoder needs to find its code. Others may contain secrets.
 _ENVIRONMENT = (
     "PATH", "LANG", "LC_ALL", "HOME", "USER", "TMPDIR", "XDG_CACHE_HOME", "PYTHONPATH",
     "PYTHONHOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "NUMBA_CPU_NAME",
@@ -76,19 +76,19 @@ _ENVIRONMENT = (
 
 
 class DecoderEnded(Exception):
-    """The process ended; the message says why."""
+    """Error for a decoder process that ended or sent an invalid reply; the message says why."""
 
 
 class DecoderProcess:
-    """A decoder process, its socket and its shared memory. It runs one task at a time.
+    """Decoder process with its socket and shared memory, which runs one task at a time.
 
     Parameters
     ----------
-    program : module that it runs
-    more_bytes : memory that it may allocate for its work, bytes; 0 for no limit
-    compiled : whether it loads kernels
-    files : descriptors that it may read, which are arguments of the program
-    more : arguments after these
+    program : name of the module that the process runs
+    more_bytes : maximum memory that the process may allocate for its work, bytes; 0 for no limit
+    compiled : whether the process loads kernels
+    files : file descriptors that the process may read; the program gets them as arguments
+    more : further arguments of the program
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class DecoderProcess:
         more: tuple[str, ...] = (),
     ) -> None:
         self.compiled, self._more_bytes = compiled, more_bytes
-        self._sent = self._used = 0  # bytes of the upload, and of the memory that the task used
+        self._sent = self._used = 0  # size of the upload, and of the memory that the task used
         self.protections = Protections(no_new_privileges=False, seccomp=False, landlock=0)
         memory = os.memfd_create("sceneprint-decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -110,16 +110,16 @@ class DecoderProcess:
             seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
             fcntl.fcntl(memory, fcntl.F_ADD_SEALS, seals)
             self._shared = mmap.mmap(memory, SHARED_BYTES)
-            given = (theirs.fileno(), memory, os.getpid(), more_bytes)
+            arguments = (theirs.fileno(), memory, os.getpid(), more_bytes)
             kind = "kernels" if compiled else "plain"
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", program, *map(str, given), kind, *map(str, files),
+                [sys.executable, "-P", "-m", program, *map(str, arguments), kind, *map(str, files),
                  *more],
                 env={name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
                 | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-                | dict.fromkeys(_MALLOC, str(_KEPT_BYTES)),
-                pass_fds=(*given[:2], *files), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
+                | dict.fromkeys(_MALLOC, str(_ERASED_BYTES)),
+                pass_fds=(*arguments[:2], *files), stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
         except BaseException:
             self._socket.close()
@@ -130,11 +130,11 @@ class DecoderProcess:
 
     @property
     def pid(self) -> int:
-        """The process id."""
+        """Id of the process."""
         return self._process.pid
 
     def await_ready(self) -> None:
-        """Wait until the process is confined; raise DecoderEnded if that fails."""
+        """Wait until the process is confined. Raise DecoderEnded if it fails."""
         reply = self._receive(_BEGIN_S)
         walls = reply.get("ready")
         if not isinstance(walls, dict):
@@ -144,14 +144,14 @@ class DecoderProcess:
         )
 
     def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
-        """Run a task and return its reply, unchecked; `array_of` returns its arrays.
+        """Run a task and return its unchecked reply; `array_of` returns its arrays.
 
         Raises
         ------
-        DecoderEnded : The process ended during the task.
-        DecoderFailure : The task took too long.
+        DecoderEnded : If the process ends during the task.
+        DecoderFailure : If the task takes too long.
         """
-        self._sent, self._used = len(data), SHARED_BYTES  # until a reply says how much it wrote
+        self._sent, self._used = len(data), SHARED_BYTES  # upper bound until the reply arrives
         self._shared[: len(data)] = data
         try:
             self._socket.send(json.dumps({**request, "bytes": len(data)}).encode())
@@ -162,18 +162,19 @@ class DecoderProcess:
     def result(
         self, reply: dict[str, Any], checked: Callable[[DecoderProcess, dict[str, Any]], Any]
     ) -> Any:
-        """Return the content of a reply.
+        """Return the checked result of a reply.
 
         Parameters
         ----------
-        reply : a reply of `run`
-        checked : checks a reply and returns its result; an error means that the reply is false
+        reply : return value of `run`
+        checked : function that checks a reply and returns its result; it raises an error for an
+            invalid reply
 
         Raises
         ------
-        DecoderEnded : The reply is false.
-        DecoderFailure : The task needed too much memory.
-        FrameError, MissingDependency : The decoder reports an error of the upload.
+        DecoderEnded : If the reply is invalid.
+        DecoderFailure : If the task needs too much memory.
+        FrameError, MissingDependency : If the decoder reports an error of the upload.
         """
         if reply.get("memory") is True:
             raise DecoderFailure(
@@ -189,18 +190,18 @@ class DecoderProcess:
         try:
             return checked(self, reply)
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-            raise DecoderEnded(f"its answer is no result: {str(error)[:80]}") from error
+            raise DecoderEnded(f"its reply is invalid: {str(error)[:80]}") from error
 
     def array_of(self, kind: str, shape: tuple[int, ...], first: int = 0) -> NDArray[Any]:
-        """Return a copy of an array of the reply, which starts at byte `first` of the memory."""
-        found = np.frombuffer(self._shared, kind, math.prod(shape), first).copy()
-        self._used = max(self._used, first + found.nbytes)
-        return found.reshape(shape)
+        """Return a copy of an array that starts at byte `first` of the shared memory."""
+        array = np.frombuffer(self._shared, kind, math.prod(shape), first).copy()
+        self._used = max(self._used, first + array.nbytes)
+        return array.reshape(shape)
 
     def clear(self) -> None:
-        """Erase the shared memory: the next upload may be another tenant's."""
-        if self._used > _KEPT_BYTES:
-            self._shared.madvise(mmap.MADV_REMOVE)  # gives the memory back, and reads as zeros
+        """Erase the shared memory, since the next upload may be another tenant's."""
+        if self._used > _ERASED_BYTES:
+            self._shared.madvise(mmap.MADV_REMOVE)  # frees the pages, which then read as zeros
         else:
             self._shared[: self._used] = bytes(self._used)
 
@@ -232,19 +233,18 @@ class DecoderProcess:
         try:
             reply = json.loads(message)
         except (ValueError, RecursionError) as error:
-            raise DecoderEnded("its answer is no JSON") from error
+            raise DecoderEnded("its reply is not JSON") from error
         if not isinstance(reply, dict):
-            raise DecoderEnded("its answer is no record")
+            raise DecoderEnded("its reply is not an object")
         return reply
 
     def _cpu_s(self) -> float:
-        """Return the processor time of the process, seconds."""
-        with suppress(OSError):  # it ended, and the socket will show it
+        with suppress(OSError):  # if the process has ended, the socket reports it
             return time.clock_gettime((~self._process.pid << 3) | 2)
         return 0.0
 
     def _is_asleep(self) -> bool:
-        """Return whether the process waits for neither a processor nor a disk."""
+        """Return whether the process is neither runnable nor waiting for a disk."""
         with suppress(OSError):
             stat = Path(f"/proc/{self._process.pid}/stat").read_text()
             return stat.rpartition(")")[2].split()[0] not in ("R", "D")
@@ -258,7 +258,7 @@ class DecoderProcess:
 
 
 class _Slot:
-    """A place in the pool, with the process that it has; a decoder while an upload holds it."""
+    """Place in the pool, which serves one upload at a time and starts its process when needed."""
 
     def __init__(self, pool: DecoderPool) -> None:
         self._pool = pool
@@ -266,7 +266,7 @@ class _Slot:
 
     def samples(self, data: bytes) -> Samples:
         """See Decoder."""
-        if len(data) > MAXIMUM_IMAGE_BYTES:  # refused by its length, unread
+        if len(data) > MAXIMUM_IMAGE_BYTES:  # `decode_samples` refuses it by its size
             return decode_samples(data)
 
         def checked(process: DecoderProcess, reply: dict[str, Any]) -> Samples:
@@ -275,35 +275,35 @@ class _Slot:
                 raise ValueError(f"type {kind!r:.40}")
             return process.array_of(kind, shape)
 
-        found: Samples = self.run({"task": "samples"}, data, checked)
-        return found
+        samples: Samples = self.run({"task": "samples"}, data, checked)
+        return samples
 
     def points(
         self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
         units_per_metre: float,
     ) -> ReadPoints:  # fmt: skip
         """See Decoder."""
-        told = viewpoint.value if isinstance(viewpoint, Unsaid) else viewpoint
+        position = viewpoint.value if isinstance(viewpoint, Unsaid) else viewpoint
         request = {
-            "task": "points", "format": file_format, "viewpoint": told,
+            "task": "points", "format": file_format, "viewpoint": position,
             "units_per_metre": units_per_metre,
         }  # fmt: skip
 
         def checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadPoints:
-            shape, given = _shape(reply, 3 * MAXIMUM_POINTS), int(reply["given"])
-            if shape[1] != 3 or not shape[0] <= given <= MAXIMUM_POINTS:
-                raise ValueError(f"{shape} points of {given}")
+            shape, file_points = _shape(reply, 3 * MAXIMUM_POINTS), int(reply["file_points"])
+            if shape[1] != 3 or not shape[0] <= file_points <= MAXIMUM_POINTS:
+                raise ValueError(f"{shape} points of {file_points}")
             place = reply["viewpoint"]
             if place is not None:
                 x, y, z = map(float, place)
                 if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-                    raise ValueError("no viewpoint")
+                    raise ValueError("the viewpoint is not finite")
                 place = x, y, z
             points: Floats32 = process.array_of("<f4", shape)
-            # kernels index by them; a comparison with NaN is false
+            # kernels use points as indices; comparisons with NaN are false
             if len(points) and not (points.min() >= -FARTHEST_M and points.max() <= FARTHEST_M):
-                raise ValueError("points beyond reach")
-            return ReadPoints(points, place, given)
+                raise ValueError("a point is too far away")
+            return ReadPoints(points, place, file_points)
 
         read: ReadPoints = self.run(request, data, checked, compiled=file_format in _COMPILED)
         return read
@@ -312,19 +312,20 @@ class _Slot:
         self, request: dict[str, Any], data: bytes,
         checked: Callable[[DecoderProcess, dict[str, Any]], Any], *, compiled: bool = False,
     ) -> Any:  # fmt: skip
-        """Run a task, and again in another process if the first one ended, whatever the cause.
+        """Run a task, and retry it once in a new process if the process ends.
 
         Parameters
         ----------
-        request : task and its parameters
-        checked : checks a reply and returns its result; an error means that the reply is false
-        compiled : whether kernels are needed
+        request : name of the task and its parameters
+        checked : function that checks a reply and returns its result; it raises an error for an
+            invalid reply
+        compiled : whether the task needs kernels
 
         Raises
         ------
-        DecoderFailure : The task crashed twice, took too long, or needed too much memory.
-        FrameError, MissingDependency : The decoder reports an error of the upload.
-        Busy : No process can be started.
+        DecoderFailure : If the task crashes twice, takes too long, or needs too much memory.
+        FrameError, MissingDependency : If the decoder reports an error of the upload.
+        Busy : If no process can be started.
         """
         try:
             return self._run(request, data, checked, compiled=compiled)
@@ -340,7 +341,7 @@ class _Slot:
             raise
 
     def end(self) -> None:
-        """End the process if there is one."""
+        """Kill the process if one is running."""
         process, self.process = self.process, None
         if process is not None:
             process.end()
@@ -352,7 +353,7 @@ class _Slot:
         process = self.process
         if process is None or (compiled and not process.compiled):
             self.end()
-            process = self.process = self._pool.begin(compiled=compiled)
+            process = self.process = self._pool.start_process(compiled=compiled)
         try:
             return process.result(process.run(request, data, self._pool.seconds), checked)
         finally:
@@ -360,15 +361,15 @@ class _Slot:
 
 
 class DecoderPool:
-    """Decoders in confined processes; see Decoders. Tenants take turns (`sceneprint.turns`).
+    """Decoders in confined processes, which tenants use in turn (`sceneprint.turns`).
 
     Parameters
     ----------
     count : maximum number of processes
-    more_bytes : memory that each may allocate for its work, bytes; 0 for no limit
+    more_bytes : maximum memory that each process may allocate for its work, bytes; 0 for no limit
     seconds : maximum processor time of an upload
-    whose : returns the tenant of this thread's request
-    program : module that the processes run
+    whose : function that returns the tenant of this thread's request
+    program : name of the module that the processes run
     """
 
     def __init__(
@@ -381,21 +382,22 @@ class DecoderPool:
         self._free = [_Slot(self) for _ in range(count)]
         self._slots = tuple(self._free)
         self._closed = False
-        # a process ends with the thread that started it, so one thread starts all processes
+        # the kernel kills a process when the thread that started it ends
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
         self._compiling = threading.Lock()
-        #: Confinement of the processes; None before the first is ready.
+        #: Protections of the processes; None before the first process is ready.
         self.protections: Protections | None = None
 
     @contextmanager
     def place(self) -> Iterator[_Slot]:
-        """See Decoders; raise Busy if no decoder becomes free in time."""
+        """See Decoders. Raise Busy if no decoder becomes free within the time limit."""
         tenant = self._whose()
         if not self._turns.acquire(tenant, _WAIT_S):
             raise errors.Busy(
-                f"No decoder is free within {_WAIT_S:g} s. Nothing was stored. Retry in a minute."
+                f"No decoder became free within {_WAIT_S:g} s. Nothing was stored. Retry in a "
+                "minute."
             )
-        slot = self._free.pop()  # the last one first, so that the others need not be started
+        slot = self._free.pop()  # last in, first out, so that a lightly loaded pool stays small
         try:
             yield slot
         finally:
@@ -406,31 +408,31 @@ class DecoderPool:
         """Start one process."""
         with self.place() as slot, suppress(errors.Busy):
             if slot.process is None:
-                slot.process = self.begin(compiled=False)
+                slot.process = self.start_process(compiled=False)
 
     def pids(self) -> list[int]:
-        """Return the ids of the running processes."""
+        """Return the process ids of the running decoders."""
         return [one.process.pid for one in self._slots if one.process is not None]
 
     def close(self) -> None:
-        """End all processes; uploads in progress fail."""
+        """Kill all processes; uploads in progress fail."""
         self._closed = True
         self._turns.close()
         for slot in self._slots:
             slot.end()
         self._starter.shutdown()
 
-    def begin(self, *, compiled: bool) -> DecoderProcess:
-        """Start a process and wait until it is ready; raise Busy if that fails."""
+    def start_process(self, *, compiled: bool) -> DecoderProcess:
+        """Start a process and wait until it is ready. Raise Busy if it fails."""
         try:
             if self._closed:
-                raise DecoderEnded("the service stops")
-            begin = self._starter.submit(
+                raise DecoderEnded("the service is stopping")
+            starting = self._starter.submit(
                 DecoderProcess, self._program, self.more_bytes, compiled=compiled
             )
-            process = begin.result()
+            process = starting.result()
             try:
-                if compiled:  # the first may compile, and the others load the result
+                if compiled:  # one process compiles, and the others load the result
                     with self._compiling:
                         process.await_ready()
                 else:
@@ -441,8 +443,8 @@ class DecoderPool:
         except (DecoderEnded, DecoderFailure, OSError, RuntimeError) as error:
             log.error("decoder cannot be started", extra={"error": str(error)})
             raise errors.Busy(
-                "No decoder can be started for this upload; the service's log says why. Nothing "
-                "was stored. Retry in a minute."
+                "No decoder can be started for this upload. Nothing was stored. Retry in a minute. "
+                "The log of the service shows the cause."
             ) from error
         if self.protections is None:
             walls = process.protections
@@ -452,7 +454,7 @@ class DecoderPool:
         return process
 
     def note(self, slot: _Slot, reason: str) -> None:
-        """Log that a decoder failed, and end it."""
+        """Log the failure of a decoder, and kill its process."""
         process = slot.process
         about = {"pid": None if process is None else process.pid, "error": reason}
         log.warning("decoder replaced", extra={**about, "tenant": self._whose()})
@@ -460,10 +462,10 @@ class DecoderPool:
 
 
 def _shape(reply: dict[str, Any], most: int) -> tuple[int, int]:
-    """Return the shape of a two-dimensional array with `most` numbers at most."""
+    """Return the shape of a two-dimensional array of at most `most` numbers."""
     height, width = reply["shape"]
     if not (type(height) is int and type(width) is int and height >= 0 and width >= 1):
-        raise ValueError("no shape")
+        raise ValueError("the shape is invalid")
     if height * width > most:
         raise ValueError(f"shape {height} x {width}")
     return height, width

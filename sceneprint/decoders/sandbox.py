@@ -2,9 +2,9 @@
 
 close_process  -->  Protections: the protections that this kernel supports
 
-The protections are independent of each other, and a kernel or container may lack some: limits of
-the process (setrlimit), no new privileges, a filter of system calls (seccomp), and rules for files,
-TCP and signals (Landlock). Open files stay open: import and load everything first.
+The protections are independent of each other, and a kernel or container may lack some of them:
+resource limits (setrlimit), no new privileges, a filter of system calls (seccomp), and rules for
+files, TCP and signals (Landlock). Open files stay open. Import all code before confinement.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
 
 @dataclass(frozen=True)
 class Protections:
-    """The protections of a process, besides limits on memory, files and processes.
+    """Protections of a process, besides limits on memory, files and processes.
 
     Parameters
     ----------
-    no_new_privileges : whether programs that it starts cannot gain rights
-    seccomp : whether only system calls for memory, time and open files work
-    landlock : version of Landlock, which forbids files, TCP and signals; 0 without
+    no_new_privileges : whether child programs cannot gain rights
+    seccomp : whether only system calls for memory, time and open files are allowed
+    landlock : version of Landlock, which forbids files, TCP and signals; 0 if unavailable
     """
 
     no_new_privileges: bool
@@ -40,7 +40,7 @@ class Protections:
 
     @property
     def text(self) -> str:
-        """The protections as a list for people."""
+        """List of the protections for logs and pages."""
         walls = ["limits on memory and time"]
         walls += ["no new privileges"] if self.no_new_privileges else []
         walls += ["seccomp"] if self.seccomp else []
@@ -49,38 +49,41 @@ class Protections:
 
 
 def die_with_parent(parent: int) -> bool:
-    """End this process with the thread that started it; return False if the parent has ended."""
+    """Let the kernel kill this process when the thread that started it ends.
+
+    Return False if the parent has already ended.
+    """
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent
 
 
 def close_process(more_bytes: int) -> Protections:
-    """Give up all rights except computing and open files, irrevocably.
+    """Irrevocably give up all rights except computation and open files.
 
     Parameters
     ----------
-    more_bytes : memory that this process may allocate from now on, bytes; 0 for no limit
+    more_bytes : maximum memory that this process may still allocate, bytes; 0 for no limit
     """
     limit_memory(more_bytes)
     no_new = _LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
-    # both need no new privileges; the filter comes last, because it forbids these calls
+    # Landlock and seccomp require no new privileges; seccomp comes last, since it forbids the rest
     landlock = _restrict_by_landlock() if no_new else 0
-    for what in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE,
-                 resource.RLIMIT_NPROC):  # fmt: skip
-        resource.setrlimit(what, (0, 0))
+    for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE,
+                  resource.RLIMIT_NPROC):  # fmt: skip
+        resource.setrlimit(limit, (0, 0))
     return Protections(no_new, no_new and _filter_system_calls(), landlock)
 
 
-# Landlock: an empty set of rules forbids everything that Landlock controls.
+# Landlock: an empty ruleset forbids everything that Landlock controls.
 
 _CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system calls, the same on all processors
 _ASK_VERSION = 1
-#: Number of rights on files that each version can forbid.
+#: Number of file access rights that each version can forbid.
 _FILE_BITS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 
 
 def _restrict_by_landlock() -> int:
-    """Forbid everything that this kernel's Landlock controls; return its version, or 0."""
+    """Forbid everything that Landlock controls; return its version, or 0 if that fails."""
     version = int(_LIBC.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION))
     if version < 1:
         return 0
@@ -97,11 +100,11 @@ def _restrict_by_landlock() -> int:
     return version if closed else 0
 
 
-# seccomp: a program of classic BPF over (number, architecture, arguments) of a system call.
+# seccomp: a classic BPF program on the number, architecture and arguments of a system call.
 
 _SECCOMP = {"x86_64": 317, "aarch64": 277}
 _ARCHITECTURE = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-#: Allowed calls: reading and writing open files, memory, time, and exit.
+#: Numbers of the allowed system calls: access to open files, memory, time, and exit.
 _ALLOWED = {
     "x86_64": {
         "read": 0, "write": 1, "close": 3, "fstat": 5, "munmap": 11, "brk": 12,
@@ -120,22 +123,22 @@ _ALLOWED = {
         "exit_group": 94, "getrandom": 278, "rseq": 293,
     },
 }  # fmt: skip
-#: mmap and mprotect, which are allowed for memory that is not executable.
+#: Numbers of mmap and mprotect, which are allowed only for memory that is not executable.
 _MAPPING = {"x86_64": (9, 10), "aarch64": (222, 226)}
 _PROT_EXEC = 4
-_FIRST_X32 = 0x40000000  #: numbers of x32's calls on x86-64
+_FIRST_X32 = 0x40000000  #: smallest number of an x32 system call on x86-64
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _NUMBER, _ARCH, _THIRD_ARGUMENT = 0, 4, 32
-_ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000 | 1, 0x80000000  #: refuse: EPERM
+_ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000 | 1, 0x80000000  #: a refused call fails with EPERM
 _SET_FILTER, _ALL_THREADS = 1, 1
 
 
 def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
-    """Return the filter as instructions of BPF: code, jump if true, jump if false, operand.
+    """Return the filter as BPF instructions: code, jump if true, jump if false, operand.
 
     Parameters
     ----------
-    machine : `platform.machine()`: x86_64 or aarch64
+    machine : result of `platform.machine()`, x86_64 or aarch64
     """
     allowed, mapping = sorted(_ALLOWED[machine].values()), _MAPPING[machine]
     program = [
@@ -147,7 +150,7 @@ def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
         (_RETURN, 0, 0, _KILL),
     ]
     rest = len(allowed)
-    # after the list: refuse, allow, and the check of a mapping's protection
+    # the jumps lead to the instructions after the list: refuse, allow, check the protection
     program += [(_EQUAL, rest + 1 - i + 2, 0, number) for i, number in enumerate(mapping)]
     program += [(_EQUAL, rest - i, 0, number) for i, number in enumerate(allowed)]
     program += [

@@ -1,8 +1,8 @@
-"""Read a file of a whole map in a confined process that can only compute.
+"""Read the file of a whole map in a confined process.
 
 file, name, options  --read_surface_confined-->  ReadSurface, checked again
 
-The process gets the open file, so its bytes are not copied, and returns arrays in shared memory.
+The process inherits the open file, which avoids a copy, and returns arrays in shared memory.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from sceneprint_client.files import naming
 from sceneprint_client.formats import HEAD
 
 _PROGRAM = "sceneprint.decoders.surface_process"
-#: Maximum number of notes on a file, and of characters in one.
+#: Maximum number of notes on a file, and maximum length of a note, characters.
 _MOST_NOTES, _LONGEST_NOTE = 20, 1000
 
 
 @dataclass(frozen=True)
 class SurfaceLimits:
-    """Limits on reading one file.
+    """Limits for one file.
 
     Parameters
     ----------
-    more_bytes : memory besides the file and the result, bytes; 0 for no limit
-    seconds : processor time
+    more_bytes : maximum memory besides the file and the result, bytes; 0 for no limit
+    seconds : maximum processor time
     """
 
     more_bytes: int = 2 << 30
@@ -58,21 +58,21 @@ def read_surface_confined(
     file: int | Path, name: str, options: SurfaceOptions | None = None,
     limits: SurfaceLimits | None = None,
 ) -> ReadSurface:  # fmt: skip
-    """Return the surface of a file, read in a confined process; see `read_surface`.
+    """Read the surface of a file in a confined process; see `read_surface`.
 
     Parameters
     ----------
-    file : descriptor or path of a regular file that nobody changes meanwhile
-    name : name of the file, for errors, and for formats that only the suffix shows
-    options : the user's statements about the file
-    limits : default: 2 GiB and 10 minutes
+    file : descriptor or path of a regular file, which must not change meanwhile
+    name : name of the file for errors; its suffix identifies formats without a signature
+    options : units and up direction that the user states
+    limits : limits for the process; default: 2 GiB and 10 minutes
 
     Raises
     ------
-    UnreadableCloud, UselessFrame, MissingDependency : as `read_surface`.
-    DecoderFailure : The process crashed, took too long, or needed too much memory.
-    Busy : No process can be started.
-    OSError : The file cannot be opened.
+    UnreadableCloud, UselessFrame, MissingDependency : If `read_surface` raises them.
+    DecoderFailure : If the process crashes, takes too long, or needs too much memory.
+    Busy : If no process can be started.
+    OSError : If the file cannot be opened.
     """
     if isinstance(file, int):
         return _read(file, name, options or SurfaceOptions(), limits or SurfaceLimits())
@@ -87,7 +87,7 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
     status = os.fstat(file)
     with naming(name):
         if not stat.S_ISREG(status.st_mode):
-            raise UnreadableCloud("This is no regular file. Name a file that holds the map.")
+            raise UnreadableCloud("This is not a regular file. Specify a file with the map.")
         form = surface_format(os.pread(file, HEAD, 0), name, status.st_size)
     request = {
         "task": "surface", "name": name, "up": options.up,
@@ -101,8 +101,8 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
             process.await_ready()
         except (DecoderEnded, DecoderFailure) as error:
             raise Busy(
-                f"No process can be started to read {name} ({error}). Nothing was stored. Retry "
-                "in a minute."
+                f"No process can be started to read {name} ({error}). Nothing was stored. Retry in "
+                "a minute."
             ) from error
         try:
             read: ReadSurface = process.result(process.run(request, b"", limits.seconds), _checked)
@@ -114,20 +114,20 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
 
 
 def _checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
-    """Return the result of a reply; an error means that the reply is false."""
+    """Check a reply and return its result; raise an error if the reply is invalid."""
     n, m, file_points = reply["points"], reply["triangles"], reply["file_points"]
     _check(_is_whole(n, 1, MOST_VERTICES), "points")
     _check(_is_whole(file_points, n, MOST_FILE_POINTS), "points of the file")
     points: Floats32 = process.array_of("<f4", (n, 3))
     far = 2 * FARTHEST_M + FAR_M
-    _check(bool(points.min() >= -far and points.max() <= far), "points beyond reach")
+    _check(bool(points.min() >= -far and points.max() <= far), "a point is too far away")
     triangles: Ints32 | None = None
     if m is not None:
         _check(_is_whole(m, 1, MOST_TRIANGLES), "triangles")
         triangles = process.array_of("<i4", (m, 3), points.nbytes)
-        _check(bool(triangles.min() >= 0 and triangles.max() < n), "triangles of other points")
+        _check(bool(triangles.min() >= 0 and triangles.max() < n), "indices of triangles")
     offset, up = _numbers(reply["offset"]), _numbers(reply["up"])
-    _check(abs(float(np.linalg.norm(up)) - 1.0) < 1e-6, "no direction")
+    _check(abs(float(np.linalg.norm(up)) - 1.0) < 1e-6, "up direction")
     units, voxel, notes = reply["units_per_metre"], reply["voxel"], reply["notes"]
     _check(math.isfinite(units) and units > 0 and (voxel is None or 0 < voxel < far), "lengths")
     sources = get_args(Source)
@@ -150,8 +150,7 @@ def _is_whole(value: object, least: int, most: int) -> bool:
 
 
 def _numbers(values: list[float]) -> Floats:
-    """Return three finite numbers; raise ValueError for others."""
     x, y, z = map(float, values)
-    found = np.array([x, y, z])
-    _check(bool(np.isfinite(found).all()), "no position")
-    return found
+    numbers = np.array([x, y, z])
+    _check(bool(np.isfinite(numbers).all()), "coordinates")
+    return numbers

@@ -1,8 +1,8 @@
-"""The process that reads one file of a whole map.
+"""Process that reads the file of one whole map.
 
     python -m sceneprint.decoders.surface_process CONTROL MEMORY PARENT BYTES kernels FILE FORMAT
 
-FILE is mapped, and the reader of FORMAT is loaded, before the process is confined. See
+Before its confinement the process maps FILE into memory and loads the reader of FORMAT. See
 child_process.py.
 """
 
@@ -33,7 +33,6 @@ from sceneprint.geometry.surface.upright import estimate_up
 
 
 def _mapped(descriptor: int) -> FileBytes:
-    """Map an open file into memory."""
     if os.fstat(descriptor).st_size == 0:
         return b""
     return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
@@ -60,22 +59,22 @@ def _main() -> None:
     serve({"surface": surface}, lambda _: _load(form))
 
 
-# Everything that is imported or compiled on first use is used once before the process is confined.
+# A confined process can neither import nor compile, so all code is used once before confinement.
 
 
 def _load(form: SurfaceFormat) -> None:
-    """Read a sample of each variant of a format."""
+    """Load the readers of a format by reading a sample of each of its variants."""
     points = np.ones((20, 3), np.float32)
     thinned(points, 8)
     estimate_up(points, None, np.array([0.0, 0.0, 1.0]))
     ElementTree.fromstring("<a/>")
     for data, one in (*array_samples(), *text_samples(), *mesh_samples()):
         if one == form:
-            with suppress(SceneprintError):  # a reader is not installed, or a sample has no mesh
+            with suppress(SceneprintError):  # an optional reader is absent, or a sample has no mesh
                 read_surface(data, "", None, form)
     for module in (rows, pcd, ply, ply_faces):
         for kernel in vars(module).values():
-            # a kernel that no sample has compiled raises an error
+            # kernels without signatures are inlined
             if isinstance(kernel, Kernel) and kernel.compiler.signatures:
                 kernel.compiler.disable_compile()
 
@@ -86,26 +85,26 @@ def mesh_samples() -> list[tuple[bytes, Any]]:
     head = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     text = "".join(f"{x} {y} {z}\n" for x, y, z in corners)
-    found: list[tuple[bytes, Any]] = [
+    samples: list[tuple[bytes, Any]] = [
         (f"ply\nformat ascii 1.0\n{head}{text}4 0 1 3 2\n".encode(), "ply")
     ]
     for sign, order in (("<", "little"), (">", "big")):
         body = np.array(corners, f"{sign}f4").tobytes() + struct.pack(f"{sign}B3i", 3, 0, 1, 2)
-        found.append((f"ply\nformat binary_{order}_endian 1.0\n{head}".encode() + body, "ply"))
+        samples.append((f"ply\nformat binary_{order}_endian 1.0\n{head}".encode() + body, "ply"))
     lines = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "vn 0 0 1\nvt 0 0\n"
     ways = ("f 1 2 3\nf 1 2 4 3\n", "f 1/1/1 2/1/1 3/1/1\n", "f 1//1 2//1 4//1 3//1\n", "")
-    found += [(f"mtllib a\n{lines}usemtl b\n{faces}".encode(), "obj") for faces in ways]
+    samples += [(f"mtllib a\n{lines}usemtl b\n{faces}".encode(), "obj") for faces in ways]
     soup = np.zeros((50,), np.uint8)
     soup[:48] = np.array([(0, 0, 1), *corners[:3]], "<f4").view(np.uint8).reshape(-1)
-    found.append((bytes(80) + struct.pack("<I", 1) + soup.tobytes(), "stl"))
+    samples.append((bytes(80) + struct.pack("<I", 1) + soup.tobytes(), "stl"))
     vertices = "".join(f"vertex {x} {y} {z}\n" for x, y, z in corners[:3])
     solid = f"solid a\nfacet normal 0 0 1\nouter loop\n{vertices}endloop\nendfacet\nendsolid a\n"
-    found += [(solid.encode(), "stl"), (b"solid broken", "stl"), (_gltf(corners), "gltf")]
-    return [*found, (_glb(json.loads(_gltf(corners))), "glb")]
+    samples += [(solid.encode(), "stl"), (b"solid broken", "stl"), (_gltf(corners), "gltf")]
+    return [*samples, (_glb(json.loads(_gltf(corners))), "glb")]
 
 
 def _gltf(corners: list[tuple[int, int, int]]) -> bytes:
-    """Return a glTF file in JSON with triangles, with and without indices, points and lines."""
+    """Return a glTF file in JSON with points, lines, and triangles with and without indices."""
     body = np.array(corners[:3], "<f4").tobytes() + struct.pack("<3I", 0, 1, 2)
     uri = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
     position = {"POSITION": 0}
@@ -131,7 +130,7 @@ def _gltf(corners: list[tuple[int, int, int]]) -> bytes:
 
 
 def _glb(tree: dict[str, Any]) -> bytes:
-    """Return the glTF file in its binary container."""
+    """Convert a glTF file to its binary container."""
     body = base64.b64decode(tree["buffers"][0].pop("uri").partition(",")[2])
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)

@@ -1,1 +1,1 @@
-"""Tasks of an operator on a data folder: check, repair, copy and restore it."""
+"""Maintenance of a data folder: checks and repairs."""

@@ -1,10 +1,10 @@
-"""Read all stored bytes at a low rate, to find damage before a query or a restore does.
+"""Read all stored bytes at a low rate to find damage before a query or a restore needs the bytes.
 
-    frames of the store  --Scrub.run, a slice each 4 s-->  damage reported, derived data signed
-    again
+    frames of the store  --Scrub.run, a slice every 4 s-->  reported damage, repaired signatures
 
-Frames are checked as by `sceneprint fsck`. Signatures and artifacts are computed again from
-uploads; other damage is only reported, as nothing is moved without an operator.
+The scrub applies the checks of `sceneprint fsck` to frames. Workers compute damaged signatures and
+artifacts again from the uploads. Other damage is only reported, because its repair moves files and
+needs an operator.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from sceneprint.store.scrub_rows import (
 
 log = logging.getLogger(__name__)
 
-#: Number of frames to check together, and maximum seconds of a slice.
+#: Number of frames that are checked together, and maximum duration of a slice, seconds.
 AT_ONCE, TURN_S = 16, 0.2
 #: Seconds between the start of a process and its first slice.
 BEGIN_S = 60.0
 
 
 class Scrub:
-    """Read slices of the store's bytes; several processes share the work.
+    """Scrub of the store in slices, which several processes share.
 
     Parameters
     ----------
-    settings : `scrub_mb_per_s` is the rate of all workers of the store together
+    settings : `scrub_mb_per_s` limits the total rate of all workers of the store
     """
 
     def __init__(self, settings: Settings, store: Store) -> None:
@@ -56,24 +56,24 @@ class Scrub:
     def run(
         self, may_go_on: Callable[[], bool] = lambda: True, *, now: bool = False
     ) -> ScrubRow | None:
-        """Read a slice if it is due; errors are logged, and the slice is read again.
+        """Read the next slice if it is due. After an error, log it and read the slice again later.
 
         Parameters
         ----------
-        may_go_on : function that is called after every few frames; if it returns False, the slice
-            ends
-        now : whether to check for a due slice although this process did so recently
+        may_go_on : function that is called after every few frames; the slice ends if it returns
+            False
+        now : whether to skip this process's interval between slices
 
         Returns
         -------
-        row : progress of the scrub; None: nothing was read
+        row : progress of the scrub; None if no slice is due
         """
         rested = now or time.monotonic() >= self._next
         if self._budget <= 0 or self._store.database.read_only or not rested:
             return None
         self._next = time.monotonic() + SLICE_S
         try:
-            with self._store.database.read() as connection:  # usually not due, so no lock
+            with self._store.database.read() as connection:  # avoids the write lock in most cases
                 row = read_scrub(connection)
                 if row is not None and not row.is_due(read_clock(connection)):
                     return None
@@ -87,7 +87,7 @@ class Scrub:
     def _read(self, row: ScrubRow, may_go_on: Callable[[], bool]) -> ScrubRow:
         until, folder = time.monotonic() + TURN_S, Folder(self._settings, self._store)
         damaged, finished, over = 0, False, False
-        while not over:  # at least a few frames, so that every pass ends
+        while not over:  # each slice checks at least one block, so every pass ends
             with self._store.database.read() as connection:
                 numbers = frames_behind(connection, row.position, AT_ONCE)
             if not numbers:
@@ -112,7 +112,7 @@ class Scrub:
         return row
 
     def _report(self, finding: Finding) -> None:
-        """Log a finding, and repair derived data."""
+        """Log a finding, and have derived data computed again."""
         about = {"map": finding.map, "frame_id": finding.frame_id, "finding": finding.kind}
         log.error("damage found", extra=about | {"means": finding.means})
         if finding.map is None or finding.frame_id is None:
@@ -121,7 +121,7 @@ class Scrub:
             with self._store.database.read() as connection:
                 row = find_map(connection, finding.map)
                 frame = find_frame(connection, row, finding.frame_id)
-        except NotFound:  # deleted meanwhile
+        except NotFound:  # the frame was deleted meanwhile
             return
         if finding.kind.endswith("-upload"):
             with self._store.database.write() as connection:

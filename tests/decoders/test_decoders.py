@@ -68,7 +68,7 @@ def test_arrays_are_the_same_as_in_this_process(pool: DecoderPool) -> None:
         for data, form in (*array_samples(), *text_samples()):
             near, far = (one.points(data, form, UNSAID, 0.5) for one in (local, slot))
             assert near.points.tobytes() == far.points.tobytes()
-            assert (near.viewpoint, near.given) == (far.viewpoint, far.given)
+            assert (near.viewpoint, near.file_points) == (far.viewpoint, far.file_points)
 
 
 @pytest.mark.parametrize("data", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(40)])
@@ -152,7 +152,7 @@ def test_a_reply_that_lies_is_no_result(
         process = slot.process
         assert process is not None
         monkeypatch.setattr(type(process), "run", lambda *_: reply)
-        with pytest.raises(errors.DecoderFailure, match="its answer is no result"):
+        with pytest.raises(errors.DecoderFailure, match="its reply is invalid"):
             slot.samples(_images()[0])
 
 

@@ -137,5 +137,5 @@ def test_a_reply_that_lies_is_no_result(
 
     monkeypatch.setattr(DecoderProcess, "await_ready", lambda self: None)
     monkeypatch.setattr(DecoderProcess, "run", run)
-    with pytest.raises(DecoderFailure, match="its answer is no result"):
+    with pytest.raises(DecoderFailure, match="its reply is invalid"):
         read_surface_confined(path, "map.npy")

@@ -23,7 +23,7 @@ def test_forms(request: pytest.FixtureRequest, points: np.ndarray, name: str, fo
     np.testing.assert_array_equal(scan.cloud.points, points)
     assert scan.cloud.points.dtype == np.float32
     assert scan.cloud.points.flags.writeable
-    assert (scan.file_format, scan.given, scan.viewpoint) == (name, 12, (0, 0, 0))
+    assert (scan.file_format, scan.file_points, scan.viewpoint) == (name, 12, (0, 0, 0))
     assert (scan.cloud.name, scan.cloud.note, scan.cloud.has_viewpoint) == ("here", "", True)
     assert format_of(data) == name
 

@@ -73,7 +73,7 @@ def tried(files: list[bytes], told: CloudFormat | None, most: int, tries: int) -
                 else:
                     read += 1
                     assert np.isfinite(scan.cloud.points).all()
-                    assert len(scan.cloud.points) <= scan.given <= 88 * len(changed)
+                    assert len(scan.cloud.points) <= scan.file_points <= 88 * len(changed)
                 assert "\n" not in said
                 assert len(said) < 600
                 _, peak = tracemalloc.get_traced_memory()

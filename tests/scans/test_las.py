@@ -18,7 +18,7 @@ N = 60_000  #: two chunks
 
 def test_las(las: Write, points: np.ndarray) -> None:
     scan = decode_scan(las())
-    assert (scan.file_format, scan.given, format_of(las())) == ("las", 12, "las")
+    assert (scan.file_format, scan.file_points, format_of(las())) == ("las", 12, "las")
     np.testing.assert_allclose(scan.cloud.points, points, atol=1e-6)
     # what follows the points, such as waveforms, is passed over
     np.testing.assert_array_equal(decode_cloud(las() + b"more").points, scan.cloud.points)

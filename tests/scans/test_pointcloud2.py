@@ -55,7 +55,7 @@ def test_any_layout_is_read_as_rosbags_wrote_it(
     data = serialize(rows, little=little, height=height, padding=padding, big=big)
     assert format_of(data[:10_016]) == "pointcloud2"
     scan = decode_scan(data)
-    assert (scan.file_format, scan.given) == ("pointcloud2", len(points))
+    assert (scan.file_format, scan.file_points) == ("pointcloud2", len(points))
     expected = whole[whole.any(axis=1)]
     np.testing.assert_array_equal(scan.cloud.points, expected.astype(np.float32))
 
@@ -141,7 +141,7 @@ def test_wrong_numbers_are_named(serialize: Any, points: np.ndarray) -> None:
     for place in range(len(data)):
         with pytest.raises(FrameError):
             decode_scan(data[:place])
-    assert decode_scan(data + bytes(3)).given == len(points)  # as middleware fills up
+    assert decode_scan(data + bytes(3)).file_points == len(points)  # as middleware fills up
     with pytest.raises(UnreadableCloud, match="8 bytes follow"):
         decode_scan(data + bytes(8))
 

@@ -63,7 +63,7 @@ def test_missing_points(pcd: Write, npy: Write, points: np.ndarray) -> None:
     for form in ("ascii", "binary", "binary_compressed"):
         scan = decode_scan(pcd(points, form))
         np.testing.assert_array_equal(scan.cloud.points, np.delete(points, [2, 7], axis=0))
-        assert (scan.given, scan.cloud.note) == (12, "2 missing points left out")
+        assert (scan.file_points, scan.cloud.note) == (12, "2 missing points left out")
     points[0] = 1e300  # a number, and yet none a float32 holds: far, not missing
     with pytest.raises(UnreadableCloud, match=r"1e\+300 m from"):
         decode_cloud(npy(points))
@@ -122,7 +122,7 @@ def test_more_than_five_million() -> None:
     rows[..., 0], rows[..., 1] = steps[:, None], steps
     scan = decode_scan(rows.tobytes(), file_format="kitti")
     side = len(np.unique(np.floor(steps.astype(float) / 0.01)))
-    assert scan.given == 2240**2
+    assert scan.file_points == 2240**2
     assert len(scan.cloud.points) == side**2
     assert scan.cloud.note == f"thinned from {2240**2} points to {side**2}, one to 1.0 cm"
 

@@ -236,12 +236,12 @@ class ReadPoints:
     ----------
     points : (n, 3) float32, metres from the viewpoint; finite, none beyond `FARTHEST_M`
     viewpoint : metres in the file's axes; None without a viewpoint
-    given : number of points in the file, including missing ones
+    file_points : number of points in the file, including missing points
     """
 
     points: Floats32
     viewpoint: Position | None
-    given: int
+    file_points: int
 
 
 #: A function with the parameters of `read_points`.
@@ -257,13 +257,13 @@ class Scan:
     cloud : points relative to the viewpoint
     file_format : format of the file
     viewpoint : viewpoint that was used, metres in the file's axes; None without a viewpoint
-    given : number of points in the file, including missing ones
+    file_points : number of points in the file, including missing points
     """
 
     cloud: Cloud
     file_format: CloudFormat
     viewpoint: Position | None
-    given: int
+    file_points: int
 
 
 def decode_cloud(
@@ -333,11 +333,11 @@ def decode_scan(
             )
         found = _format(data, file_format)
         raw = (points_of or read_points)(data, found, viewpoint, units_per_metre)
-        points, missing = raw.points, raw.given - len(raw.points)
+        points, missing = raw.points, raw.file_points - len(raw.points)
         if len(points) < FEWEST_POINTS:
             raise UselessFrame(
-                f"{missing} of {raw.given} points are missing, and the {len(points)} left are "
-                f"fewer than {FEWEST_POINTS}. Check that the sensor saw something."
+                f"{missing} of {raw.file_points} points are missing, and the {len(points)} valid "
+                f"points are fewer than {FEWEST_POINTS}. Check that the sensor saw something."
             )
         note = f"{missing} missing points left out" if missing else ""
         if len(points) > MOST_POINTS:
@@ -357,7 +357,7 @@ def decode_scan(
             pose=None if pose is None else rigid_transform(pose),
             note=note,
         )
-        return Scan(cloud, found, raw.viewpoint, raw.given)
+        return Scan(cloud, found, raw.viewpoint, raw.file_points)
 
 
 def read_points(

@@ -1,1 +1,1 @@
-"""The database, blobs and indexes checked against each other, and repaired."""
+"""Consistency checks and repairs of the database, blobs and indexes."""

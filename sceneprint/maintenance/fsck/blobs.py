@@ -1,4 +1,4 @@
-"""Check the blobs that rows refer to against their digests, and find unreferenced files."""
+"""Compare referenced blobs with their digests, and find unreferenced files."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _HAS_UPLOAD = frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT))
 
 @dataclass(frozen=True)
 class BlobReference:
-    """A blob, and the row that refers to it.
+    """Reference of a row to a blob.
 
     Parameters
     ----------
     number : number of the row
-    name : which blob of the row: an artifact's model, a file's name, a tile's place
+    name : name of the blob within the row: an artifact's model, a file's name, a tile's position
     owner : id of the frame or job
-    state, reason : those of the frame, if the row is one's
+    state, reason : state and reason of the frame; None for rows of other tables
     on_its_way : whether a job will compute the blob again
     """
 
@@ -60,7 +60,7 @@ class BlobReference:
 
     @property
     def frame_id(self) -> str | None:
-        """Id of the frame, if the row is one's."""
+        """Id of the frame; None for rows of other tables."""
         return None if self.state is None else self.owner
 
     @property
@@ -112,7 +112,7 @@ def _tiles(blob: Column[str]) -> Select[Any]:
     )
 
 
-# Repairs after a lost blob, or a damaged one that was moved away.
+# Repairs after a blob was lost, or was moved to the quarantine because it is damaged.
 
 
 def _note_loss(connection: Connection, one: BlobReference, condition: Condition) -> str:
@@ -138,7 +138,7 @@ def _clear_loss(connection: Connection, one: BlobReference) -> str:
     return f"job {enqueue(connection, 'sign', one.number).id} is queued"
 
 
-def _make_artifact(connection: Connection, one: BlobReference, _: Condition) -> str:
+def _rebuild_artifact(connection: Connection, one: BlobReference, _: Condition) -> str:
     if is_known_loss(one.reason):
         return "its upload is lost too: upload the frame again"
     if not one.on_its_way:
@@ -146,12 +146,12 @@ def _make_artifact(connection: Connection, one: BlobReference, _: Condition) -> 
     return "a worker computes it again from the upload"
 
 
-def _forget_file(connection: Connection, one: BlobReference, _: Condition) -> str:
+def _remove_job_file(connection: Connection, one: BlobReference, _: Condition) -> str:
     remove_parts(connection, one.number, items=False, files=[one.name])
     return "the file is removed from the job"
 
 
-def _make_tile(connection: Connection, one: BlobReference, _: Condition) -> str:
+def _rebuild_tile(connection: Connection, one: BlobReference, _: Condition) -> str:
     tile = tile_of_number(connection, one.number)
     if tile is not None:
         schedule_rebuild(connection, tile)
@@ -160,7 +160,7 @@ def _make_tile(connection: Connection, one: BlobReference, _: Condition) -> str:
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of blob: its references, the meaning of its loss, and its repair."""
+    """Kind of blob: its references, the consequence of its loss, and its repair."""
 
     table: Table
     references: tuple[Select[Any], ...]
@@ -172,26 +172,26 @@ class _Kind:
 _KINDS = {
     "upload": _Kind(
         frames, (_uploads(),), "the frame cannot be signed again; upload it again to repair it",
-        "set the frame's reason; a frame that is not signed yet fails", _note_loss,
+        "record the loss in the frame's reason, and set an unsigned frame to failed", _note_loss,
     ),
     "artifact": _Kind(
         frames, (_artifacts(),), "queries find the frame, but cannot validate it",
-        "compute it again from the upload", _make_artifact,
+        "compute it again from the upload", _rebuild_artifact,
     ),
     "job-file": _Kind(
         jobs, (_job_files(),), "it cannot be downloaded, and the job cannot continue",
-        "remove it: start the job again", _forget_file,
+        "remove it from the job; then start the job again", _remove_job_file,
     ),
     "tile": _Kind(
         surface_tiles, (_tiles(surface_tiles.c.blob), _tiles(surface_tiles.c.draft)),
         "that part of the surface cannot be shown",
-        "compute it again from the frames", _make_tile,
+        "compute it again from the frames", _rebuild_tile,
     ),
 }  # fmt: skip
 
 
 def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobReference]:
-    """Return the references of some rows, in order."""
+    """Return the references of the rows with these numbers, in order."""
     number = _KINDS[kind].table.c.number
     return [
         BlobReference(kind, *row)
@@ -201,7 +201,13 @@ def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobRef
 
 
 def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Finding]:
-    """Check the blobs of a kind that some rows refer to against their digests."""
+    """Compare the blobs of some rows with their digests, and yield the findings.
+
+    Parameters
+    ----------
+    kind : key of `_KINDS`
+    numbers : numbers of the rows that refer to the blobs
+    """
     blobs = folder.store.blobs
     for one in read_rows(folder, numbers, partial(_read, kind)):
         if isinstance(one, tuple):
@@ -213,7 +219,7 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
         if condition == "sound" and not recovered:
             continue
         with folder.store.database.read() as connection:
-            if _now(connection, one) is None:  # deleted since
+            if _current_reference(connection, one) is None:  # the row was deleted meanwhile
                 continue
         finding = partial(
             Finding, what=one.what, map=one.map, frame_id=one.frame_id,
@@ -223,14 +229,16 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
         if recovered:
             yield finding(
                 kind="found-upload", severity="leftover",
-                means="the frame's reason says that it is lost, but it exists",
-                would="clear the reason, and sign the frame if it failed because of that",
+                means="the frame's reason says that the upload is lost, but it exists",
+                would="clear the reason, and sign the frame if it failed for that reason",
                 repair=partial(_repair, folder, one),
             )  # fmt: skip
         elif condition == "missing" and (one.on_its_way or is_known_loss(one.reason)):
-            yield finding(kind=f"missing-{kind}", severity="note", means=f"{means}; this is known")
+            yield finding(
+                kind=f"missing-{kind}", severity="note", means=f"{means}; the loss is on record"
+            )
         else:
-            move = "move it to the quarantine, and " if condition == "damaged" else ""
+            move = "move the file to the quarantine, and " if condition == "damaged" else ""
             yield finding(
                 kind=f"{condition}-{kind}", severity="damage", means=means,
                 would=move + _KINDS[kind].would, repair=partial(_repair, folder, one),
@@ -238,12 +246,12 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
 
 
 def _is_recovered(one: BlobReference, condition: Condition) -> bool:
-    """Return whether an upload exists that its frame calls lost."""
+    """Return whether a sound upload exists although its frame's reason says that it is lost."""
     return one.kind == "upload" and condition == "sound" and is_known_loss(one.reason)
 
 
 def check_products(folder: Folder) -> Iterator[Finding]:
-    """Check the files of long jobs, such as a mesh, and the tiles of surfaces."""
+    """Check the files of long jobs, such as meshes, and the tiles of surfaces."""
     has_files = jobs.c.number.in_(select(job_files.c.job_number))
     for numbers in folder.numbers("files of jobs", jobs, has_files):
         yield from check_blobs(folder, "job-file", numbers)
@@ -251,16 +259,19 @@ def check_products(folder: Folder) -> Iterator[Finding]:
         yield from check_blobs(folder, "tile", numbers)
 
 
-def _now(connection: Connection, one: BlobReference) -> BlobReference | None:
-    """Return the present reference; None if the row no longer refers to the blob."""
+def _current_reference(connection: Connection, one: BlobReference) -> BlobReference | None:
+    """Read a reference again; return None if the row no longer refers to the blob."""
     references = _read(one.kind, connection, [one.number])
     return next((o for o in references if (o.digest, o.name) == (one.digest, one.name)), None)
 
 
 def _repair(folder: Folder, one: BlobReference) -> str:
-    # in one transaction, so that a new upload of the same bytes stays
+    # one transaction, so that the repair cannot remove a new upload of the same bytes
     with folder.store.database.write() as connection:
-        now, condition = _now(connection, one), folder.store.blobs.condition(one.digest)
+        now, condition = (
+            _current_reference(connection, one),
+            folder.store.blobs.condition(one.digest),
+        )
         if now is not None and _is_recovered(now, condition):
             return _clear_loss(connection, now)
         if now is None or condition == "sound":
@@ -269,14 +280,14 @@ def _repair(folder: Folder, one: BlobReference) -> str:
         return moved + _KINDS[one.kind].repair(connection, now, condition)
 
 
-#: Minimum age of an unfinished file in a finding, seconds.
+#: Age from which an unfinished file is reported, seconds.
 WRITING_S = 60.0
 #: Number of files to look up in one transaction.
 _BATCH = 200
 
 
 def check_files(folder: Folder) -> Iterator[Finding]:
-    """Find unreferenced and foreign files where blobs are stored."""
+    """Find unreferenced and foreign files in the blob store."""
     if folder.map_name is not None:
         return
     now, waiting = time.time(), list[BlobEntry]()
@@ -287,7 +298,7 @@ def check_files(folder: Folder) -> Iterator[Finding]:
         if entry.digest is None and not entry.unfinished:
             yield Finding(
                 "foreign-file", entry.place, "note",
-                "the store has no file of this name, and ignores it", path=entry.place,
+                "it does not belong to the store, which ignores it", path=entry.place,
             )  # fmt: skip
         elif entry.changed_at < now - max(folder.grace_s, WRITING_S * entry.unfinished):
             waiting.append(entry)
@@ -306,8 +317,8 @@ def _unreferenced(folder: Folder, entries: list[BlobEntry]) -> Iterator[Finding]
             continue
         yield Finding(
             "unreferenced-file", entry.place, "leftover" if in_use else "note",
-            "no row refers to it: its writer was killed, or its frame was deleted"
-            if in_use else "the database has never held a frame: is it the one of these blobs?",
+            "no row refers to it: its writer was killed, or its frame was deleted" if in_use
+            else "the database has no frames: check that it belongs to this blob store",
             "remove it" if in_use else None, path=entry.place,
             repair=partial(_remove, folder, entry) if in_use else None,
         )  # fmt: skip
@@ -321,6 +332,6 @@ def _remove(folder: Folder, entry: BlobEntry) -> str:
     if not folder.store.blobs.holds(entry.digest):
         return "removed"
     with folder.store.database.read() as connection:
-        if referred_blobs(connection, [entry.digest]):  # an upload has just been committed
+        if referred_blobs(connection, [entry.digest]):  # a new upload refers to it
             return GONE
     raise StoreError(BUSY_BLOBS)

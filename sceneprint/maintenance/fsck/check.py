@@ -1,9 +1,9 @@
-"""Check a whole data folder for lost, damaged and left-over data, and repair it.
+"""Check a whole data folder for lost, damaged and superfluous data, and repair it.
 
     Settings  --fsck-->  Findings, as they are discovered
 
-Without repair nothing is written. With it each finding is repaired at once, in a transaction that
-checks it again, since services and workers may run meanwhile.
+Without `repair` the check writes nothing. With it, a transaction verifies each finding again and
+repairs it at once, since services and workers may run meanwhile.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from sceneprint_client.api import FrameState
 
 
 def check_frames(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Check some frames: their rows, signatures, uploads and artifacts."""
+    """Check the rows, signatures, uploads and artifacts of the frames with these numbers."""
     yield from check_rows(folder, numbers)
     yield from check_blobs(folder, "upload", numbers)
     yield from check_blobs(folder, "artifact", numbers)
@@ -54,7 +54,7 @@ def _check_all_frames(folder: Folder) -> Iterator[Finding]:
         yield from check_frames(folder, numbers)
 
 
-#: Files come before frames: blobs that a frame's repair dooms are not left over.
+#: Files come before frames: blobs that the repair of a frame dooms are not superfluous files.
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
     check_database, check_models, check_counts, check_files, _check_all_frames, check_products,
     check_indexes,
@@ -66,26 +66,26 @@ def fsck(
     grace_s: float = GRACE_S, progress: Progress = lambda *_: None,
     counts: Counter[str] | None = None,
 ) -> Iterator[Finding]:  # fmt: skip
-    """Check a data folder; the service may run.
+    """Check a data folder and yield the findings; the service may run.
 
     Parameters
     ----------
     settings : settings of the folder
-    map_name : map to check; None: all maps, and data of no map
-    repair : whether to repair findings; else nothing is changed
-    quick : whether to check only that things exist, without reading large ones
-    grace_s : see GRACE_S
-    counts : filled with the numbers of checked things
+    map_name : map to check; None checks all maps, and data that belongs to no map
+    repair : whether to repair the findings; if not, nothing is changed
+    quick : whether to check only that blobs and rows exist, without reading their content
+    grace_s : age below which an unreferenced file is ignored, seconds
+    counts : counter to which the check adds the numbers of checked objects
 
     Yields
     ------
-    findings, after their repair
+    finding : a finding, after its repair if `repair` is set
 
     Raises
     ------
-    UnusableStore, NewerSchema : the folder is missing or cannot be read.
-    UnknownMap : the map does not exist.
-    ValueError : `quick` and `repair` are both set: unread data cannot be repaired.
+    UnusableStore, NewerSchema : If the folder is missing or cannot be read.
+    UnknownMap : If the map does not exist.
+    ValueError : If both `quick` and `repair` are set, since unread data cannot be repaired.
     """
     if quick and repair:
         raise ValueError("a quick check cannot repair")
@@ -103,7 +103,7 @@ def fsck(
 
 
 def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -> Iterator[Finding]:
-    """Yield the findings of a check, including that the database cannot be read."""
+    """Yield the findings of a check; if the database is unreadable, that is the last finding."""
     try:
         yield from check(folder)
     except (ValueError, TypeError, KeyError, UnusableStore) as error:
@@ -115,7 +115,7 @@ def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -
 def _repaired(finding: Finding, trusted: bool) -> Finding:
     assert finding.repair is not None
     if not trusted:
-        return replace(finding, error="the database itself is damaged: restore a backup first")
+        return replace(finding, error="the database is damaged: restore a backup first")
     try:
         return replace(finding, done=finding.repair())
     except SceneprintError as error:
@@ -126,10 +126,10 @@ def _repaired(finding: Finding, trusted: bool) -> Finding:
 
 @contextmanager
 def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
-    # first, as a disk that is not mounted looks like a folder without data
+    # without this check, a disk that is not mounted would look like an empty folder
     if isinstance(settings.blobs, Path):
         require_folder(settings.blobs)
-    # a repair creates no database
+    # a repair must not create a database
     with (
         inspect_database(settings.database) as database,
         inspect_blobs(settings.blobs, database) as blobs,
@@ -146,12 +146,7 @@ def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
 
 
 def _require_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
-    """Check that there is a blob: an empty folder is probably not mounted.
-
-    Raises
-    ------
-    UnusableStore : frames refer to blobs, but there are none.
-    """
+    """Raise UnusableStore if frames refer to blobs but none exists: the disk may not be mounted."""
     without = FrameState.DELETED, FrameState.REDUNDANT
     refers = select(frames.c.number).where(frames.c.state.not_in(without)).limit(1)
     with database.read() as connection:
@@ -159,6 +154,6 @@ def _require_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
             return
     if next(blobs.digests(), None) is None:
         raise UnusableStore(
-            f"{place}: there are no uploads, and nothing was changed. Check that its disk is "
-            "mounted, or restore a backup."
+            f"{place}: The folder has no uploads, although the database refers to some. Nothing "
+            "was changed. Check that the disk is mounted, or restore a backup."
         )

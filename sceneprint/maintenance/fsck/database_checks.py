@@ -1,7 +1,7 @@
-"""Check the database itself, and find rows that are contradictory, damaged or unreadable.
+"""Check the database, and find rows that are contradictory, damaged or unreadable.
 
-If pages or references of the database are damaged, nothing is repaired: its rows are not reliable,
-and a repair might remove sound data.
+If pages or foreign keys are damaged, nothing is repaired: the rows are unreliable, and a repair
+might remove sound data.
 """
 
 from __future__ import annotations
@@ -59,26 +59,25 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState
 
-#: Kinds of findings after which nothing is repaired.
+#: Kinds of findings that prevent all later repairs.
 FATAL = frozenset({"damaged-database", "dangling-row"})
 #: Maximum number of findings of one kind.
 _MOST = 20
 _RESTORE = (
-    "restore a backup of the data folder (`sceneprint restore`); nothing is repaired in a "
-    "damaged database"
+    "restore a backup of the data folder (`sceneprint restore`); a damaged database is not repaired"
 )
 
 
 def check_database(folder: Folder) -> Iterator[Finding]:
-    """Check SQLite's pages and indexes, and the foreign keys of either database.
+    """Check the pages and indexes of SQLite, and the foreign keys of SQLite or PostgreSQL.
 
-    PostgreSQL enforces foreign keys, but not while a dump is loaded without triggers. Its own
-    pg_amcheck checks its pages.
+    PostgreSQL does not enforce foreign keys while a dump is loaded without triggers. Use pg_amcheck
+    to check its pages.
     """
     database = folder.store.database
     folder.progress("database", 0, 1)
     if database.is_sqlite:
-        # integrity_check also compares indexes with their tables
+        # only integrity_check compares indexes with their tables
         pragma = "quick_check" if folder.quick else "integrity_check"
         with database.read() as connection:
             lines = connection.execute(text(f"PRAGMA {pragma}({_MOST})")).scalars().all()
@@ -113,12 +112,12 @@ def _dangling(folder: Folder, key: ForeignKeyConstraint) -> Iterator[Finding]:
 
 
 def damaged_database(message: str) -> Finding:
-    """Return the finding that the database is unreadable or contradictory."""
+    """Return the finding for an unreadable or contradictory database."""
     return Finding("damaged-database", "the database", "damage", message, _RESTORE)
 
 
 def check_models(folder: Folder) -> Iterator[Finding]:
-    """Find models with a damaged file, which can neither sign nor search."""
+    """Find models whose file is damaged, so that they can neither sign nor search."""
     with folder.store.database.read() as connection:
         stored = connection.execute(select(models.c.id)).scalars().all()
     for model_id in stored:
@@ -128,8 +127,8 @@ def check_models(folder: Folder) -> Iterator[Finding]:
         source = next((name for name in PRESETS if read_model(name).id == model_id), None)
         yield Finding(
             "damaged-model", f"model {model_id[:12]}", "damage",
-            "its file was changed: its maps can be neither signed nor searched",
-            "restore a backup" if source is None else f"replace it by the preset {source}",
+            "its file is damaged: frames of its maps can be neither signed nor searched",
+            "restore a backup" if source is None else f"replace it with the preset {source}",
             repair=None if source is None else partial(_put_preset, folder, model_id, source),
         )  # fmt: skip
 
@@ -142,7 +141,7 @@ def _put_preset(folder: Folder, model_id: str, source: str) -> str:
 
 
 def check_counts(folder: Folder) -> Iterator[Finding]:
-    """Find maps whose stored use is wrong, on which quotas depend."""
+    """Find maps whose stored usage is wrong; quotas depend on it."""
     with folder.store.database.read() as connection:
         rows = list_maps(connection)
     for row in rows:
@@ -155,8 +154,8 @@ def check_counts(folder: Folder) -> Iterator[Finding]:
         if stored != counted:
             yield Finding(
                 "stale-value", f"map {row.name}", "damage",
-                f"its stored use is {stored.frames} frames of {stored.bytes} bytes, and it holds "
-                f"{counted.frames} of {counted.bytes}", "count again",
+                f"its stored usage is {stored.frames} frames with {stored.bytes} bytes, but it "
+                f"holds {counted.frames} frames with {counted.bytes} bytes", "count again",
                 map=row.name, repair=partial(_count_again, folder, row.number),
             )  # fmt: skip
 
@@ -166,7 +165,7 @@ def _count_again(folder: Folder, number: int) -> str:
     with folder.store.database.write() as connection:
         counted = counted_usage(connection, number)
         connection.execute(own.values(used_frames=counted.frames, used_bytes=counted.bytes))
-    return f"{counted.frames} frames of {counted.bytes} bytes are counted"
+    return f"counted {counted.frames} frames with {counted.bytes} bytes"
 
 
 # Rows of frames, and related rows of other tables.
@@ -177,13 +176,13 @@ _GONE = (FrameState.DELETED, FrameState.REDUNDANT, FrameState.REJECTED)
 
 @dataclass(frozen=True)
 class _CheckedFrame:
-    """A frame, and its rows in other tables."""
+    """Frame with its rows in other tables."""
 
     frame: FrameRow
     map: MapRow
     tags: frozenset[str]
-    signed: dict[str, bool]  # whether its signatures are sound, by model
-    busy: bool  # whether a job will sign it
+    signed: dict[str, bool]  # for each model with a signature, whether the signature is sound
+    busy: bool  # whether a job will sign the frame
 
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
@@ -196,7 +195,7 @@ def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
             yield Finding(
                 "unreadable-row", f"frame number {number}", "damage",
                 f"its row cannot be read: {type(error).__name__}: {message:.200}",
-                "restore a backup; the frames around it are not affected",
+                "restore a backup; other frames are not affected",
             )  # fmt: skip
             continue
         folder.counts["signatures"] += len(one.signed)
@@ -212,14 +211,13 @@ def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
 
 def _repair_row(folder: Folder, number: int, fault: _Fault) -> str:
     with folder.store.database.write() as connection:
-        for one in _read_frames(folder, connection, [number]):  # it may have changed since
+        for one in _read_frames(folder, connection, [number]):  # the row may have changed
             if fault.is_found(one):
                 return fault.fix(folder, connection, one)
     return GONE
 
 
 def _read_frames(folder: Folder, connection: Connection, numbers: list[int]) -> list[_CheckedFrame]:
-    """Read the rows of some frames in one transaction."""
     here = frames.c.number.in_(numbers)
     own = select(maps).where(maps.c.number.in_(select(frames.c.map_number).where(here)))
     map_rows = {row["number"]: map_row(row) for row in connection.execute(own).mappings()}
@@ -247,14 +245,14 @@ def _signatures(folder: Folder, numbers: list[int]) -> Select[Any]:
     statement = select(c.frame_number, c.model_id).where(c.frame_number.in_(numbers))
     if folder.quick:
         return statement
-    # SQLite accepts any bytes as text, but cannot decode them
+    # SQLite stores arbitrary bytes in text columns, which then fail to decode
     raw = LargeBinary if folder.store.database.is_sqlite else Text
     counts = (cast(one, raw) for one in (c.n_patches, c.n_pairs))
     return statement.add_columns(cast(c.vector, LargeBinary), c.checksum, *counts)
 
 
 def _is_sound(model: Model | None, vector: bytes, checksum: int, *counts: str | bytes) -> bool:
-    """Return whether the checksum and length of a signature are right."""
+    """Return whether the checksum and length of a signature are correct."""
     try:
         readable = all(isinstance(json.loads(one), list) for one in counts)
         fits = model is None or len(vector) == model.signature_bytes
@@ -268,18 +266,18 @@ def _is_indexed(one: _CheckedFrame) -> bool:
 
 
 def _damaged(one: _CheckedFrame) -> set[str]:
-    """Return the models whose signature of an indexed frame is damaged; others are stray."""
+    """Return the models of the map whose signature of an indexed frame is damaged."""
     own = (one.map.model_id, one.map.next_model_id) if _is_indexed(one) else ()
     return {model_id for model_id, sound in one.signed.items() if not sound and model_id in own}
 
 
 def _stray(one: _CheckedFrame) -> set[str]:
-    """Return the models of which a frame has a signature that it should not have."""
+    """Return the models with a signature of the frame that its state or map does not allow."""
     if one.frame.deletion is not None:
-        return set()  # it may be restored
+        return set()  # the deletion may be undone
     if one.frame.state in _GONE:
         return set(one.signed)
-    # a signature of another model would prevent signing
+    # a signature of an unsigned frame would prevent signing
     own = {one.map.model_id} if _is_indexed(one) else set[str]()
     return one.signed.keys() - own - {one.map.next_model_id or ""}
 
@@ -289,7 +287,7 @@ def _place(frame: FrameRow) -> tuple[float | None, ...]:
 
 
 def _is_stale(one: _CheckedFrame) -> bool:
-    """Return whether the tags or the position that searches use differ from the frame's."""
+    """Return whether the search columns for tags and position differ from the frame's values."""
     frame = one.frame
     placed = (frame.pose_x, frame.pose_y, frame.pose_z) == _place(frame)
     return not placed or (frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags))
@@ -302,11 +300,11 @@ def _queue(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
 
 
 def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
-    """Sign a frame without a sound signature from its upload; set it to failed if that is lost."""
+    """Have a frame signed again from its upload; set it to failed if the upload is lost."""
     frame, row, damaged = one.frame, one.map, _damaged(one)
     _remove_signatures(connection, frame.number, damaged)
     if row.model_id in one.signed and row.model_id not in damaged:
-        for model_id in damaged:  # meanwhile its other signature is searched
+        for model_id in damaged:  # queries use the sound signature meanwhile
             enqueue(connection, REENCODE, frame.number, PRIORITY, model_id)
         return "a worker computes it again from the upload"
     condition = folder.store.blobs.condition(frame.blob)
@@ -315,14 +313,14 @@ def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
         "state": FrameState.RECEIVED if loss is None else FrameState.FAILED,
         "reason": loss,
         "indexed_at": None,
-        "novelty": None,  # the map has accepted the frame before
-        # readers and indexes remove it until it is signed
+        "novelty": None,  # the map has already accepted the frame
+        # a new revision makes readers and indexes drop the frame until it is signed
         "revision": next_revision(connection, row.number),
     }
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**values))
     if loss is not None:
         record_event(connection, "frame.failed", row.name, frame.id)
-        return f"it is failed: {loss}"
+        return f"the frame is set to failed: {loss}"
     job = enqueue(connection, "sign", frame.number, PRIORITY)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
     return "a worker signs it again from its upload"
@@ -330,7 +328,7 @@ def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
 
 def _remove_stray(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
     _remove_signatures(connection, one.frame.number, _stray(one))
-    return f"{len(_stray(one))} removed"
+    return f"{len(_stray(one))} signatures removed"
 
 
 def _remove_signatures(connection: Connection, number: int, models: set[str]) -> None:
@@ -347,19 +345,19 @@ def _write_derived(_: Folder, connection: Connection, one: _CheckedFrame) -> str
         named = [{"frame_number": number, "tag": tag} for tag in sorted(set(one.frame.tags))]
         if named:
             connection.execute(insert(frame_tags), named)
-    return "written"
+    return "copied from the frame"
 
 
-def _take_revision(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
+def _assign_revision(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
     revision = next_revision(connection, one.map.number)
     own = update(frames).where(frames.c.number == one.frame.number)
     connection.execute(own.values(revision=revision))
-    return f"it is at revision {revision}"
+    return f"the frame is now at revision {revision}"
 
 
 @dataclass(frozen=True)
 class _Fault:
-    """An error of a frame's rows; `fix` repairs it, and returns what it did."""
+    """Fault of a frame's rows; `fix` repairs it and returns a description of the repair."""
 
     is_found: Callable[[_CheckedFrame], object]
     means: str
@@ -370,15 +368,15 @@ class _Fault:
 _FAULTS = {
     "frame-without-job": _Fault(
         lambda one: one.frame.state in _BEING_SIGNED and not one.busy,
-        "it waits to be signed, but has no job", "queue a job for it", _queue,
+        "it waits to be signed, but has no job", "queue a job", _queue,
     ),
     "frame-without-signature": _Fault(
         lambda one: _is_indexed(one) and one.map.model_id not in one.signed,
-        "it is indexed without a signature, so that queries do not find it",
+        "it is indexed without a signature, so queries cannot find it",
         "sign it again from its upload", _sign,
     ),
     "damaged-signature": _Fault(
-        _damaged, "its signature was changed, so that queries ignore it",
+        _damaged, "its signature is damaged, so queries ignore it",
         "remove the signature, and sign the frame again from its upload", _sign,
     ),
     "stray-signature": _Fault(
@@ -386,11 +384,12 @@ _FAULTS = {
         "remove that signature", _remove_stray,
     ),
     "stale-value": _Fault(
-        _is_stale, "the tags or the position that searches use differ from the frame's",
+        _is_stale, "the search columns for tags and position differ from the frame's values",
         "copy them from the frame", _write_derived,
     ),
     "revision-ahead": _Fault(
         lambda one: (one.frame.revision or 0) > one.map.revision,
-        "its revision is greater than its map's", "give it the map's next revision", _take_revision,
+        "its revision is greater than its map's", "assign the map's next revision",
+        _assign_revision,
     ),
 }  # fmt: skip

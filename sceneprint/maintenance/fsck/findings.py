@@ -1,4 +1,4 @@
-"""Findings of a check, the checked folder, and functions that several checks share."""
+"""Findings of a check, the checked folder, and functions shared by the checks."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from sceneprint.store import Store
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, models
 
-#: damage: data is not as it was stored; leftover: data is not needed; note: known, or harmless.
+#: damage: stored data is lost or changed; leftover: data is superfluous; note: harmless, or on
+#: record.
 Severity = Literal["damage", "leftover", "note"]
-#: Function that is called with the checked subject, and its numbers of checked and all things.
+#: Function that takes the checked subject, the number of checked objects, and their total.
 Progress = Callable[[str, int, int], None]
-#: SQLSTATEs of damaged pages and indexes of PostgreSQL.
+#: SQLSTATE codes with which PostgreSQL reports damaged pages and indexes.
 _DAMAGED = ("XX001", "XX002")
-#: Seconds in which an unreferenced file may belong to an unfinished upload.
+#: Age below which an unreferenced file may belong to an unfinished upload, seconds.
 GRACE_S = 3600.0
-#: Number of rows to read in one transaction.
+#: Number of rows that are read in one transaction.
 BLOCK = 64
-#: Result of a repair that was not necessary any more.
-GONE = "nothing: it was repaired or deleted meanwhile"
+#: Result of a repair that is no longer necessary.
+GONE = "nothing: the data was repaired or deleted meanwhile"
 #: Reason why a blob cannot be moved.
 BUSY_BLOBS = (
-    "a backup is being taken, or another process removes blobs; run it again when that is done"
+    "a backup or another process that removes blobs is running; run the check again after it ends"
 )
 
 T = TypeVar("T")
@@ -41,18 +42,19 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Finding:
-    """An error in a data folder.
+    """Fault in a data folder.
 
     Parameters
     ----------
-    kind : kind, in kebab-case
-    what : the record or file
-    means : consequence
-    would : action of a repair; None: there is none
-    map, frame_id, path : map, frame and file of the error, if any
-    repair : function that repairs it and returns what it did; raises a SceneprintError if it fails
-    done : what the repair did; None: there was none
-    error : why the repair failed
+    kind : identifier in kebab-case
+    what : description of the record or file
+    means : consequence of the fault
+    would : description of the repair that `repair` performs; None if there is none
+    map, frame_id, path : map, frame and file of the fault, if any
+    repair : function that repairs the fault and returns a description of the repair; raises a
+        SceneprintError if that fails
+    done : description of the completed repair; None before a repair
+    error : reason why the repair failed
     """
 
     kind: str
@@ -69,22 +71,22 @@ class Finding:
 
     @property
     def left(self) -> bool:
-        """Whether the error remains."""
+        """Whether the fault remains."""
         return self.severity != "note" and self.done is None
 
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """A data folder under check.
+    """Data folder under check.
 
     Parameters
     ----------
     settings : settings of the folder
     store : database and blobs
-    map_name : map to check; None: all maps, and data of no map
-    quick : whether to check only that things exist, without reading large ones
-    grace_s : age below which a file may be an unfinished write, seconds
-    counts : numbers of checked things, by name
+    map_name : map to check; None checks all maps, and data that belongs to no map
+    quick : whether to check only that blobs and rows exist, without reading their content
+    grace_s : age below which an unreferenced file is ignored, seconds
+    counts : numbers of checked objects, by subject
     """
 
     settings: Settings
@@ -97,7 +99,7 @@ class Folder:
     _models: dict[str, Model | None] = field(default_factory=dict)
 
     def model(self, model_id: str) -> Model | None:
-        """Return a stored model; None if it is missing, or its file has another id."""
+        """Return a stored model; None if it is missing or damaged."""
         if model_id not in self._models:
             with self.store.database.read() as connection:
                 statement = select(models.c.content).where(models.c.id == model_id)
@@ -112,7 +114,7 @@ class Folder:
     def numbers(
         self, subject: str, table: Table = frames, *where: ColumnElement[bool]
     ) -> Iterator[list[int]]:
-        """Yield the numbers of all checked rows, in blocks, and report the progress."""
+        """Yield the numbers of all rows to check, in blocks, and report the progress."""
         done, after, number = 0, 0, table.c.number
         with self.store.database.read() as connection:
             if self.map_name is not None:
@@ -121,9 +123,9 @@ class Folder:
             total = int(connection.execute(select(func.count(number)).where(*where)).scalar_one())
         self.progress(subject, 0, total)
         while True:
-            wanted = select(number).where(*where, number > after).order_by(number).limit(BLOCK)
+            query = select(number).where(*where, number > after).order_by(number).limit(BLOCK)
             with self.store.database.read() as connection:
-                block = list(connection.execute(wanted).scalars())
+                block = list(connection.execute(query).scalars())
             if not block:
                 return
             yield block
@@ -134,7 +136,7 @@ class Folder:
 def read_rows(
     folder: Folder, numbers: list[int], read: Callable[[Connection, list[int]], list[T]]
 ) -> Iterator[T | tuple[int, Exception]]:
-    """Yield the rows of some numbers, or number and error of each that cannot be read."""
+    """Yield the rows with these numbers; for an unreadable row, yield its number and the error."""
     try:
         with folder.store.database.read() as connection:
             rows = read(connection, numbers)
@@ -147,12 +149,12 @@ def read_rows(
     else:
         yield from rows
         return
-    for number in numbers:  # one unreadable row must not hide the others
+    for number in numbers:  # an unreadable row must not hide the rest of its block
         yield from read_rows(folder, [number], read)
 
 
 def is_of_rows(error: Exception) -> bool:
-    """Return whether stored data caused an error, and not the machine."""
+    """Return whether damaged data caused an error, rather than the machine."""
     if not isinstance(error, UnusableStore):
         return True
     cause = error.__cause__
@@ -164,11 +166,11 @@ def is_of_rows(error: Exception) -> bool:
 
 
 def quarantine_blob(folder: Folder, digest: str) -> str:
-    """Move a damaged blob away, and return a description.
+    """Move a damaged blob to the quarantine, and return a description.
 
     Raises
     ------
-    StoreError : a backup needs all blobs, or another process is removing some.
+    StoreError : If a backup or another process that removes blobs is running.
     """
     with folder.store.blobs.removing() as allowed:
         if not allowed:

@@ -1,4 +1,4 @@
-"""Compare search indexes with the database; workers rebuild a damaged index."""
+"""Compare search indexes with the database. Workers rebuild an index that a repair removes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sceneprint_client.api import FrameState
 
 
 def check_indexes(folder: Folder) -> Iterator[Finding]:
-    """Check that the newest index of each map is sound, and equals the database."""
+    """Check that the newest index of each map is sound and agrees with the database."""
     with folder.store.database.read() as connection:
         rows = [row for row in list_maps(connection) if folder.map_name in (None, row.name)]
     for done, row in enumerate(() if folder.quick else rows):
@@ -30,7 +30,7 @@ def check_indexes(folder: Folder) -> Iterator[Finding]:
         if number is None or model is None:
             continue
         folder.counts["indexes"] += 1
-        index = newest(place, row.model_id, model.signature_bytes)  # reads all its bytes
+        index = newest(place, row.model_id, model.signature_bytes)  # verifies all checksums
         wrong = [] if index is None else list(_differing_frames(folder, row, index))
         if index is None or index.number < number:
             means = "has a damaged or missing file"
@@ -48,7 +48,7 @@ def check_indexes(folder: Folder) -> Iterator[Finding]:
 
 def _remove(place: Path) -> str:
     if not clear(place):
-        raise StoreError("a worker is building this index; run it again when that is done")
+        raise StoreError("a worker is building this index; run the check again after it ends")
     return "the index is removed"
 
 
@@ -56,7 +56,7 @@ def _differing_frames(folder: Folder, row: MapRow, index: IndexVersion) -> Itera
     """Yield the ids of frames whose signature is missing or different in the index."""
     with folder.store.database.read() as connection:
         version = trusted(connection, row, index)
-    if version is None:  # queries ignore an index of another history, such as after a restore
+    if version is None:  # queries ignore an index of another history, for example after a restore
         return
     after = 0
     here = (
@@ -65,9 +65,9 @@ def _differing_frames(folder: Folder, row: MapRow, index: IndexVersion) -> Itera
         & (frames.c.revision <= version.revision)
     )
     while True:
-        wanted = select(frames.c.number, frames.c.id).where(here, frames.c.number > after)
+        query = select(frames.c.number, frames.c.id).where(here, frames.c.number > after)
         with folder.store.database.read() as connection:
-            block = connection.execute(wanted.order_by(frames.c.number).limit(BLOCK)).all()
+            block = connection.execute(query.order_by(frames.c.number).limit(BLOCK)).all()
             stored = stored_signatures(connection, [each.number for each in block], row.model_id)
         if not block:
             return
@@ -77,6 +77,6 @@ def _differing_frames(folder: Folder, row: MapRow, index: IndexVersion) -> Itera
         rows = version.vectors_of(keys[held])
         indexed = {key: one.tobytes() for key, one in zip(keys[held].tolist(), rows, strict=True)}
         for number, frame_id in block:
-            # damage in the database is another finding
+            # `check_rows` reports damage in the database
             if number in stored and indexed.get(number) != stored[number]:
                 yield frame_id

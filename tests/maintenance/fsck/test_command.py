@@ -56,8 +56,8 @@ def test_it_says_what_it_would_do_and_what_it_did(
     lines = fsck("--json", record, expect=1).splitlines()
     assert house.files() == before
     assert lines[1] == (
-        f"damage    stale-value  frame {frame} of map hall: the tags or the position that "
-        "searches use differ from the frame's; would: copy them from the frame"
+        f"damage    stale-value  frame {frame} of map hall: the search columns for "
+        "tags and position differ from the frame's values; would: copy them from the frame"
     )
     assert lines[0].startswith("note      foreign-file  ")
     assert lines[-1] == (
@@ -70,7 +70,7 @@ def test_it_says_what_it_would_do_and_what_it_did(
         ("stale-value", frame, None),
     ]
     lines = fsck("--repair", expect=0).splitlines()
-    assert lines[1].endswith("; done: written")
+    assert lines[1].endswith("; done: copied from the frame")
     assert lines[-1].startswith("1 damaged, 0 left over: 1 repaired, 0 not. Run it again")
     assert fsck("--map", "hall", expect=0).splitlines()[-1] == "no problems found"
 

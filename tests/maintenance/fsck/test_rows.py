@@ -116,7 +116,7 @@ def test_what_a_map_is_counted_to_hold(house: Any) -> None:
     assert house.look(quick=True) == house.look(map_name="attic") == []
     [found] = house.look()
     assert (found.kind, found.map) == ("stale-value", "hall")
-    assert f"use is {before[0][0] + 1} frames of {before[0][1]} bytes" in found.means
+    assert f"usage is {before[0][0] + 1} frames with {before[0][1]} bytes" in found.means
     assert [one.left for one in house.look(repair=True)] == [False]
     assert (house.sql(asked), house.look()) == (before, [])
 
