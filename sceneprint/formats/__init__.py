@@ -1,1 +1,1 @@
-"""Files and bytes that come from outside: images, clouds, archives, datasets."""
+"""Readers and writers of external data: images, clouds, archives, datasets."""

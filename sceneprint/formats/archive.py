@@ -1,15 +1,15 @@
-"""Read frames in tar and zip files in place, so that no archive decides where a file is written.
+"""Read frames from tar and zip files without unpacking them, so that archives cannot choose paths.
 
 file  --open_archive-->  Archive: sequences, refused, frame_of(reference)
 file  --tar_entries, zip_entries-->  ArchiveEntry, ...  --read_entry-->  bytes
 name  --parts_of-->  parts of a relative path
 
-Only files of cameras, poses and lists are unpacked, into a private folder, with limits on their
-size and names. Images are empty files there, so `find_each` finds sequences as it does on a disk.
-An image is read from the archive when it is needed.
+Only files with cameras, poses and lists are unpacked, into a private folder and with limits on size
+and name. The folder has an empty file for each image, so `find_each` finds sequences as on a disk.
+Images are read from the archive when they are needed.
 
-`tarfile` and `zipfile` trust the sizes in headers. This module limits the number of members, the
-size of headers, and the names.
+`tarfile` and `zipfile` trust the sizes in headers. This module therefore limits the number of
+members, the size of headers, and the names.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ from sceneprint_client.formats import is_cloud, titles_of
 from sceneprint_client.frame_files import POSE_FOLDERS, rows_as_npy
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
-# Members of a tar or a zip, read by the standard library within limits.
+# Members of a tar or zip, which the standard library reads within limits.
 
-#: Maximum number of members: a hundred thousand files are a month of one robot.
+#: Maximum number of members: the files of one robot in a month.
 MOST_MEMBERS = 100_000
 #: Maximum length of a member's name, bytes, and maximum number of folders in it.
 LONGEST_NAME, DEEPEST = 1024, 16
-_LONGEST_PART = 200  #: bytes: no file system takes more than 255
-_ENCRYPTED = 0x1 | 0x40 | 0x2000  #: flags of a zip's member
-_UNIX = 3  #: system whose modes a zip's member may have
-#: What the standard library raises for malformed archives.
+_LONGEST_PART = 200  #: bytes; file systems accept at most 255
+_ENCRYPTED = 0x1 | 0x40 | 0x2000  #: flags of an encrypted member of a zip
+_UNIX = 3  #: code of the system whose file modes a member of a zip may contain
+#: Exceptions that the standard library raises for malformed archives.
 _MALFORMED = (
     tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, LookupError,
     OverflowError, RuntimeError, ValueError,
@@ -64,15 +64,15 @@ _MALFORMED = (
 
 @dataclass(frozen=True, slots=True)
 class ArchiveEntry:
-    """A member of an archive that has not been read.
+    """Member of an archive whose content has not been read.
 
     Parameters
     ----------
     name : name in the archive; never used as a path
     size : announced size of the content, bytes
-    start : offset of the content in a tar
-    packed : size of the content in the tar, bytes
-    open : opens the content of a zip's member
+    start : offset of the content in the archive, bytes
+    packed : size of the content in the archive, bytes
+    open : function that opens the content of a member of a zip; None for a tar
     trouble : reason why the member cannot be read, or None
     """
 
@@ -84,8 +84,8 @@ class ArchiveEntry:
     trouble: str | None = None
 
 
-class OddName(Exception):
-    """A member's name cannot be used as a relative path; the message says why."""
+class UnusableName(Exception):
+    """Error for a member's name that cannot be a relative path; the message says why."""
 
 
 def parts_of(name: str) -> tuple[str, ...]:
@@ -97,47 +97,48 @@ def parts_of(name: str) -> tuple[str, ...]:
 
     Raises
     ------
-    OddName : The name is absolute, leads upwards, is too long or too deep, or not printable.
+    UnusableName : If the name is absolute, has a part `..`, is too long or too deep, or has a
+        character that is not printable.
     """
-    text = name.replace("\\", "/")  # some programs for Windows write backslashes
+    text = name.replace("\\", "/")  # some Windows programs write backslashes
     if len(name.encode(errors="replace")) > LONGEST_NAME:
-        raise OddName(f"its name has more than {LONGEST_NAME} bytes")
+        raise UnusableName(f"its name has more than {LONGEST_NAME} bytes")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
-        raise OddName("its name is absolute")
+        raise UnusableName("its name is absolute")
     parts = tuple(part for part in text.split("/") if part not in ("", "."))
     if ".." in parts:
-        raise OddName("its name leads out of the archive")
+        raise UnusableName("its name leads outside the archive")
     if not parts or not all(map(_is_plain, parts)):
-        raise OddName("its name is empty, or has a character that cannot be printed")
+        raise UnusableName("its name is empty or has a character that is not printable")
     if len(parts) > DEEPEST:
-        raise OddName(f"it lies below more than {DEEPEST} folders")
+        raise UnusableName(f"it is nested in more than {DEEPEST - 1} folders")
     if any(len(part.encode()) > _LONGEST_PART for part in parts):
-        raise OddName(f"a part of its name has more than {_LONGEST_PART} bytes")
+        raise UnusableName(f"a part of its name has more than {_LONGEST_PART} bytes")
     return parts
 
 
 def printable_name(name: str) -> str:
-    """Return a member's name for a message: one line of limited length."""
+    """Return a member's name as one printable line of at most 200 characters."""
     text = name if name.isprintable() else ascii(name)[1:-1]
     return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
 
 
 def _is_plain(part: str) -> bool:
-    # "C*": control, format, surrogate, private, unassigned
+    # categories "C*": control, format, surrogate, private use, unassigned
     return not any(unicodedata.category(letter).startswith("C") for letter in part)
 
 
-#: Maximum sizes of one member's headers and of a zip's directory, bytes: the standard library
-#: reads them into memory.
+#: Maximum size of the headers of a member, and of the directory of a zip, bytes. The standard
+#: library reads both into memory.
 _MAXIMUM_HEADERS, _MAXIMUM_DIRECTORY = 65_536, 64 << 20
 _DIRECTORY_ENTRY = b"PK\x01\x02"
 BLOCK = tarfile.BLOCKSIZE
 PIECE = 1 << 20  #: size of the pieces that are decompressed, bytes
-_DAMAGED = "the tar is damaged after it, and the rest cannot be found"
+_DAMAGED = "the tar is damaged after this member, and the rest cannot be read"
 
 
 class _HeaderFile:
-    """A file from which the standard library may read `allowance` more bytes."""
+    """File from which the standard library may read at most `allowance` more bytes."""
 
     def __init__(self, file: BinaryIO, allowance: int) -> None:
         self.allowance = allowance
@@ -157,7 +158,7 @@ class _HeaderFile:
 
 
 def is_tar_header(block: bytes) -> bool:
-    """Return whether a block is the header of a tar's member."""
+    """Return whether a block is the header of a member of a tar."""
     try:
         tarfile.TarInfo.frombuf(block[:BLOCK], "utf-8", "surrogateescape")
     except tarfile.HeaderError:
@@ -168,21 +169,21 @@ def is_tar_header(block: bytes) -> bool:
 def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
     """Yield the members of a tar except folders; unreadable members have `trouble`.
 
-    If the tar is damaged or truncated, the last member says so, and those before it are sound.
+    If the tar is damaged or truncated, the `trouble` of the last member says so.
 
     Parameters
     ----------
-    file : a seekable file that is not compressed
+    file : seekable tar without compression
 
     Raises
     ------
-    UnreadableArchive : There are too many members, or the first is unreadable.
+    UnreadableArchive : If the tar has too many members, or the first member is unreadable.
     """
     end = file.seek(0, os.SEEK_END)
     file.seek(0)
     headers, last = _HeaderFile(file, _MAXIMUM_HEADERS), ""
     try:
-        # TarFile itself, because `tarfile.open` continues after an error
+        # `tarfile.open` would skip damaged headers silently
         tar = tarfile.TarFile(fileobj=cast("BinaryIO", headers), encoding="utf-8")
     except (UnreadableArchive, *_MALFORMED) as error:
         raise UnreadableArchive("The tar is damaged at its start. Pack it again.") from error
@@ -193,12 +194,12 @@ def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
         except (UnreadableArchive, *_MALFORMED):
             yield ArchiveEntry(last, trouble=_DAMAGED)
             return
-        if info is None:  # the end, or an unknown header
+        if info is None:  # the end of the archive, or an invalid header
             file.seek(tar.offset)
             if any(file.read(BLOCK)):
                 yield ArchiveEntry(last, trouble=_DAMAGED)
             return
-        # TarFile keeps all members and their headers; the attribute is missing in typeshed
+        # TarFile would keep all members in memory; typeshed lacks the attribute
         cast("Any", tar).members.clear()
         tar.pax_headers = {}
         if info.size < 0:
@@ -207,7 +208,7 @@ def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
         last = info.name
         cut = tar.offset > end < info.offset_data + info.size
         if not info.isdir() and not last.endswith("/"):
-            trouble = "the archive ends within it" if cut else _tar_trouble(info)
+            trouble = "the archive ends within this member" if cut else _tar_trouble(info)
             yield ArchiveEntry(last, info.size, info.offset_data, info.size, trouble=trouble)
         if cut:
             return
@@ -220,8 +221,8 @@ def _tar_trouble(info: tarfile.TarInfo) -> str | None:
     if info.isdev():
         return "it is a pipe" if info.isfifo() else "it is a device"
     if info.issparse():
-        return "it is a file with holes"
-    return None if info.isreg() else "it is no plain file"
+        return "it is a sparse file"
+    return None if info.isreg() else "it is not a regular file"
 
 
 def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
@@ -229,11 +230,11 @@ def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
 
     Parameters
     ----------
-    file : a seekable file that stays open
+    file : seekable zip, which must stay open
 
     Raises
     ------
-    UnreadableArchive : The directory is missing or damaged, or has too many entries.
+    UnreadableArchive : If the directory is missing or damaged, or has too many entries.
     """
     end = file.seek(0, os.SEEK_END)
     headers = _HeaderFile(file, _MAXIMUM_DIRECTORY)
@@ -241,7 +242,7 @@ def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
         packed = _opened_zip(headers)
     except _MALFORMED as error:
         raise UnreadableArchive(
-            f"The zip is damaged, or ends early ({error}). Pack it again, or copy it once more."
+            f"The zip is damaged or truncated ({error}). Copy or pack it again."
         ) from error
     headers.allowance = sys.maxsize  # members are read in pieces
     for info in packed.infolist():
@@ -269,14 +270,14 @@ def _zip_trouble(info: zipfile.ZipInfo, mode: int, beyond: bool) -> str | None:
     if stat.S_ISLNK(mode):
         return "it is a link"
     if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
-        return "it is no plain file"
-    # LZMA is refused as well, because the file decides how much memory it needs
+        return "it is not a regular file"
+    # LZMA is refused too, because the file determines how much memory its decoder needs
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         return (
-            f"it is packed by method {info.compress_type}, and only stored and deflated ones are "
-            "read"
+            f"it is compressed with method {info.compress_type}; only stored and deflated members "
+            "are supported"
         )
-    return "it begins or ends beyond the archive" if beyond else None
+    return "it extends beyond the archive" if beyond else None
 
 
 def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
@@ -284,7 +285,7 @@ def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
 
     Raises
     ------
-    UnreadableArchive : The content is damaged, or of another size than announced.
+    UnreadableArchive : If the content is damaged, or its size differs from the announced size.
     """
     if entry.open is None:
         file.seek(entry.start)
@@ -296,32 +297,35 @@ def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
         raise UnreadableArchive(f"it is damaged ({cause})") from cause
     if len(data) != entry.size:
         raise UnreadableArchive(
-            f"it is damaged (it has {len(data)} bytes, and announces {entry.size})"
+            f"it is damaged (it has {len(data)} bytes, but announces {entry.size})"
         )
     return data
 
 
 def _too_many() -> UnreadableArchive:
     return UnreadableArchive(
-        f"The archive has more than {MOST_MEMBERS} members. Pack fewer into one."
+        f"The archive has more than {MOST_MEMBERS} members. Split it into several archives."
     )
 
 
-# Decompression of tars while they are received: members are read later by random access, perhaps
-# from an object store. `gzip.open` and its like pull from a file, but the chunks of a request are
-# pushed, so this class calls the decompressors, and stops a bomb early.
+# Decompression of tars while they are received. Members are read later by random access, possibly
+# from an object store. `gzip.open` and similar functions pull bytes from a file, but the chunks of
+# a request are pushed. `Inflater` therefore calls the decompressors itself and stops a
+# decompression bomb early.
 #
 # chunks  --Inflater.pieces-->  bytes of a zip or of a plain tar
 
-#: Maximum ratio of content to archive size, beyond `FREE` bytes of content. Depth images are
-#: compressed already, and NPY files of noisy depth shrink to a fifth.
+#: Maximum ratio of content to archive size, and size of the content that is exempt, bytes. Depth
+#: images are already compressed; NPY files of noisy depth shrink to a fifth.
 MOST_RATIO, FREE = 50, 64 << 20
-_MAXIMUM_STREAMS = 65_536  #: concatenated streams, which parallel compressors write
+_MAXIMUM_STREAMS = (
+    65_536  #: maximum number of concatenated streams; parallel compressors write many
+)
 _XZ_MEMORY = 192 << 20  #: bytes; `xz -9` needs less
 
 _MAGIC = (b"PK\x03\x04", b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00")
 _KINDS = "a zip, or a tar (plain, .gz, .bz2 or .xz)"
-_NO_TAR = f"What is compressed here is no tar. Send {_KINDS}."
+_NO_TAR = f"The compressed file is not a tar. Send {_KINDS}."
 
 
 class _Stream(Protocol):
@@ -335,16 +339,16 @@ class _Stream(Protocol):
 
 
 def is_archive(head: bytes) -> bool:
-    """Return whether the first bytes of a file are those of a readable archive."""
+    """Return whether a file that starts with `head` is a zip, a tar or a compressed file."""
     return head.startswith(_MAGIC) or is_tar_header(head[:BLOCK])
 
 
 class Inflater:
-    """Receives an archive in chunks of any size, and returns it in pieces, tars decompressed.
+    """Decompressor of tars that receives chunks of any size; zips pass unchanged.
 
     Parameters
     ----------
-    most_bytes : maximum size of the returned archive
+    most_bytes : maximum size of the decompressed archive
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -354,33 +358,33 @@ class Inflater:
         self._stream: _Stream | None = None
         self._streams = 0
         self._start = b""  # first bytes of the tar
-        #: Bytes received, and bytes returned.
-        self.taken, self.given = 0, 0
+        #: Numbers of received and of returned bytes.
+        self.bytes_in, self.bytes_out = 0, 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
-        """Yield the pieces of the archive that a chunk completes.
+        """Yield the decompressed pieces of the archive for the next chunk.
 
         Raises
         ------
-        UnreadableArchive : The file is no archive, is damaged, or exceeds `most_bytes`.
+        UnreadableArchive : If the file is not an archive, is damaged, or exceeds `most_bytes`.
         """
-        self.taken += len(chunk)
+        self.bytes_in += len(chunk)
         if self._head is not None:
             self._head += chunk
             if len(self._head) < BLOCK:
                 return
             chunk, self._head = self._head, None
             self._open(chunk)
-        yield from self._given(chunk)
+        yield from self._checked_pieces(chunk)
 
     def end(self) -> Iterator[bytes]:
-        """Yield the remaining pieces after the last chunk; raises as `pieces`."""
-        if self._head is not None:  # shorter than a block: an empty zip, or an empty file
+        """Yield the remaining pieces after the last chunk; raise the errors of `pieces`."""
+        if self._head is not None:  # shorter than a block, such as an empty zip
             chunk, self._head = self._head, None
             self._open(chunk)
-            yield from self._given(chunk)
+            yield from self._checked_pieces(chunk)
         if self._stream is not None:
-            raise UnreadableArchive("The archive ends early. Copy or pack it again.")
+            raise UnreadableArchive("The archive is truncated. Copy or pack it again.")
         if self._packing is not None and len(self._start) < BLOCK:
             raise UnreadableArchive(_NO_TAR)
 
@@ -389,20 +393,21 @@ class Inflater:
             raise UnreadableArchive("The archive is empty. Copy or pack it again.")
         if not is_archive(head):
             raise UnreadableArchive(
-                f"This is no archive that is read. Send {_KINDS} of a sequence; one frame is sent "
-                "as a frame."
+                f"This is not a supported archive. Send a sequence as {_KINDS}, and a single frame "
+                "without an archive."
             )
         for magic in _MAGIC[1:]:
             if head.startswith(magic):
                 self._packing, self._stream = magic, _open_entry(magic)
 
-    def _given(self, chunk: bytes) -> Iterator[bytes]:
+    def _checked_pieces(self, chunk: bytes) -> Iterator[bytes]:
         for piece in [chunk] if self._packing is None else self._inflated(chunk):
-            self.given += len(piece)
-            if self.given > self._most or self.given > FREE + MOST_RATIO * self.taken:
+            self.bytes_out += len(piece)
+            if self.bytes_out > self._most or self.bytes_out > FREE + MOST_RATIO * self.bytes_in:
                 raise UnreadableArchive(
-                    f"The archive holds more than {self._most} bytes, or {MOST_RATIO} times what "
-                    "it weighs, which no depth images do. Send it in parts, or packed less."
+                    f"The content of the archive exceeds {self._most} bytes or {MOST_RATIO} times "
+                    "the size of the archive. Depth images do not compress so well. Send the "
+                    "archive in parts, or with less compression."
                 )
             if self._packing is not None and len(self._start) < BLOCK:
                 self._start += piece[: BLOCK - len(self._start)]
@@ -413,7 +418,7 @@ class Inflater:
     def _inflated(self, chunk: bytes) -> Iterator[bytes]:
         data = chunk
         while True:
-            if self._stream is None:  # between two streams, or after the last
+            if self._stream is None:  # between two streams, or after the last stream
                 data = data.lstrip(b"\0")
                 if not data:
                     return
@@ -421,7 +426,8 @@ class Inflater:
                 self._streams += 1
                 if self._streams > _MAXIMUM_STREAMS:
                     raise UnreadableArchive(
-                        "The archive is packed in too many small parts. Pack it again, as one."
+                        f"The archive has more than {_MAXIMUM_STREAMS} compressed streams. Pack it "
+                        "again as one stream."
                     )
                 self._stream = _open_entry(self._packing)
             try:
@@ -435,7 +441,7 @@ class Inflater:
             if self._stream.eof:
                 data, self._stream = self._stream.unused_data, None
                 continue
-            # zlib returns unused input in this attribute; the others keep it
+            # zlib returns unused input in this attribute; the other decompressors keep it
             data = getattr(self._stream, "unconsumed_tail", b"")
             if not data and len(piece) < PIECE:
                 return
@@ -455,36 +461,36 @@ def _open_entry(magic: bytes) -> _Stream:
 DEFAULT_NAME = "import"
 _LISTS = ("depth.txt", "groundtruth.txt", TRANSFORMS)
 _TEXTS = (INTRINSICS_FILE, CLOUDS_FILE, "TrainSplit.txt", "TestSplit.txt")
-#: Maximum sizes of a list, of another text, and of all texts together, bytes.
+#: Maximum size of a list, of any other text, and of all texts together, bytes.
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27
-_HEAD_BYTES = 1024  #: first bytes of an image, which show its size
-_PARENTS = ("0", "1", "2", "3", "4")  #: parents of the root, in which a camera is searched
+_HEAD_BYTES = 1024  #: number of first bytes of an image that state its size
+_PARENTS = ("0", "1", "2", "3", "4")  #: private parent folders, since camera files are sought above
 
-#: Errors of a file system if a file and a folder have the same name, or a name is invalid.
+#: Error codes for a name that both a file and a folder have, or that is invalid.
 _CLASHES = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
-Wanted = Literal["image", "text"]
+Role = Literal["image", "text"]
 
 
 class Archive:
-    """An open archive; see `open_archive`.
+    """Open archive; see `open_archive`.
 
     Parameters
     ----------
-    file : the archive
-    root : private folder for the layout of its sequences
+    file : file of the archive
+    root : private folder that represents the content of the archive
     """
 
     def __init__(self, file: BinaryIO, root: Path) -> None:
         self._file, self._root = file, root
         self._members: dict[Path, ArchiveEntry] = {}
-        #: Names of refused members and sequences, with the reasons.
+        #: Names of refused members and sequences, each with the reason.
         self.refused: list[tuple[str, str]] = []
         #: Number of members that belong to no sequence, such as colour images.
         self.ignored = 0
-        #: Whether the archive has depth of Record3D.
+        #: Whether the archive has depth files of Record3D.
         self.is_record3d = False
-        #: The sequences; each of their frames may still be damaged.
+        #: Sequences in the archive; the content of their frames has not been read.
         self.sequences: tuple[FrameSequence, ...] = ()
 
     def name_of(self, reference: FrameReference) -> str:
@@ -500,17 +506,17 @@ class Archive:
 
         Raises
         ------
-        UnreadableArchive : The member is damaged, encrypted or too large.
+        UnreadableArchive : If the member is damaged, encrypted or too large.
         """
         limit = MAXIMUM_IMAGE_BYTES if reference.cloud is None else MAXIMUM_CLOUD_BYTES
         data = self._read(self._members[reference.path], limit)
         if reference.row is not None:
             return rows_as_npy(data, reference.row)
-        # units that no camera file can express
+        # a camera file cannot state the units of such depth images
         return reference.source.converted(data) if isinstance(reference.source, ScaledNpy) else data
 
-    def told(self, error: SceneprintError) -> str:
-        """Return the message of an error without the private folder."""
+    def message_of(self, error: SceneprintError) -> str:
+        """Return the message of an error without the path of the private folder."""
         return str(error).replace(f"{self._root}/", "")
 
     def _read(self, member: ArchiveEntry, limit: int) -> bytes:
@@ -519,8 +525,8 @@ class Archive:
             raise UnreadableArchive(f"{name}: {member.trouble}. Pack it again as a plain file.")
         if max(member.size, member.packed) > limit:
             raise UnreadableArchive(
-                f"{name}: it has {member.size} bytes, and at most {limit} are read. Check that it "
-                "is the file you meant."
+                f"{name}: it has {member.size} bytes; the limit is {limit}. Check that it is the "
+                "right file."
             )
         try:
             return read_entry(self._file, member)
@@ -528,53 +534,60 @@ class Archive:
             raise UnreadableArchive(f"{name}: {error}. Pack it again.") from error
 
     def lay_out(self, name: str) -> None:
-        """Fill the folder, and find the sequences in it."""
-        found = self._wanted()
-        tops = {parts[0] for parts, _, _ in found}
-        single = len(tops) == 1 and all(len(parts) > 1 for parts, _, _ in found)
+        """Fill the private folder, and find the sequences in it.
+
+        Parameters
+        ----------
+        name : name of the scene if the archive has no folder for it
+        """
+        members = self._sequence_members()
+        tops = {parts[0] for parts, _, _ in members}
+        single = len(tops) == 1 and all(len(parts) > 1 for parts, _, _ in members)
         above = self._root.joinpath(name)
         weight = self._file.seek(0, 2)
-        # a zip's members may overlap, so their total may exceed the archive's size
-        unpacked = sum(member.size for _, member, _ in found)
+        # members of a zip may overlap, so their total size is not limited by the archive's size
+        unpacked = sum(member.size for _, member, _ in members)
         if unpacked > FREE + MOST_RATIO * weight:
             raise UnreadableArchive(
-                f"The archive holds {unpacked} bytes, more than {MOST_RATIO} times what it "
-                "weighs, which no depth images do. Pack them less."
+                f"The content of the archive has {unpacked} bytes, more than {MOST_RATIO} times "
+                "the size of the archive. Depth images do not compress so well. Pack them with "
+                "less compression."
             )
         left = _MAXIMUM_TEXTS
-        # cameras of other systems describe colour images; depth images show their own size
-        of_exports = any(_is_of_export(parts) for parts, _, _ in found)
-        for parts, member, wanted in found:
+        # camera files of other systems describe colour images, so the size of depth is needed
+        of_exports = any(_is_of_export(parts) for parts, _, _ in members)
+        for parts, member, role in members:
             path = above.joinpath(*parts)
             if path in self._members:
-                again = "there is another member of this name before it"
-                self._refuse(member, member.trouble or again)
+                self._refuse(member, member.trouble or "an earlier member has the same name")
                 continue
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.touch(exist_ok=False)
             except OSError as error:
-                if error.errno not in _CLASHES:  # the archive does not cause a full disk
+                if error.errno not in _CLASHES:  # an error such as a full disk
                     raise
-                self._refuse(member, "another member has the name of its folder, or its own")
+                self._refuse(member, "its name conflicts with the name of another member")
                 continue
             self._members[path] = member
-            if wanted == "image" and of_exports and member.trouble is None:
+            if role == "image" and of_exports and member.trouble is None:
                 path.write_bytes(self._head(member))
-            if wanted == "text" and member.trouble is not None:
+            if role == "text" and member.trouble is not None:
                 self._refuse(member, member.trouble)
-            elif wanted == "text":
+            elif role == "text":
                 left -= self._unpack(path, member, left)
         root = above / tops.pop() if single else above
         if root.is_dir():
             try:
                 self.sequences, refused = find_each(root)
             except DatasetError as error:
-                raise UnreadableArchive(self.told(error)) from error
-            self.refused += [(printable_name(one), self.told(error)) for one, error in refused]
+                raise UnreadableArchive(self.message_of(error)) from error
+            self.refused += [
+                (printable_name(one), self.message_of(error)) for one, error in refused
+            ]
 
     def _head(self, member: ArchiveEntry) -> bytes:
-        """Return the first bytes of a member; empty if it is unreadable."""
+        """Return the first bytes of a member; no bytes if the member is unreadable."""
         if member.open is None:
             self._file.seek(member.start)
             return self._file.read(min(_HEAD_BYTES, member.size))
@@ -585,7 +598,7 @@ class Archive:
             return b""
 
     def _unpack(self, path: Path, member: ArchiveEntry, left: int) -> int:
-        """Write a text; a damaged one stays empty, so its reader refuses it."""
+        """Write a text file and return its size; the reader refuses a damaged one, left empty."""
         limit = min(_MAXIMUM_LIST if path.name in _LISTS else _MAXIMUM_TEXT, left)
         try:
             data = self._read(member, limit)
@@ -595,28 +608,26 @@ class Archive:
         path.write_bytes(data)
         return len(data)
 
-    def _wanted(self) -> list[tuple[tuple[str, ...], ArchiveEntry, Wanted]]:
-        """Return the members that may belong to a sequence, with the parts of their names."""
-        found: list[tuple[tuple[str, ...], ArchiveEntry, Wanted]] = []
+    def _sequence_members(self) -> list[tuple[tuple[str, ...], ArchiveEntry, Role]]:
+        """Return parts of the name, entry and role of each member that may belong to a sequence."""
+        members: list[tuple[tuple[str, ...], ArchiveEntry, Role]] = []
         for count, member in enumerate(_entries_of(self._file), start=1):
             if count > MOST_MEMBERS:
-                raise UnreadableArchive(
-                    f"The archive has more than {MOST_MEMBERS} members. Pack fewer into one."
-                )
+                raise _too_many()
             try:
                 parts = parts_of(member.name)
-            except OddName as error:
+            except UnusableName as error:
                 self._refuse(member, str(error))
                 continue
-            wanted = _wanted(parts)
-            if wanted is not None:
-                found.append((parts, member, wanted))
-            elif member.trouble is not None and not member.size:  # links, and damage of a tar
+            role = _role_of(parts)
+            if role is not None:
+                members.append((parts, member, role))
+            elif member.trouble is not None and not member.size:  # a link, or damage of the tar
                 self._refuse(member, member.trouble)
             else:
                 self.ignored += 1
                 self.is_record3d |= parts[-2:-1] == (FRAMES,) and parts[-1].endswith(DEPTH_SUFFIX)
-        return found
+        return members
 
     def _refuse(self, member: ArchiveEntry, reason: str) -> None:
         self.refused.append(
@@ -630,36 +641,36 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
 
     Parameters
     ----------
-    file : a zip, or a tar that is not compressed; it stays open while the archive is used
+    file : zip, or tar without compression; it must stay open while the archive is used
     folder : parent of the private folder, which is removed at the end
-    name : name of the scene if the archive has no folder for it; one part of a path
+    name : name of the scene if the archive has no folder for it; a single part of a path
 
     Raises
     ------
-    UnreadableArchive : The file is no archive, is damaged, exceeds a limit, has no depth, or has
-        two scenes of the same name.
-    OSError : The folder cannot be written.
+    UnreadableArchive : If the file is not an archive, is damaged, exceeds a limit, has no depth, or
+        has two scenes with the same name.
+    OSError : If the folder cannot be written.
     """
     with tempfile.TemporaryDirectory(prefix="archive-", dir=folder) as private:
         archive = Archive(file, Path(private).joinpath(*_PARENTS).absolute())
         try:
             own = parts_of(name)[-1]
-        except OddName as error:
+        except UnusableName as error:
             raise UnreadableArchive(
-                f"The archive cannot be called {printable_name(name)}: {error}."
+                f"The archive cannot be named {printable_name(name)}: {error}. Choose another name."
             ) from error
         archive.lay_out(own)
         if not archive.sequences and archive.is_record3d:
             raise UnreadableArchive(
-                "This is a capture of Record3D, whose depth a service does not inflate. Run "
-                "`sceneprint upload MAP FILE.r3d`."
+                "This is a capture of Record3D, whose depth the service cannot decompress. Upload "
+                "it with `sceneprint upload MAP FILE.r3d`."
             )
         if not archive.sequences and not archive.refused:
             raise UnreadableArchive(
-                "There is no depth image or cloud in the archive, or only in archives within it. "
-                "Pack a 7-Scenes scene or sequence, a TUM RGB-D folder (depth.txt), or a folder of "
-                f"depth images ({titles_of('depth')}) with its intrinsics.json; one of clouds "
-                f"({titles_of('cloud')}); or an export of Polycam or nerfstudio."
+                "The archive has no depth images or clouds; archives within it are not read. Pack "
+                "a 7-Scenes scene or sequence, a TUM RGB-D folder (depth.txt), a folder of depth "
+                f"images ({titles_of('depth')}) with its intrinsics.json, a folder of clouds "
+                f"({titles_of('cloud')}), or an export of Polycam or nerfstudio."
             )
         yield archive
 
@@ -675,20 +686,20 @@ def _entries_of(file: BinaryIO) -> Iterator[ArchiveEntry]:
 
 
 def _is_of_export(parts: tuple[str, ...]) -> bool:
-    """Return whether other systems write a member of this name beside their depth images."""
+    """Return whether the name is that of a camera or pose file of another system's export."""
     *folders, name = parts
     of_camera = name.lower().endswith(".json") and folders[-1:] in ([one] for one in CAMERAS)
     return of_camera or name == TRANSFORMS
 
 
-def _wanted(parts: tuple[str, ...]) -> Wanted | None:
-    """Return the role of a member in a sequence by its name; None for hidden files and colour."""
+def _role_of(parts: tuple[str, ...]) -> Role | None:
+    """Return the role of a member in a sequence by its name; None if it has none."""
     *folders, name = parts
     hidden = any(part.startswith(".") or part == "__MACOSX" for part in parts)
-    # the first folder may be the one that was packed, whatever its name
+    # the first folder may be the packed data set, whose name is arbitrary
     if hidden or any(is_beside_depth(folder) for folder in folders[1:]):
         return None
-    # `find_pose_file` finds the one that belongs to a frame
+    # `find_pose_file` assigns pose files to frames
     is_pose = name.endswith(".txt") and ("pose" in name or {*folders[-1:]} & {*POSE_FOLDERS})
     if name in _TEXTS or name in _LISTS or is_pose or _is_of_export(parts):
         return "text"

@@ -1,4 +1,4 @@
-"""Geometry artifacts: the surface that a sensor saw, quantised to 16 bits, and its patches.
+"""Geometry artifacts: the surface that a sensor saw, quantised to 16 bits, with its patches.
 
     Surface  --pack_image | pack_points-->  (h, w, 3) or (N, 5) uint16
     uint16  --unpack_image | unpack_points-->  Surface
@@ -6,7 +6,7 @@
 Pixels of a pinhole camera are inverse depths, whose steps are far below a sensor's noise. Pixels of
 a sphere are ranges, and unordered points are offsets in a cube. A normal has 2 x 16 bits on an
 octahedron, or 2 x 8 for scans with spread points. Steps of range and offset are powers of two, so
-packing an unpacked surface again changes nothing.
+packing an unpacked surface reproduces the same bytes.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ from sceneprint.types import (
 
 Packed = NDArray[np.uint16]
 MOST = 65535
-#: Smallest step relative to the largest coordinate that float32 resolves.
-_TOLD = 2.0**-22
+#: Smallest step that float32 resolves, relative to the largest coordinate.
+_RESOLUTION = 2.0**-22
 
 
 @kernel
 def _to_octahedron(nx: float, ny: float, nz: float, most: float) -> tuple[int, int]:
     total = abs(nx) + abs(ny) + abs(nz)
     u, v = nx / total, ny / total
-    if nz > 0:  # normals face the sensor (-z), and this half is the middle of the square
+    if nz > 0:  # the middle of the square holds the normals that face the sensor (-z)
         u, v = (
             (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
             (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
         )
     a, b = round((u * 0.5 + 0.5) * most), round((v * 0.5 + 0.5) * most)
-    # two places on the edge of the square are the same direction: choose one
+    # two positions on the edge of the square are the same direction, so one is preferred
     a_on_edge, b_on_edge = a == 0 or a == most, b == 0 or b == most
     if a_on_edge:
         b = max(b, int(most) - b)
@@ -78,7 +78,7 @@ def _of_octahedron(a: int, b: int, most: float) -> tuple[float, float, float]:
 def _pack_image(
     points: Floats32, normals: Floats32, pinhole: bool, scale: float, most: float, out: Packed
 ) -> None:
-    """Write inverse depth or range, and normal, of every pixel to out (h, w, 3); 0 if invalid."""
+    """Write inverse depth or range, and the normal, of each valid pixel to out (h, w, 3)."""
     height, width = points.shape[0], points.shape[1]
     for y in range(height):
         for x in range(width):
@@ -104,9 +104,9 @@ def _pack_image(
 def _unpack_line(
     inverse: Floats, across: Floats, down: Floats, xn: Floats, yn: float, area: float, out: Floats
 ) -> None:
-    """Write points, normals and areas (7, w) of a line of pixels to `out`.
+    """Write points, normals and areas (7, w) of a row of pixels to `out`.
 
-    Invalid pixels are computed as well, so that the compiler can vectorise the loop.
+    Invalid pixels are computed too, so that the compiler can vectorise the loop.
     """
     px, py, pz, nx, ny, nz, areas = out[0], out[1], out[2], out[3], out[4], out[5], out[6]
     for x in range(len(inverse)):
@@ -186,13 +186,17 @@ def _unpack_normals(packed: Packed, most: float, out: Floats32) -> None:
 
 
 def _step(span: float) -> float:
-    """Return the power of two whose 65535-fold covers `span`, apart from rounding."""
+    """Return the smallest power of two of which 65535 steps cover `span`, apart from rounding."""
     return 2.0 ** math.ceil(math.log2(span / MOST) - 1e-4) if span > 0 else 1.0
 
 
 def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
-    """Return the pixels (h, w, 3) of a camera's surface, and the scale of their first number: the
-    inverse depth (pinhole) or range (sphere) of 1. Numbers of normals are 0 to `most`.
+    """Pack the surface of a camera.
+
+    Returns
+    -------
+    packed : (h, w, 3) inverse depth or range, and a normal of two numbers from 0 to `most`
+    scale : inverse depth (pinhole) or range (sphere) that 1 represents
     """
     pinhole = isinstance(surface.camera, Intrinsics)
     if pinhole:
@@ -209,7 +213,7 @@ def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
 def unpack_image(
     packed: Packed, scale: float, camera: Intrinsics | Sphere, most: int = MOST
 ) -> Surface:
-    """Return the surface of the pixels of `pack_image`."""
+    """Return the surface that `pack_image` has packed."""
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
     areas, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
@@ -225,14 +229,14 @@ def unpack_image(
 
 
 def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, float]:
-    """Return unordered points as (N, 5) offsets and normals, with their corner and step."""
+    """Return unordered points as (N, 5) offsets and normals, with corner (3,) and step, metres."""
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
     packed = np.zeros((len(points), 5), np.uint16)
     if not len(points):
         return packed, np.zeros(3), 1.0
     corner = points.min(axis=0).astype(float)
     span = float(np.ptp(points.astype(float), axis=0).max())
-    step = _step(max(span, float(np.abs(points).max()) * _TOLD * MOST))
+    step = _step(max(span, float(np.abs(points).max()) * _RESOLUTION * MOST))
     offsets = np.rint((points - corner) / step)
     packed[:, :3] = np.clip(offsets, 0, MOST).astype(np.uint16)
     _pack_normals(normals, float(most), packed[:, 3:])
@@ -240,7 +244,7 @@ def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, flo
 
 
 def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST) -> Surface:
-    """Return the surface of the points of `pack_points`: one row, without areas."""
+    """Return the surface that `pack_points` has packed, as one row without areas."""
     points = (packed[:, :3] * step + corner).astype(np.float32)
     normals = np.zeros((len(packed), 3), np.float32)
     _unpack_normals(packed[:, 3:], float(most), normals)
@@ -250,43 +254,44 @@ def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST)
     )
 
 
-# Artifacts as bytes, from which a frame is validated without reading its upload again.
+# Artifacts as bytes, which allow the validation of a frame without its upload.
 #
 #     Geometry  --write_geometry-->  bytes  --read_geometry-->  Geometry
 #
-# Little-endian, in this order: magic, schema, CRC-32 of the rest, sizes and camera, id of the
-# model, arrays. Depth images have schema 1, clouds 2, and scans with spread points 3, in which
-# offsets and ranges come first, and then all normals.
+# The order is: magic, schema, CRC-32 of the rest, sizes and camera, id of the model, arrays.
+# Numbers are little-endian. Depth images have schema 1, clouds 2, and scans with spread points 3,
+# where all offsets and ranges precede the normals.
 
 MAGIC = b"SPGEO"
-#: Versions of the format for depth images, clouds, and scans with spread points. Raise a version
+#: Versions of the format for depth images, clouds, and scans with spread points. Increase a version
 #: if its bytes or their meaning change.
 SCHEMA_VERSION, CLOUD_SCHEMA, SCAN_SCHEMA = 1, 2, 3
-#: magic, schema, checksum
+#: Magic, schema, checksum.
 _HEAD = struct.Struct("<5sHI")
-#: Depth image: width, height, patches, bytes of a descriptor, fx, fy, cx, cy, inverse depth of
-#: 65535, model.
+#: Depth image: width, height, number of patches, bytes of a descriptor, fx, fy, cx, cy, inverse
+#: depth that 1 represents, model.
 _DEPTH = struct.Struct("<HHHH5d32s")
-#: Cloud: width, height, patches, bytes of a descriptor, kind, pole, then step, left and top of a
-#: sphere or the corner of unordered points, then the step of 1, model.
+#: Cloud: width, height, number of patches, bytes of a descriptor, kind, pole, then step, left and
+#: top of a sphere or the corner of unordered points, then the range or offset that 1 represents,
+#: model.
 _CLOUD = struct.Struct("<HHHHBB4d32s")
 _SPHERE, _POINTS = 1, 2
-#: Scan, after the fields of a cloud: number of spread points, their corner, and their step of 1.
+#: Scan, after the fields of a cloud: number of spread points, their corner, and their step.
 _SPREAD = struct.Struct("<H4d")
-#: Largest number of a normal of a scan with spread points: an error of half a degree at most.
+#: Largest number of a normal in scans with spread points; the error is at most half a degree.
 _COARSE = 255
-#: Maximum number of unordered points: as many as a depth image has pixels.
+#: Maximum number of unordered points, about the number of pixels of a depth image.
 MAXIMUM_POINTS = 20_000
-#: Maximum number of patches, and of bytes of a descriptor, that are accepted: validation compares
-#: all patches with all, and no model exceeds these numbers.
+#: Maximum number of patches, and of bytes of a descriptor. Validation compares all pairs of
+#: patches, and no model exceeds these numbers.
 MAXIMUM_PATCHES, MAXIMUM_DESCRIPTOR = 4096, 1024
-#: Range of the nearest depth, metres, in which points and areas stay finite in float32.
+#: Limits of the nearest depth, metres, within which points and areas are finite in float32.
 NEAREST = (1e-6, 1e6)
-#: Range of a step of range or offset, metres.
+#: Limits of a step of range or offset, metres.
 STEPS = (2.0**-40, 16.0)
-#: Largest distance, metres, and area, square metres, of a patch that are accepted.
+#: Maximum distance, metres, and maximum area, square metres, of a patch.
 FARTHEST, LARGEST = 1e9, 1e18
-#: A patch without its descriptor: mean, normal, area, coherence as float32, and its size.
+#: Record of a patch without its descriptor.
 _PATCH = np.dtype(
     [
         ("mean", "<f4", 3), ("normal", "<f4", 3), ("area", "<f4"), ("coherence", "<f4"),
@@ -300,8 +305,8 @@ def write_geometry(geometry: Geometry) -> bytes:
 
     Parameters
     ----------
-    geometry : an artifact whose model id is 64 hexadecimal digits, and which has MAXIMUM_POINTS
-        unordered points at most
+    geometry : artifact whose model id has 64 hexadecimal digits; more than MAXIMUM_POINTS unordered
+        points are thinned
     """
     patches, camera, spread = geometry.patches, geometry.surface.camera, geometry.surface.spread
     schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
@@ -333,14 +338,14 @@ def write_geometry(geometry: Geometry) -> bytes:
 
 
 def _split(packed: Packed, places: int) -> bytes:
-    """Return the first numbers of each row as 16 bits, then those of the normals as 8."""
+    """Return the first `places` numbers of each row as 16 bits, then the normals as 8 bits."""
     return (
         packed[..., :places].astype("<u2").tobytes() + packed[..., places:].astype("u1").tobytes()
     )
 
 
 def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
-    """Return the numbers (*shape, places + 2) that `_split` has written."""
+    """Return the numbers (*shape, places + 2) from the bytes of `_split`."""
     end = 2 * places * math.prod(shape)
     first = np.frombuffer(data[:end], "<u2").reshape(*shape, places)
     normals = np.frombuffer(data[end:], np.uint8).reshape(*shape, 2)
@@ -348,20 +353,20 @@ def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
 
 
 def read_geometry(data: bytes) -> Geometry:
-    """Return the geometry artifact of the bytes of `write_geometry`.
+    """Return the geometry artifact from the bytes of `write_geometry`.
 
     Raises
     ------
-    UnreadableGeometry : The bytes are no artifact, truncated, damaged, of another schema, or
-        describe an impossible camera, depth or patch.
+    UnreadableGeometry : If the bytes are not an artifact, are truncated or damaged, have another
+        schema, or describe an impossible camera, depth or patch.
     """
-    nothing = f"{len(data)} bytes are no geometry artifact."
+    nothing = f"The {len(data)} bytes are not a geometry artifact."
     if len(data) < _HEAD.size or data[: len(MAGIC)] != MAGIC:
         _refuse(nothing)
     _, schema, checksum = _HEAD.unpack_from(data)
     if schema not in (SCHEMA_VERSION, CLOUD_SCHEMA, SCAN_SCHEMA):
         _refuse(
-            f"The geometry artifact has schema {schema}, and this version reads "
+            f"The geometry artifact has schema {schema}; this version reads "
             f"{SCHEMA_VERSION} to {SCAN_SCHEMA}."
         )
     body = memoryview(data)[_HEAD.size :]
@@ -370,30 +375,34 @@ def read_geometry(data: bytes) -> Geometry:
     start = layout.size + _SPREAD.size * is_scan
     if len(body) < start:
         _refuse(nothing)
-    width, height, count, length, *told, model = layout.unpack_from(body)
+    width, height, count, length, *projection, model = layout.unpack_from(body)
     spread = _SPREAD.unpack_from(body, layout.size) if is_scan else None
-    pixel = 4 if is_scan else 10 if schema == CLOUD_SCHEMA and told[0] == _POINTS else 6
+    pixel = 4 if is_scan else 10 if schema == CLOUD_SCHEMA and projection[0] == _POINTS else 6
     points = 8 * spread[0] if spread else 0
     arrays = [width * height * pixel, points, count * _PATCH.itemsize, count * length]
     ends = np.cumsum([start, *arrays])
     if len(body) != ends[-1] or crc32(body) != checksum:
-        _refuse("The geometry artifact is damaged: its checksum does not fit.")
-    drawn = body[ends[0] : ends[1]]
+        _refuse("The geometry artifact is damaged: its checksum does not match.")
+    pixels = body[ends[0] : ends[1]]
     try:
         if spread:
             surface = _scan(
-                _joined(drawn, (height, width), 1), body[ends[1] : ends[2]], told, spread
+                _joined(pixels, (height, width), 1), body[ends[1] : ends[2]], projection, spread
             )
         else:
-            packed = np.frombuffer(drawn, "<u2").reshape(height, width, pixel // 2)
-            surface = _depth(packed, *told) if schema == SCHEMA_VERSION else _cloud(packed, *told)
+            packed = np.frombuffer(pixels, "<u2").reshape(height, width, pixel // 2)
+            surface = (
+                _depth(packed, *projection)
+                if schema == SCHEMA_VERSION
+                else _cloud(packed, *projection)
+            )
     except InvalidIntrinsics as error:
-        raise UnreadableGeometry(f"The geometry artifact has no camera: {error}") from error
+        raise UnreadableGeometry(f"The geometry artifact has an invalid camera: {error}") from error
     patches = _patches(np.frombuffer(body[ends[2] : ends[3]], _PATCH))
     if count > MAXIMUM_PATCHES or length > MAXIMUM_DESCRIPTOR or not _sound(patches):
         _refuse(
-            f"The geometry artifact's {count} patches with descriptors of {length} bytes are none "
-            "that a model makes."
+            f"The geometry artifact has {count} patches with descriptors of {length} bytes, which "
+            "are invalid or exceed the limits."
         )
     descriptors: Bytes = np.frombuffer(body[ends[3] :], np.uint8).reshape(count, length)
     return Geometry(surface, patches, descriptors, model.hex())
@@ -407,23 +416,25 @@ def _depth(
     packed: NDArray[np.uint16], fx: float, fy: float, cx: float, cy: float, scale: float
 ) -> Surface:
     camera = Intrinsics(packed.shape[1], packed.shape[0], fx, fy, cx, cy)
-    # false for NaN as well
+    # comparisons with NaN are false
     if not (scale > 0 and NEAREST[0] <= 1.0 / (scale * 65535.0) <= NEAREST[1]):
-        _refuse(f"The geometry artifact has {scale} for its scale of depth.")
+        _refuse(f"The geometry artifact has the invalid depth scale {scale}.")
     return unpack_image(packed, scale, camera)
 
 
-def _scan(packed: Packed, points: memoryview, told: list[Any], spread: tuple[Any, ...]) -> Surface:
+def _scan(
+    packed: Packed, points: memoryview, projection: list[Any], spread: tuple[Any, ...]
+) -> Surface:
     """Return the surface of a range image with its spread points."""
     count, *corner, step = spread
-    near = all(abs(one) <= NEAREST[1] for one in corner)  # false for NaN
-    if not (told[0] == _SPHERE and 0 < count <= SPREAD_POINTS and near):
-        _refuse("The geometry artifact has points that no scan has.")
+    near = all(abs(one) <= NEAREST[1] for one in corner)  # comparisons with NaN are false
+    if not (projection[0] == _SPHERE and 0 < count <= SPREAD_POINTS and near):
+        _refuse("The geometry artifact has invalid spread points.")
     if not STEPS[0] <= step <= STEPS[1]:
-        _refuse(f"The geometry artifact has {step} for its step of offset.")
-    shown = _cloud(packed, *told, most=_COARSE)
-    of_all = unpack_points(_joined(points, (count,), 3), np.array(corner), step, _COARSE)
-    return replace(shown, spread=of_all)
+        _refuse(f"The geometry artifact has the invalid offset step {step}.")
+    surface = _cloud(packed, *projection, most=_COARSE)
+    spread_surface = unpack_points(_joined(points, (count,), 3), np.array(corner), step, _COARSE)
+    return replace(surface, spread=spread_surface)
 
 
 def _cloud(
@@ -431,18 +442,18 @@ def _cloud(
     *, most: int = MOST,
 ) -> Surface:  # fmt: skip
     if not STEPS[0] <= step <= STEPS[1]:
-        _refuse(f"The geometry artifact has {step} for its step of range.")
+        _refuse(f"The geometry artifact has the invalid range step {step}.")
     height, width = packed.shape[:2]
     if kind == _SPHERE:
         return unpack_image(packed, step, Sphere(width, height, a, b, c, pole), most)
-    near = all(abs(one) <= NEAREST[1] for one in (a, b, c))  # false for NaN
+    near = all(abs(one) <= NEAREST[1] for one in (a, b, c))  # comparisons with NaN are false
     if kind != _POINTS or pole or height != 1 or width > MAXIMUM_POINTS or not near:
-        _refuse("The geometry artifact has points that no cloud has.")
+        _refuse("The geometry artifact has invalid unordered points.")
     return unpack_points(packed[0], np.array([a, b, c]), step)
 
 
 def _patches(rows: NDArray[np.void]) -> Patches:
-    with np.errstate(invalid="ignore"):  # a signalling NaN; `_sound` refuses it
+    with np.errstate(invalid="ignore"):  # for signalling NaN, which `_sound` refuses
         return Patches(
             means=rows["mean"].astype(float),
             normals=rows["normal"].astype(float),
@@ -453,7 +464,7 @@ def _patches(rows: NDArray[np.void]) -> Patches:
 
 
 def _sound(patches: Patches) -> bool:
-    """Return whether the numbers describe patches; comparisons with NaN are false."""
+    """Return whether the numbers of all patches are valid; comparisons with NaN are false."""
     length = np.sqrt((patches.normals**2).sum(axis=1))
     return bool(
         (np.abs(patches.means) <= FARTHEST).all()

@@ -1,6 +1,6 @@
-"""Read depth images: stored samples and a camera become a `Frame`.
+"""Read depth images, and combine their samples with a camera to a `DepthFrame`.
 
-bytes  --decode_png | decode_npy-->  samples (H, W)  --make_frame-->  Frame
+bytes  --decode_png | decode_npy-->  samples (H, W)  --make_frame-->  DepthFrame
 """
 
 from __future__ import annotations
@@ -37,24 +37,20 @@ from sceneprint_client.formats import format_at, function_at, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import TRANSPORT_BYTES, inverse_depth
 
-#: Samples of a depth image: whole numbers of a unit, or metres.
+#: Samples of a depth image: integers in stored units, or metres.
 Samples = NDArray[np.uint16] | Floats32
 
-#: Maximum size of a frame, bytes: all samples as float64, and a header.
-_MAXIMUM_CHUNKS = 65_536  # 16 megapixels in pieces of 1 KB; each costs time even if empty
+#: Maximum number of chunks: 16 megapixels in chunks of 1 KB. Even empty chunks take time.
+_MAXIMUM_CHUNKS = 65_536
 _COLOURS = {2: "colour (RGB)", 3: "palette", 4: "greyscale with alpha", 6: "colour with alpha"}
-#: Adam7: first column and row of each pass, and its steps
+#: First column, first row, column step and row step of each pass of Adam7 interlacing.
 _PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2),
            (0, 1, 1, 2))  # fmt: skip
-_TRUNCATED = "The PNG ends early. Copy or write the file again."
+_TRUNCATED = "The PNG is truncated. Copy or write the file again."
 
 
 def decode_png(data: bytes) -> NDArray[np.uint16]:
     """Return the samples of a 16-bit greyscale PNG, in stored units.
-
-    Parameters
-    ----------
-    data : the whole file
 
     Returns
     -------
@@ -62,17 +58,17 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
 
     Raises
     ------
-    UnreadableFrame : the file is empty, damaged, truncated, animated, too large, or has
-        another kind of pixels.
+    UnreadableFrame : If the file is empty, damaged, truncated, animated or too large, or has
+        another pixel format.
     """
     check_length(data)
     if not data.startswith(PNG_SIGNATURE):
-        raise UnreadableFrame("This is no PNG. Write the depth as a 16-bit greyscale PNG.")
+        raise UnreadableFrame("This is not a PNG. Write the depth as a 16-bit greyscale PNG.")
 
     header, pixels = b"", bytearray()
     for kind, content in _chunks(data):
         if not header and kind != b"IHDR":
-            raise UnreadableFrame("The PNG does not begin with its header. Write it again.")
+            raise UnreadableFrame("The PNG does not start with its header. Write it again.")
         if kind == b"IHDR":
             if header:
                 raise UnreadableFrame("The PNG has two headers. Write it again.")
@@ -81,27 +77,27 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
             pixels += content
         elif kind == b"acTL":
             raise UnreadableFrame("The PNG is animated. Send one image per frame.")
-        elif kind != b"IEND" and kind[0:1].isupper():  # upper case: a critical chunk
+        elif kind != b"IEND" and kind[0:1].isupper():  # an uppercase letter marks a critical chunk
             raise UnreadableFrame(
-                f"The PNG has a {kind!r} chunk, which 16-bit greyscale has not. "
+                f"The PNG has a {kind!r} chunk, which 16-bit greyscale images do not have. "
                 "Write it as a plain PNG."
             )
     return _samples(header, _inflate(bytes(pixels), header))
 
 
 def check_length(data: bytes) -> None:
-    """Refuse a file that is empty or too long for a depth image."""
+    """Raise UnreadableFrame if a file is empty or too large for a depth image."""
     if not data:
         raise UnreadableFrame("The file is empty. Copy or write it again.")
     if len(data) > MAXIMUM_IMAGE_BYTES:
         raise UnreadableFrame(
-            f"The file has {len(data)} bytes, the limit is {MAXIMUM_IMAGE_BYTES}. "
+            f"The file has {len(data)} bytes; the limit is {MAXIMUM_IMAGE_BYTES}. "
             "Send the image at a lower resolution."
         )
 
 
 def png_size(head: bytes) -> tuple[int, int]:
-    """Return the width and height of a PNG; UnreadableFrame if its header is cut off."""
+    """Return the width and height of a PNG; raise UnreadableFrame if its header is truncated."""
     if len(head) < 24:
         raise UnreadableFrame(_TRUNCATED)
     width, height = struct.unpack_from(">II", head, 16)
@@ -109,7 +105,7 @@ def png_size(head: bytes) -> tuple[int, int]:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield kind and content of each chunk up to IEND, after comparing its checksum."""
+    """Verify the checksum of each chunk up to IEND, and yield its kind and content."""
     view, position = memoryview(data), len(PNG_SIGNATURE)
     for _ in range(_MAXIMUM_CHUNKS):
         if position + 12 > len(data):
@@ -121,7 +117,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
         kind = data[position + 4 : position + 8]
         if struct.unpack_from(">I", data, end)[0] != crc32(view[position + 4 : end]):
             raise UnreadableFrame(
-                f"The PNG is damaged: the check sum of its {kind!r} chunk is wrong. "
+                f"The PNG is damaged: the checksum of its {kind!r} chunk is wrong. "
                 "Copy or write the file again."
             )
         yield kind, view[position + 8 : end]
@@ -129,47 +125,47 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
             return
         position = end + 4
     raise UnreadableFrame(
-        f"The PNG has more than {_MAXIMUM_CHUNKS} chunks. Write it with larger ones."
+        f"The PNG has more than {_MAXIMUM_CHUNKS} chunks. Write it with larger chunks."
     )
 
 
 def _checked_header(content: memoryview) -> bytes:
-    """Return the content of IHDR if it announces a 16-bit greyscale image of sane size."""
+    """Return the content of IHDR; raise UnreadableFrame if the image is not supported."""
     if len(content) != 13:
-        raise UnreadableFrame("The header of the PNG has a wrong length. Write it again.")
+        raise UnreadableFrame("The header of the PNG has the wrong length. Write it again.")
     width, height, bits, colour, compression, filtering, interlace = struct.unpack(
         ">IIBBBBB", content
     )
     if colour != 0 or bits != 16:
         kind = _COLOURS.get(colour, "greyscale")
         raise UnreadableFrame(
-            f"The PNG is {kind} with {bits} bits per sample, and depth is 16-bit greyscale. "
+            f"The PNG is {kind} with {bits} bits per sample, but depth must be 16-bit greyscale. "
             "Send the depth image itself, written from a uint16 array."
         )
     if width < 1 or height < 1 or width * height > MAXIMUM_SAMPLES:
         raise UnreadableFrame(
-            f"The PNG announces {width} x {height} samples; 1 to {MAXIMUM_SAMPLES} are read. "
+            f"The PNG announces {width} x {height} samples; it must have 1 to {MAXIMUM_SAMPLES}. "
             "Send the image at a lower resolution."
         )
     if compression or filtering or interlace > 1:
         raise UnreadableFrame(
-            "The PNG uses a compression, filter or interlacing that PNG has not. Write it again."
+            "The PNG has an unknown compression, filter or interlacing method. Write it again."
         )
     return bytes(content)
 
 
-#: The stub of isal declares an instance.
+#: Error of isal, which its stub declares as an instance.
 _DAMAGED = cast(type[Exception], isal_zlib.error)
 
 
 def _inflate(pixels: bytes, header: bytes) -> bytes:
-    """Return the filtered rows, exactly the number of bytes that the header announces."""
+    """Return the filtered rows; raise UnreadableFrame if their size differs from the header's."""
     width, height, interlaced = *struct.unpack_from(">II", header), header[12]
     passes = _PASSES if interlaced else ((0, 0, 1, 1),)
     expected = 0
     for column, row, across, down in passes:
         columns, rows = -(-(width - column) // across), -(-(height - row) // down)
-        if columns > 0 and rows > 0:  # an empty pass has no filter bytes either
+        if columns > 0 and rows > 0:  # an empty pass has no filter bytes
             expected += rows * (1 + 2 * columns)
     stream = isal_zlib.decompressobj()
     try:
@@ -180,19 +176,19 @@ def _inflate(pixels: bytes, header: bytes) -> bytes:
         ) from cause
     if len(rows_bytes) != expected or not stream.eof:
         raise UnreadableFrame(
-            f"The PNG announces {width} x {height} samples and holds "
+            f"The PNG announces {width} x {height} samples, but contains "
             f"{'fewer' if len(rows_bytes) <= expected else 'more'}. Copy or write it again."
         )
     return rows_bytes
 
 
 def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
-    """Return the samples of filtered rows, decoded by Pillow from a PNG of header and pixels."""
+    """Return the samples of filtered rows, which Pillow decodes from a minimal PNG."""
     from PIL.PngImagePlugin import PngImageFile
 
     plain = _png(header, zlib.compress(rows, 0))
     try:
-        # Image.open has a limit on pixels that belongs to the whole program
+        # the pixel limit of Image.open is a setting of the whole process
         with PngImageFile(io.BytesIO(plain)) as image:
             samples = np.asarray(image)
     except (OSError, ValueError, SyntaxError) as cause:
@@ -203,7 +199,7 @@ def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
 
 
 def encode_npy(array: NDArray[Any]) -> bytes:
-    """Return the bytes of an NPY file with an array."""
+    """Return an array as the bytes of an NPY file."""
     file = io.BytesIO()
     np.save(file, np.ascontiguousarray(array), allow_pickle=False)
     return file.getvalue()
@@ -212,20 +208,20 @@ def encode_npy(array: NDArray[Any]) -> bytes:
 def encode_png(samples: NDArray[np.uint16]) -> bytes:
     """Return a 16-bit greyscale PNG of the samples (H, W), in a sixth of Pillow's time.
 
-    Each row holds its differences from the one above, and ISA-L deflates them.
+    Each row stores its differences from the previous row, and ISA-L compresses them.
     """
     height, width = samples.shape
     raw = samples.astype(">u2").view(np.uint8)
     rows = np.zeros((height, 1 + raw.shape[1]), np.uint8)
     rows[:, 1:] = raw
     rows[1:, 1:] -= raw[:-1]
-    rows[1:, 0] = 2  # the filter Up; the first row is as it is
+    rows[1:, 0] = 2  # filter type Up; the first row has filter type None
     header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
     return _png(header, isal_zlib.compress(rows.tobytes(), 1))
 
 
 def _png(header: bytes, pixels: bytes) -> bytes:
-    """Return a PNG of a header and compressed rows."""
+    """Return a PNG with a header and compressed rows."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         check = crc32(content, crc32(kind))
@@ -238,86 +234,81 @@ def _png(header: bytes, pixels: bytes) -> bytes:
 
 # Images of ROS's compressed_depth_image_transport: a PNG after a header of 12 bytes.
 
-#: Range of the parameter a of 32FC1 images: q (q + 1) for the quantisation q, 100 by default.
+#: Limits of the parameter a of 32FC1 images: q (q + 1) for the quantisation q, by default 100.
 _A = (1.0, 1e8)
-#: Range of the depth of an inverse depth of 1, metres: the transport's limit, 10 by default.
+#: Limits of the depth that the value 1 encodes, metres: the transport's maximum, by default 10.
 _DEEPEST_M = (0.1, 1e3)
 
 
 def transported_size(head: bytes) -> tuple[int, int]:
-    """Return the width and height of the PNG in a compressedDepth message; as `png_size`."""
+    """Return the width and height of the PNG in a compressedDepth message; see `png_size`."""
     return png_size(head[TRANSPORT_BYTES:])
 
 
 def decode_transported(data: bytes) -> Samples:
-    """Return the samples of a 16UC1 image, or the metres of one of 32FC1, as its header says."""
+    """Return the samples of a compressedDepth message: stored units (16UC1) or metres (32FC1)."""
     samples = decode_png(data[TRANSPORT_BYTES:])
     a, b = struct.unpack_from("<ff", data, 4)
-    # the transport leaves these numbers unset for 16UC1 images: usually zero, or tiny
+    # for 16UC1 images, the transport leaves both numbers unset, so they are mostly zero or tiny
     if not (1e-3 < a < 1e9 and 1e-3 < abs(b) < 1e9):
         return samples
     if b < 1 and _A[0] < a < _A[1] and _DEEPEST_M[0] <= a / (1 - b) <= _DEEPEST_M[1]:
         return inverse_depth(samples, a, b)
     raise UnreadableFrame(
-        f"The header of the compressedDepth image (a = {a:g}, b = {b:g}) is neither that of 16UC1 "
-        "nor of 32FC1. Send the PNG after its 12 bytes, or float32 metres a / (v - b) as NPY."
+        f"The header of the compressedDepth image (a = {a:g}, b = {b:g}) is neither that of a "
+        "16UC1 nor of a 32FC1 image. Send the PNG without the first 12 bytes, or float32 metres "
+        "a / (v - b) as NPY."
     )
 
 
-# NPY files of float metres or stored units, read without trust in their header.
+# NPY files of float metres or stored units, whose headers are not trusted.
 #
 # bytes  --decode_npy-->  samples (H, W) float32 or uint16
 
 _TYPES = (
-    "depth is float32 in metres (float64 and float16 are taken too) or uint16 in stored units. "
-    "Convert it."
+    "depth must be float32, float64 or float16 in metres, or uint16 in stored units. Convert it."
 )
 _SHAPES = (
-    "The shape of the NPY array is not that of an image, which has two dimensions. "
-    "Send one image of height x width."
+    "The NPY array does not have the two dimensions of an image. "
+    "Send one image with the shape (height, width)."
 )
 
 
 def decode_npy(data: bytes) -> Samples:
-    """Return the samples of an NPY file: floating ones in metres, uint16 in stored units.
-
-    Parameters
-    ----------
-    data : the whole file: one two-dimensional array of float32, float64, float16 or uint16
+    """Return the samples of an NPY file with a two-dimensional array.
 
     Returns
     -------
-    samples : (H, W) float32, with the NaN and infinities of the file; or uint16
+    samples : (H, W) float32 metres for a floating-point array, with its NaN and infinities; uint16
+        stored units for a uint16 array
 
     Raises
     ------
-    UnreadableFrame : The file is empty, not NPY, too large, of another type or shape, contains
-        Python objects, or its size contradicts its header.
+    UnreadableFrame : If the file is empty, too large or not NPY, has another type or shape,
+        contains Python objects, or its size contradicts its header.
     """
     check_length(data)
     if not data.startswith(NPY_SIGNATURE):
-        raise UnreadableFrame("This is no NPY file. Write the depth with numpy.save.")
+        raise UnreadableFrame("This is not an NPY file. Write the depth with numpy.save.")
     header = _header(data)
     height, width = header.shape
     expected = height * width * header.dtype.itemsize
     if len(data) - header.start != expected:
         raise UnreadableFrame(
-            f"The NPY header announces {height} x {width} samples of {header.dtype.itemsize} bytes "
-            f"and {len(data) - header.start} of {expected} bytes follow. Copy or write the file "
-            "again."
+            f"The NPY header announces {height} x {width} samples of {header.dtype.itemsize} "
+            f"bytes, but {len(data) - header.start} of {expected} bytes follow. Copy or write the "
+            "file again."
         )
     numbers = np.frombuffer(data, header.dtype, offset=header.start)
     samples = numbers.reshape(header.shape, order=header.order)
     if header.dtype.kind == "u":
         return np.array(samples, dtype=np.uint16, order="C")
-    with np.errstate(all="ignore"):  # a float64 beyond float32 becomes inf: missing
+    with np.errstate(all="ignore"):  # a float64 beyond float32 becomes infinite, thus missing
         return np.array(samples, dtype=np.float32, order="C")
 
 
 def npy_size(head: bytes) -> tuple[int, int]:
-    """Return the width and height that the header of an NPY file announces; UnreadableFrame if it
-    is no depth image.
-    """
+    """Return the width and height of an NPY file; raise UnreadableFrame if it is not an image."""
     height, width = _header(head).shape
     return width, height
 
@@ -327,13 +318,13 @@ def _header(data: bytes) -> NpyHeader:
     height, width = header.shape
     if not 1 <= height * width <= MAXIMUM_SAMPLES:
         raise UnreadableFrame(
-            f"The NPY file announces no samples, or more than {MAXIMUM_SAMPLES}. "
+            f"The NPY file must have 1 to {MAXIMUM_SAMPLES} samples, but announces none or more. "
             "Send the image at a lower resolution."
         )
     return header
 
 
-#: Value of missing samples of some sensors, besides 0.
+#: Value with which some sensors mark missing samples; others use 0.
 _MISSING = 65_535
 
 
@@ -350,48 +341,48 @@ def make_frame(
 
     Parameters
     ----------
-    samples : (H, W) uint16 in stored units, 0 and 65535 where missing; or floating in
-        metres, NaN, infinite and <= 0 where missing
-    intrinsics : the camera that took the image, with its distortion
-    depth_scale : stored units per metre; ignored for floating samples, which are metres
+    samples : (H, W) uint16 in stored units, where 0 and 65535 are missing; or floating-point
+        metres, where NaN, infinite and non-positive values are missing
+    intrinsics : camera of the image, with its distortion
+    depth_scale : stored units per metre; ignored for floating-point samples
     along_ray : whether the samples are ranges along the pixel's ray instead of z
     name : name of the frame in messages
-    pose : (4, 4) T_parent_sensor, or None where unknown
+    pose : (4, 4) T_parent_sensor, or None if unknown
 
     Returns
     -------
-    frame : depth (H, W) float32, metres, 0 where missing
+    frame : depth (H, W) float32, metres, where 0 is missing
 
     Raises
     ------
-    UnreadableFrame : The samples are of another type or not two-dimensional.
-    InvalidIntrinsics : They do not fit the image, or the depth scale is not positive.
-    InvalidPose : The pose is not a rigid transform.
-    UselessFrame : No valid sample remains.
+    UnreadableFrame : If the samples have another type or are not two-dimensional.
+    InvalidIntrinsics : If the intrinsics do not fit the image, or the depth scale is not positive.
+    InvalidPose : If the pose is not a rigid transform.
+    UselessFrame : If no valid sample remains.
     """
     with naming(name):
         if not (math.isfinite(depth_scale) and depth_scale > 0):
             raise InvalidIntrinsics(
                 f"The depth scale {depth_scale} is not a positive number. "
-                "Give the stored units per metre, 1000 for millimetres."
+                "Specify the stored units per metre, such as 1000 for millimetres."
             )
         depth = _metres(samples, depth_scale)
         height, width = depth.shape
         if (width, height) != (intrinsics.width, intrinsics.height):
             raise InvalidIntrinsics(
-                f"The image has {width} x {height} pixels, the intrinsics are of "
-                f"{intrinsics.width} x {intrinsics.height}. Give those of this image, as a "
-                "resized image has others."
+                f"The image has {width} x {height} pixels, but the intrinsics are for "
+                f"{intrinsics.width} x {intrinsics.height}. Specify the intrinsics of this image; "
+                "a resized image needs scaled intrinsics."
             )
-        # before undistorting, because the ray of a sample is that of the distorted pixel
+        # this precedes `undistort`, because the ray of a sample is that of the distorted pixel
         if along_ray:
             depth = ray_to_axis(depth, intrinsics)
         if intrinsics.distortion:
             depth = undistort(depth, intrinsics)
         if not depth.any():
             raise UselessFrame(
-                f"All {depth.size} samples are missing. Check that the sensor saw something "
-                "within its range."
+                f"All {depth.size} samples are missing. Check that the sensor saw surfaces within "
+                "its range."
             )
         return DepthFrame(
             depth=depth,
@@ -410,16 +401,12 @@ def read_frame(
     name: str = "",
     pose: Floats | None = None,
 ) -> DepthFrame:
-    """Return the frame of a depth image, whose content determines the format.
-
-    Parameters
-    ----------
-    path : the file; for the others see `make_frame`
+    """Return the frame of a depth image file; see `make_frame` for the other parameters.
 
     Raises
     ------
-    UnreadableFrame : The file is missing or too large; and as `decode_frame`. Each error names
-        the file.
+    UnreadableFrame : If the file is missing or too large, or `decode_frame` raises the error. The
+        message names the file.
     """
     data = read_bytes(path, MAXIMUM_IMAGE_BYTES, UnreadableFrame)
     with naming(str(path)):
@@ -440,17 +427,16 @@ def decode_frame(
     samples_of: Callable[[bytes], Samples] | None = None,
     trust_depth: bool = False,
 ) -> DepthFrame:
-    """Return the frame of the bytes of a depth image.
+    """Return the frame of the bytes of a depth image; see `make_frame` for the other parameters.
 
     Parameters
     ----------
-    data : the whole file; for the others see `make_frame`
     samples_of : decoder of the file; default: `decode_samples`
     trust_depth : whether to accept samples that do not look like depth
 
     Raises
     ------
-    UnreadableFrame : as `decode_samples`, `check_depth` and `make_frame`.
+    UnreadableFrame : If `decode_samples`, `check_depth` or `make_frame` raises the error.
     """
     with naming(name):
         samples = (samples_of or decode_samples)(data)
@@ -467,40 +453,41 @@ def decode_samples(data: bytes) -> Samples:
 
     Raises
     ------
-    UnreadableFrame : The first bytes show no depth format; and as the reader of the format.
+    UnreadableFrame : If the first bytes match no depth format, or the reader raises the error.
     """
     check_length(data)
-    found = format_at(data, "depth")
-    if found is None:
+    file_format = format_at(data, "depth")
+    if file_format is None:
         raise UnreadableFrame(
-            f"This is none of {titles_of('depth')}. Write the depth as a 16-bit greyscale PNG, or "
-            "as a float32 array in metres or a uint16 array in stored units with numpy.save."
+            f"The format is none of {titles_of('depth')}. Write the depth as a 16-bit greyscale "
+            "PNG, or with numpy.save as a float32 array in metres or a uint16 array in stored "
+            "units."
         )
-    samples: Samples = function_at(found.reader)(data)
+    samples: Samples = function_at(file_format.reader)(data)
     return samples
 
 
 def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
-    """Return (H, W) float32 metres, 0 where missing."""
+    """Return (H, W) float32 metres, where 0 is missing."""
     if not isinstance(samples, np.ndarray):
         raise TypeError(f"samples must be a numpy array, not {type(samples).__name__}")
     if samples.ndim != 2 or samples.size == 0:
         raise UnreadableFrame(
-            f"The samples have shape {samples.shape}, and a depth image has two dimensions. "
-            "Send one image of height x width."
+            f"The samples have the shape {samples.shape}, but a depth image has two dimensions. "
+            "Send one image with the shape (height, width)."
         )
-    with np.errstate(all="ignore"):  # what overflows float32 is missing
+    with np.errstate(all="ignore"):  # values beyond float32 are missing
         if samples.dtype.kind == "u" and samples.dtype.itemsize == 2:
-            if samples.size > _MISSING + 1:  # fewer values than samples: each is divided once
-                taken: Floats32 = np.take(_metres_of_values(depth_scale), samples)
-                return taken
+            if samples.size > _MISSING + 1:  # a table of all values is smaller than the image
+                metres: Floats32 = np.take(_metres_of_values(depth_scale), samples)
+                return metres
             depth = (samples / depth_scale).astype(np.float32)
             depth[samples == _MISSING] = 0.0
         elif samples.dtype.kind == "f":
             depth = np.array(samples, dtype=np.float32, order="C")
         else:
             raise UnreadableFrame(
-                f"The samples are {samples.dtype}, and depth is uint16 in stored units or "
+                f"The samples are {samples.dtype}, but depth must be uint16 in stored units or "
                 "float32 in metres. Convert them."
             )
         depth[~(np.isfinite(depth) & (depth > 0.0))] = 0.0
@@ -509,22 +496,22 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
 
 @lru_cache(maxsize=4)
 def _metres_of_values(depth_scale: float) -> Floats32:
-    """Return the metres (65536,) of every value of a 16-bit sample."""
+    """Return the metres (65536,) of all values of a 16-bit sample."""
     return _metres(np.arange(_MISSING + 1, dtype=np.uint16)[None], depth_scale).ravel()
 
 
-# The size of a depth image by its header.
+# Size of a depth image according to its header.
 #
 # first bytes  --size_of-->  width, height
 
 
 def size_of(head: bytes) -> tuple[int, int] | None:
-    """Return the width and height of a depth image by its first `HEAD` bytes; None if unknown."""
-    found = format_at(head, "depth")
-    if found is None:
+    """Return the width and height of a depth image from its first `HEAD` bytes; None if unknown."""
+    file_format = format_at(head, "depth")
+    if file_format is None:
         return None
     try:
-        size: tuple[int, int] = function_at(found.size)(head)
-    except UnreadableFrame:  # whoever decodes it says why
+        size: tuple[int, int] = function_at(file_format.size)(head)
+    except UnreadableFrame:  # the decoder reports the reason
         return None
     return size

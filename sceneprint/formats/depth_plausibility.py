@@ -1,10 +1,11 @@
-"""Check that stored samples are depth, by their smoothness along the rows.
+"""Check the plausibility of depth samples by their smoothness along the rows.
 
 samples (H, W), stored units per metre  --check_depth-->  nothing, or UnreadableFrame
 
-Neighbouring samples of depth are near each other; those of swapped bytes, rotated bits and noisy
-infrared images are not. Measured on all 1,622 real depth images at hand (redkitchen of 7-Scenes,
-fr1_rpy of TUM, studyroom2 of SUN3D, a RealSense) and 60 of synthetic rooms:
+Neighbouring samples of depth are similar, unlike those of images with swapped bytes or rotated
+bits, or of noisy infrared images. The following ranges were measured on 1,622 real depth images
+(redkitchen of 7-Scenes, fr1_rpy of TUM, studyroom2 of SUN3D, a RealSense) and 60 of synthetic
+rooms:
 
     share of differing neighbours that are nearer with their bytes swapped: refused above .9
         depth 0 to .009, at an eighth of the size to .023; with swapped bytes .991 to 1
@@ -14,7 +15,7 @@ fr1_rpy of TUM, studyroom2 of SUN3D, a RealSense) and 60 of synthetic rooms:
     share of multiples of 8: refused above .8
         depth .13; rotated left by 3 bits .8 to 1
 
-An infrared image as smooth as depth, such as a photograph without noise, is not recognised.
+An infrared image that is as smooth as depth, for example without noise, is not detected.
 """
 
 from __future__ import annotations
@@ -26,39 +27,39 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableFrame
 
-_ROWS = 40  #: number of rows that are checked
+_ROWS = 40  #: number of checked rows
 _PAIRS, _BENDS = 500, 4000  #: minimum numbers of pairs and of triples for a decision
-_LEAST_SHARE = 0.1  #: minimum share of samples with both neighbours; below, the image is sparse
-_LEAST_VARYING = 0.25  #: minimum share of varying triples; below, edges would decide
-_SWAPPED = 0.9  #: share of differing neighbours that would be nearer with their bytes swapped
-_ROUGH, _SMOOTH = 0.05, 0.025  #: median bends: too rough for depth; smooth with the bits restored
-_SHIFTED = 0.8  #: share of multiples of 8 among the samples; one eighth in depth images
+_LEAST_SHARE = 0.1  #: minimum share of samples with two valid neighbours
+_LEAST_VARYING = 0.25  #: minimum share of varying triples; with fewer, edges would dominate
+_SWAPPED = 0.9  #: maximum share of differing neighbours that are nearer with their bytes swapped
+_ROUGH, _SMOOTH = 0.05, 0.025  #: maximum median bends of depth, and after restoring the bits
+_SHIFTED = 0.8  #: maximum share of multiples of 8; depth images have one eighth
 
-_TRUST = "If this is depth as it is, say so: --trust-depth, or `trust_depth` in the metadata."
+_TRUST = "If the samples are correct, use --trust-depth, or `trust_depth` in the metadata."
 
 Rows = NDArray[Any]
 
 
 def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
-    """Refuse samples that are not depth, or whose bytes or bits are in another order.
+    """Raise an error if samples are not depth, or have swapped bytes or rotated bits.
 
-    It takes 0.6 ms for 640 x 480. Callers skip it if the user sets `trust_depth`.
+    The check takes 0.6 ms for 640 x 480 samples. Callers skip it if the user sets `trust_depth`.
 
     Parameters
     ----------
-    samples : (H, W) uint16 in stored units, or floating in metres
+    samples : (H, W) uint16 in stored units, or floating-point metres
     depth_scale : stored units per metre
 
     Raises
     ------
-    UnreadableFrame : The samples are not depth; the message says what to do.
+    UnreadableFrame : If the samples are not depth; the message contains the remedy.
     """
     rows = samples[:: max(1, len(samples) // _ROWS)]
     is_whole = rows.dtype == np.uint16
     if is_whole and depth_scale < 8000 and _is_shifted(rows):
         raise UnreadableFrame(
-            "The samples are multiples of 8: this is depth whose bits were rotated left by 3, as "
-            "in SUN3D and SUN RGB-D. Write d >> 3 | d << 13 of each uint16 sample d, or set "
+            "The samples are multiples of 8, so their bits seem to be rotated left by 3, as in "
+            "SUN3D and SUN RGB-D. Write d >> 3 | d << 13 for each uint16 sample d, or set "
             f"depth_scale to {8 * depth_scale:g}. {_TRUST}"
         )
     is_rough = _bend(rows) > _ROUGH
@@ -67,24 +68,25 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
     bits = _rotation(rows) if is_whole else None
     if bits == 8 or (bits is None and not is_rough):
         raise UnreadableFrame(
-            "The samples are in the wrong byte order: with bytes swapped, neighbours are near "
-            f"each other. PNG stores the high byte first. Write samples.byteswap(). {_TRUST}"
+            "The samples seem to have the wrong byte order, because neighbours are similar only "
+            "with swapped bytes. PNG stores the high byte first. Write samples.byteswap(). "
+            f"{_TRUST}"
         )
     if bits is not None:
         raise UnreadableFrame(
-            "The bits of the samples are rotated: rotated back, neighbours are near each other. "
-            f"Write d << {bits} | d >> {16 - bits} of each uint16 sample d. {_TRUST}"
+            "The bits of the samples seem to be rotated, because neighbours are similar only after "
+            f"a rotation. Write d << {bits} | d >> {16 - bits} for each uint16 sample d. {_TRUST}"
         )
     raise UnreadableFrame(
-        "This is no depth: neighbouring samples differ as in infrared or confidence images. Send "
-        f"the depth image of the sensor. {_TRUST}"
+        "The samples do not seem to be depth: neighbours differ as in infrared or confidence "
+        f"images. Send the depth image of the sensor. {_TRUST}"
     )
 
 
 def _rotation(rows: Rows) -> int | None:
-    """Return the left rotation, in bits, that makes samples smooth; None if there is none.
+    """Return the left rotation, in bits, that makes the samples smooth; None if there is none.
 
-    Twice the depth is as smooth as the depth, so the rotation with the smallest samples counts.
+    Several rotations may be smooth, since they double the depth. The smallest samples are right.
     """
     turned = [(bits, rows << bits | rows >> 16 - bits) for bits in range(1, 16)]
     smooth = [(float(one.mean()), bits) for bits, one in turned if 0.0 < _bend(one) < _SMOOTH]
@@ -92,29 +94,29 @@ def _rotation(rows: Rows) -> int | None:
 
 
 def _is_swapped(rows: Rows) -> bool:
-    """Return whether most neighbours would be nearer with their bytes swapped."""
+    """Return whether most differing neighbours are nearer with their bytes swapped."""
     a, b = rows[:, :-1], rows[:, 1:]
     differ = _valid(a) & _valid(b) & (a != b)
     a, b = a[differ], b[differ]
-    if len(a) < _PAIRS or not (a & 255).any():  # 8-bit depth in the high bytes
+    if len(a) < _PAIRS or not (a & 255).any():  # too few, or 8-bit depth in the high bytes
         return False
     nearer = np.abs(_signed(a.byteswap()) - _signed(b.byteswap())) < np.abs(_signed(a) - _signed(b))
     return float(nearer.mean()) > _SWAPPED
 
 
 def _is_shifted(rows: Rows) -> bool:
-    """Return whether samples are multiples of 8, but not of 16 as well."""
-    taken = rows[_valid(rows)]
-    if len(taken) < _PAIRS or float((taken & 7 == 0).mean()) < _SHIFTED:
+    """Return whether most samples are multiples of 8, but not most of them multiples of 16."""
+    valid = rows[_valid(rows)]
+    if len(valid) < _PAIRS or float((valid & 7 == 0).mean()) < _SHIFTED:
         return False
-    return len(np.unique(taken)) > 64 and 0.25 < float((taken & 8 != 0).mean()) < 0.75
+    return len(np.unique(valid)) > 64 and 0.25 < float((valid & 8 != 0).mean()) < 0.75
 
 
 def _bend(rows: Rows) -> float:
-    """Return the median of |a - 2 b + c| / min(a, b, c) over three samples in a row that differ."""
+    """Return the median of |a - 2 b + c| / min(a, b, c) over triples of neighbours that vary."""
     valid = _valid(rows)
     whole = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:]
-    with np.errstate(all="ignore"):  # damaged floats overflow
+    with np.errstate(all="ignore"):  # damaged floats may overflow
         a, b, c = (rows[:, k : k - 2 or None][whole].astype(np.float32) for k in range(3))
         varying = (a != b) | (b != c)
         a, b, c = a[varying], b[varying], c[varying]
@@ -125,7 +127,7 @@ def _bend(rows: Rows) -> float:
 
 
 def _valid(rows: Rows) -> NDArray[np.bool_]:
-    """Return which samples are not missing."""
+    """Return a mask of the samples that are not missing."""
     if rows.dtype == np.uint16:
         return (rows > 0) & (rows < 65_535)
     with np.errstate(invalid="ignore"):

@@ -1,35 +1,35 @@
-"""Write points, surfaces and pose graphs in formats of other programs: PLY, web pages, g2o.
+"""Write points, surfaces and pose graphs as PLY, as bytes for web pages, and as g2o.
 
 points, normals, colours, faces, edges  --write_ply-->  bytes of a PLY file
-points, normals, patches, residuals  --encode_points-->  bytes that a page draws, 12 a point
-poses, GraphEdge, ...  --g2o-->  VERTEX_SE3:QUAT, EDGE_SE3:QUAT
+points, normals, patches, residuals  --encode_points-->  bytes for web pages, 12 per point
+poses, PoseEdge, ...  --g2o-->  VERTEX_SE3:QUAT, EDGE_SE3:QUAT
 
-Bytes for web pages are little-endian. A header of 48 bytes:
+The bytes for web pages are little-endian. The header has 48 bytes:
 
     0  4 x u8   "SPPT"
     4  u16      version, 1
-    6  u16      flags: 1 normals, 2 patches, 4 residuals are present
-    8  u32      points that follow
-    12 u32      bytes of a point, 12
+    6  u16      flags of the present columns: 1 normals, 2 patches, 4 residuals
+    8  u32      number of points
+    12 u32      bytes per point, 12
     16 3 x f32  origin, metres
     28 3 x f32  extent, metres
     40 u32      number of points before thinning
-    44 f32      metres of a residual of 250 at short range, as the model's validation allows
-                (it grows with distance); 0 without residuals
+    44 f32      distance that a residual of 250 represents at short range, metres (the tolerance of
+                the model's validation, which grows with distance); 0 without residuals
 
-Then, of each point:
+Each point follows with 12 bytes:
 
     0  3 x u16  position: origin + value / 65535 * extent
-    6  u16      index of its validation patch; 65535 for none
+    6  u16      index of the validation patch; 65535 for none
     8  3 x i8   normal, times 127
-    11 u8       residual, from the surface of another frame: 1 to 250; 253 if the point is outside
-                that frame's view, or beside or behind its surface; 254 if that frame saw through
-                the point; 255 if it was not compared
+    11 u8       residual, the distance from the surface of another frame: 1 to 250; 253 if the point
+                is outside that frame's view, or beside or behind its surface; 254 if that frame
+                saw through the point; 255 if the point was not compared
 
-The information matrix of g2o refers to the right perturbation T exp(xi), xi = (shift in metres,
+`PoseEdge` has the information matrix of the right perturbation T exp(xi), xi = (shift in metres,
 turn in radians) in the axes of the edge's second vertex. The error of g2o is the shift and the
-*vector part of the quaternion* of Z^-1 X_i^-1 X_j, which is half of a small turn. Its information
-about a turn is therefore four times that in radians, and twice between shift and turn.
+*vector part of the quaternion* of Z^-1 X_i^-1 X_j, which is half of a small turn. The information
+of g2o is therefore four times as large for turns, and twice as large between shift and turn.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from sceneprint_client.surface_encoding import (
 
 Ints = NDArray[np.int32] | NDArray[np.int64]
 
-#: Names of types in PLY.
+#: PLY names of numpy types.
 _WORDS = {"<f4": "float", "u1": "uchar"}
 
 
@@ -75,7 +75,7 @@ def write_ply(
     Parameters
     ----------
     points : (N, 3) metres
-    normals : (N, 3) unit length
+    normals : (N, 3) unit vectors
     colours : (N, 3) red, green, blue
     faces : (F, 3) triangles, as indices of points
     edges : (E, 2) lines, as indices of points
@@ -83,7 +83,7 @@ def write_ply(
 
     Raises
     ------
-    ValueError : The arrays have other shapes, or an index has no point.
+    ValueError : If an array has another shape, or an index is out of range.
     """
     n = len(points)
     kinds = [(name, "<f4") for name in "xyz"]
@@ -114,32 +114,30 @@ def write_ply(
 
 
 def points_of(surface: Surface) -> tuple[Floats32, Floats32]:
-    """Return points (N, 3) and normals (N, 3) of the valid pixels, row by row, in the sensor's
-    frame.
-    """
+    """Return points (N, 3) and normals (N, 3) of the valid pixels in the sensor's frame."""
     return surface.points[surface.valid], surface.normals[surface.valid]
 
 
 def _checked(values: Floats | Floats32 | Bytes, n: int, width: int) -> Floats | Floats32 | Bytes:
     if values.shape != (n, width):
-        raise ValueError(f"an array of shape {values.shape}, not ({n}, {width})")
+        raise ValueError(f"an array has the shape {values.shape}, not ({n}, {width})")
     return values
 
 
 def _indices(values: Ints, width: int, n: int) -> Ints:
     if values.ndim != 2 or values.shape[1] != width:
-        raise ValueError(f"indices of shape {values.shape}, not (any, {width})")
+        raise ValueError(f"indices have the shape {values.shape}, not (any, {width})")
     if values.size and (values.min() < 0 or values.max() >= n):
-        raise ValueError(f"indices from {values.min()} to {values.max()} of {n} points")
+        raise ValueError(f"indices range from {values.min()} to {values.max()} for {n} points")
     return values
 
 
 def _one_line(comment: str) -> str:
-    """Return a comment as one line of ASCII: names of frames are arbitrary."""
+    """Return a comment as one line of ASCII, since names of frames are arbitrary."""
     return comment.encode("unicode_escape").decode("ascii")
 
 
-# Points as bytes that a web page draws without decoding.
+# Points as bytes that a web page can draw directly.
 
 MEDIA_TYPE = "application/vnd.sceneprint.points"
 NOT_COMPARED = 255
@@ -163,11 +161,11 @@ def encode_points(
     Parameters
     ----------
     points : (N, 3) metres
-    normals : (N, 3) unit length
-    patches : (N,) indices of patches; -1, or NO_PATCH and above, for none
-    residuals : (N,) as in the module's docstring
+    normals : (N, 3) unit vectors
+    patches : (N,) indices of patches; -1 or at least NO_PATCH for none
+    residuals : (N,) residuals as in the module's docstring
     total : number of points before thinning; default: N
-    scale : metres of a residual of 250
+    scale : distance that a residual of 250 represents, metres
     """
     n = len(points)
     at = np.asarray(points, np.float64)
@@ -182,8 +180,8 @@ def encode_points(
         rows["patch"] = np.where((patches >= 0) & (patches < NO_PATCH), patches, NO_PATCH)
     rows["normal"] = 0 if normals is None else np.rint(normals * 127.0).clip(-127, 127)
     rows["residual"] = NOT_COMPARED if residuals is None else residuals
-    told = ((NORMALS, normals), (PATCHES, patches), (RESIDUALS, residuals))
-    flags = sum(flag for flag, values in told if values is not None)
+    columns = ((NORMALS, normals), (PATCHES, patches), (RESIDUALS, residuals))
+    flags = sum(flag for flag, values in columns if values is not None)
     head = HEADER.pack(
         MAGIC, VERSION, flags, n, POINT.itemsize, *origin.tolist(), *extent.tolist(),
         n if total is None else total, scale,
@@ -192,7 +190,7 @@ def encode_points(
 
 
 def thinned(count: int, limit: int) -> Indices:
-    """Return rising indices of at most `limit` of `count` points: pseudorandom, always the same."""
+    """Return sorted indices of a fixed pseudorandom subset of at most `limit` of `count` points."""
     if count <= limit:
         return np.arange(count)
     keys = np.arange(1, count + 1, dtype=np.uint64)  # SplitMix64
@@ -202,7 +200,7 @@ def thinned(count: int, limit: int) -> Indices:
     return np.sort(np.argsort(keys, kind="stable")[:limit])
 
 
-# Pose graphs in g2o's format.
+# Pose graphs in the g2o format.
 
 #: Factors from (shift, vector part of the quaternion) to xi.
 _PER_QUATERNION = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
@@ -210,7 +208,7 @@ _PER_QUATERNION = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
 @dataclass(frozen=True, eq=False)
 class PoseEdge:
-    """A relative pose of two vertices.
+    """Relative pose of two vertices.
 
     Parameters
     ----------
@@ -227,9 +225,9 @@ class PoseEdge:
 
 
 def g2o(poses: Sequence[Floats], edges: Sequence[PoseEdge]) -> str:
-    """Return a graph in g2o's format: vertices numbered from 0, then edges.
+    """Return a pose graph in the g2o format: vertices numbered from 0, then edges.
 
-    There are no other lines, as some readers stop at comments and at fixed vertices.
+    The text has no other lines, because some readers fail at comments and fixed vertices.
 
     Parameters
     ----------
@@ -250,11 +248,12 @@ def information_of(covariance: Floats, T: Floats) -> Floats:
 
     Parameters
     ----------
-    covariance : (6, 6) covariance of T, as in `geometry.covariance`: the error is added to the
-        translation and multiplied before the rotation, in the axes of the edge's first vertex
+    covariance : (6, 6) covariance of T in the axes of the edge's first vertex, as in
+        `geometry.covariance`: the error is added to the translation and multiplied from the left
+        to the rotation
     T : (4, 4) T_first_second
     """
-    # [exp(r) R, t + x] = T exp(xi) where x = R shift and r = R turn
+    # [exp(r) R, t + x] = T exp(xi) with x = R shift and r = R turn
     axes = np.kron(np.eye(2), T[:3, :3])
     information: Floats = axes.T @ np.linalg.inv(covariance) @ axes
     return (information + information.T) / 2.0

@@ -1,4 +1,4 @@
-"""The range of a frame's depth, which uploads report so that users notice wrong units.
+"""Range of a frame's depth, which uploads report so that users notice wrong units.
 
 Frame | Cloud  --sample_range-->  SampleRange
 """
@@ -10,12 +10,12 @@ import numpy as np
 from sceneprint.types import AnyFrame, Cloud, Floats32
 from sceneprint_client.api.frames import SampleRange
 
-#: Minimum number of samples for percentiles, if a frame has more: it takes a millisecond.
+#: Minimum number of samples for the percentiles of a larger frame, which take a millisecond.
 _SAMPLES = 20_000
 
 
 def sample_range(frame: AnyFrame) -> SampleRange:
-    """Return the range of a frame with samples: percentiles of at least `_SAMPLES` of them."""
+    """Return percentiles of the depths or distances of a frame, from a subset of its samples."""
     if isinstance(frame, Cloud):
         points = frame.points[:: max(1, len(frame.points) // _SAMPLES)]
         return _range_of(np.linalg.norm(points, axis=1), len(frame.points), None)

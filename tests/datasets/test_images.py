@@ -77,7 +77,7 @@ def test_read_frame_by_content(tmp_path: Path) -> None:
     ("data", "message"),
     [
         (b"", "empty"),
-        (depth_file.PNG_SIGNATURE, "ends early"),
+        (depth_file.PNG_SIGNATURE, "is truncated"),
         (b"\x93NUMPY", "header"),
         (b"P5", "none of PNG"),
     ],
@@ -108,7 +108,7 @@ def test_what_is_no_file(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(depth_file, "MAXIMUM_IMAGE_BYTES", 1000)
     with pytest.raises(UnreadableFrame, match="more than 1000 bytes"):
         read_frame(tmp_path / "huge.png", CAMERA)
-    with pytest.raises(UnreadableFrame, match="1001 bytes, the limit is 1000"):
+    with pytest.raises(UnreadableFrame, match="1001 bytes; the limit is 1000"):
         decode_png(b"\0" * 1001)
 
 
@@ -164,7 +164,7 @@ def test_no_array_is_the_callers_mistake() -> None:
 
 
 def test_intrinsics_of_another_image() -> None:
-    with pytest.raises(InvalidIntrinsics, match="3 x 4 pixels, the intrinsics are of 4 x 3"):
+    with pytest.raises(InvalidIntrinsics, match="3 x 4 pixels, but the intrinsics are for 4 x 3"):
         make_frame(SAMPLES.T, CAMERA)
 
 

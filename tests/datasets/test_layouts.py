@@ -53,8 +53,8 @@ def test_tum_stamps_that_differ_by_rounding_or_a_millisecond(tmp_path: Path) -> 
     (folder / "groundtruth.txt").write_text(rows)
     (sequence,) = find_sequences(folder)
     assert [None if f.pose is None else f.pose[0, 3] for f in sequence.frames] == [1, 2, None]
-    assert (
-        sequence.unposed == "groundtruth.txt has no pose within 20 ms of them (nearest: 0.4 s away)"
+    assert sequence.unposed == (
+        "groundtruth.txt has no pose within 20 ms of their time stamps (nearest: 0.4 s away)"
     )
 
 
@@ -62,7 +62,7 @@ def test_tum_without_poses(tmp_path: Path) -> None:
     (tum(tmp_path / "desk") / "groundtruth.txt").unlink()
     (sequence,) = find_sequences(tmp_path)
     assert [f.pose for f in sequence.frames] == [None] * 3
-    assert sequence.unposed == "there is no groundtruth.txt"
+    assert sequence.unposed == "the folder has no groundtruth.txt"
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_what_is_left_out_is_named(tmp_path: Path) -> None:
     found = find_sequences(scene)
     assert [s.name for s in found] == ["aligned_depth_to_color", "depth"]
     assert [f.path.name for s in found for f in s.frames] == ["0.png", "0.png"]
-    assert found[0].note.startswith("left out: scene/ir, scene/depth/confidence_0.png (images of ")
+    assert found[0].note.startswith("left out: scene/ir, scene/depth/confidence_0.png (colour, ")
     assert found[1].note == ""
     (asked,) = find_sequences(scene / "ir")
     assert len(asked.frames) == 1
@@ -140,9 +140,9 @@ def test_what_is_left_out_is_named(tmp_path: Path) -> None:
         ("11.0 depth/../../secret.png", "line 1: .*outside"),
         ("11.0 ..\\secret.png", "line 1: .*outside"),
         ("11.0 /etc/passwd", "line 1: .*outside"),
-        ("11.0 depth/absent.png", "line 1: .*no file depth/absent.png"),
-        ("11.0", "line 1: .*no time stamp and file"),
-        ("soon depth/9.5.png", "line 1: .*no time stamp"),
+        ("11.0 depth/absent.png", "line 1: .*file depth/absent.png does not exist"),
+        ("11.0", "line 1: .*not a time stamp and a file"),
+        ("soon depth/9.5.png", "line 1: .*not a time stamp"),
         ("inf depth/9.5.png", "line 1: .*not finite"),
         ("# nothing", "list is empty"),
         ("1 depth/9.5.png\n2 depth/9.5.png", "same name"),

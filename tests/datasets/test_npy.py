@@ -63,7 +63,7 @@ def test_npy_of_later_versions() -> None:
 
 BAD_NPY = {
     "empty": (b"", "empty"),
-    "no NPY": (b"PK\x03\x04" * 9, "no NPY"),
+    "not an NPY": (b"PK\x03\x04" * 9, "not an NPY"),
     "only the signature": (b"\x93NUMPY", "header of the NPY"),
     "unknown version": (b"\x93NUMPY\x09" + GOOD_NPY[7:], "header of the NPY"),
     "truncated": (GOOD_NPY[:-1], "47 of 48 bytes"),
@@ -81,14 +81,14 @@ BAD_NPY = {
     "pickled": (npy(np.array([[{}]], object), allow_pickle=True), "pickled"),
     "flat": (npy(np.ones(12, np.float32)), "two dimensions"),
     "colour": (npy(np.ones((3, 4, 3), np.float32)), "two dimensions"),
-    "no samples": (npy(np.ones((0, 4), np.float32)), "no samples"),
+    "announces none": (npy(np.ones((0, 4), np.float32)), "announces none"),
     "bomb": (
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999), }"),
-        "more than 8388608",
+        "1 to 8388608 samples",
     ),
     "numbers without end": (
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (0x" + "f" * 9000 + ", 1), }"),
-        "more than",
+        "1 to 8388608",
     ),
     "negative": (
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (-3, -4)}"), "two dimensions",

@@ -35,13 +35,13 @@ def test_its_scale_makes_metres() -> None:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (pfm()[:-1], "3 x 2 samples of 4 bytes, and 23 bytes follow"),
+        (pfm()[:-1], "3 x 2 samples of 4 bytes, but 23 bytes follow"),
         (pfm() + b" ", "25 bytes follow"),
         (pfm(header="Pf\n3\n{}1\n"), "header of the PFM file"),
         (pfm(header="Pf\n3 2\n0\n"), "header of the PFM file"),
         (pfm(header="Pf\n3 2\n1e999\n"), "header of the PFM file"),
-        (pfm(header="Pf\n0 2\n-1\n"), "announces no samples"),
-        (pfm(header="Pf\n99999 99999\n-1\n"), "or more than"),
+        (pfm(header="Pf\n0 2\n-1\n"), "not between 1 and 8388608"),
+        (pfm(header="Pf\n99999 99999\n-1\n"), "not between 1 and 8388608"),
         (pfm(header="PF\n3 2\n-1\n"), "none of PNG"),
     ],
 )

@@ -101,11 +101,11 @@ def test_the_largest_image_is_read() -> None:
 
 BAD_PNG = {
     "empty": (b"", "empty"),
-    "no PNG": (b"\xff\xd8\xff\xe0JFIF" * 9, "no PNG"),
-    "only the signature": (PNG_SIGNATURE, "ends early"),
-    "truncated in the data": (GOOD_PNG[:-20], "ends early"),
-    "truncated in the end": (GOOD_PNG[:-1], "ends early"),
-    "damaged": (GOOD_PNG[:45] + bytes([GOOD_PNG[45] ^ 1]) + GOOD_PNG[46:], "check sum"),
+    "no PNG": (b"\xff\xd8\xff\xe0JFIF" * 9, "not a PNG"),
+    "only the signature": (PNG_SIGNATURE, "truncated"),
+    "truncated in the data": (GOOD_PNG[:-20], "truncated"),
+    "truncated in the end": (GOOD_PNG[:-1], "truncated"),
+    "damaged": (GOOD_PNG[:45] + bytes([GOOD_PNG[45] ^ 1]) + GOOD_PNG[46:], "checksum"),
     "8 bit": (pillow_png(SAMPLES.astype(np.uint8)), "greyscale with 8 bits"),
     "1 bit": (pillow_png(SAMPLES > 2), "greyscale with 1 bits"),
     "colour": (pillow_png(np.zeros((3, 4, 3), np.uint8)), "RGB"),
@@ -121,10 +121,10 @@ BAD_PNG = {
     "bomb by its header": (raw_png(65_535, 65_535, b"\0" * 99), "65535 x 65535"),
     "just over the limit": (raw_png(4096, 4097, b"\0" * 99), "4096 x 4097"),
     "no size": (raw_png(0, 3, b""), "0 x 3"),
-    "fewer rows than announced": (raw_png(4, 4, rows_of(SAMPLES)), "holds fewer"),
-    "more rows than announced": (raw_png(4, 2, rows_of(SAMPLES)), "holds more"),
-    "bomb in the data": (raw_png(4, 3, b"\0" * 30_000_000), "holds more"),
-    "no data": (PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"IEND"), "holds fewer"),
+    "fewer rows than announced": (raw_png(4, 4, rows_of(SAMPLES)), "contains fewer"),
+    "more rows than announced": (raw_png(4, 2, rows_of(SAMPLES)), "contains more"),
+    "bomb in the data": (raw_png(4, 3, b"\0" * 30_000_000), "contains more"),
+    "no data": (PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"IEND"), "contains fewer"),
     "no zlib": (
         PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"IDAT", b"hello world") + chunk(b"IEND"),
         "do not decompress",
@@ -132,15 +132,15 @@ BAD_PNG = {
     "data without their end": (
         PNG_SIGNATURE + GOOD_PNG[8:33]
         + chunk(b"IDAT", zlib.compress(rows_of(SAMPLES))[:-3]) + chunk(b"IEND"),
-        "holds fewer",
+        "contains fewer",
     ),
     "unknown filter": (raw_png(4, 3, b"\x09" + rows_of(SAMPLES)[1:]), "rows do not decode"),
     "unknown interlacing": (raw_png(4, 3, rows_of(SAMPLES), interlace=2), "interlacing"),
-    "no header": (PNG_SIGNATURE + chunk(b"IEND"), "begin with its header"),
+    "no header": (PNG_SIGNATURE + chunk(b"IEND"), "start with its header"),
     "two headers": (GOOD_PNG[:33] + GOOD_PNG[8:], "two headers"),
     "short header": (PNG_SIGNATURE + chunk(b"IHDR", b"abc") + chunk(b"IEND"), "wrong length"),
     "chunk longer than the file": (
-        GOOD_PNG[:33] + b"\xff\xff\xff\xff" + GOOD_PNG[37:], "ends early",
+        GOOD_PNG[:33] + b"\xff\xff\xff\xff" + GOOD_PNG[37:], "truncated",
     ),
     "endless chunks": (
         PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"tEXt") * 65_536, "more than 65536 chunks",
@@ -166,7 +166,7 @@ def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
 
 
 def repaired(data: bytes) -> bytes:
-    """The same PNG with right check sums, so that damage reaches what lies behind them."""
+    """The same PNG with right checksums, so that damage reaches what lies behind them."""
     out, position = data[:8], 8
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
@@ -238,7 +238,7 @@ def test_a_compressed_depth_message_of_ros() -> None:
     assert decode_frame(nothing, camera).depth[0, 0] == 0  # 0 is missing
     for a, b in ((10100.0, 1009.0), (10100.0, -2.0), (1e-2, -1.0), (2e8, -1e8)):
         odd = struct.pack("<iff", 0, a, b) + encode_png(samples)
-        with pytest.raises(UnreadableFrame, match="neither that of 16UC1 nor of 32FC1"):
+        with pytest.raises(UnreadableFrame, match="neither that of a 16UC1 nor of a 32FC1"):
             decode_frame(odd, camera)
-    with pytest.raises(UnreadableFrame, match="ends early"):
+    with pytest.raises(UnreadableFrame, match="truncated"):
         decode_frame(bytes(12) + encode_png(samples)[:-5], camera)

@@ -181,12 +181,12 @@ def test_trajectory_files(tmp_path: Path) -> None:
     ("line", "message"),
     [
         ("1 2 3", "line 2: .*3 words"),
-        ("1 2 3 4 0 0 0 x", "line 2: .*no number"),
+        ("1 2 3 4 0 0 0 x", "line 2: .*not a number"),
         ("nan 2 3 4 0 0 0 1", "line 2: .*not finite"),
         ("1 inf 3 4 0 0 0 1", "line 2: .*not finite"),
         ("1 2 3 4 0 0 0 0", "line 2: .*unit length"),
         ("1 2 3 4 1e200 0 0 1e200", "line 2: .*unit length"),
-        ("# only comments", "holds no pose"),
+        ("# only comments", "has no pose"),
     ],
 )
 def test_bad_trajectories(line: str, message: str, tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_a_single_file(kitchen: Path) -> None:
 
 
 def test_nothing_there(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"absent: There is no such file or folder"):
+    with pytest.raises(DatasetError, match=r"absent: The file or folder does not exist"):
         find_sequences(tmp_path / "absent")
     with pytest.raises(DatasetError, match=r"no depth image .*7-Scenes .*TUM .*NPY"):
         find_sequences(tmp_path)
@@ -161,9 +161,9 @@ def test_symlinks_do_not_go_in_circles(kitchen: Path) -> None:
 @pytest.mark.parametrize(
     ("train", "message"),
     [
-        ("sequence1\nsequence2", "for training and for testing"),
-        ("sequence1\nfirst", "line 2: This names no sequence"),
-        ("sequence1\n\nsequence3", "line 3: There is no folder seq-03"),
+        ("sequence1\nsequence2", "for both training and testing"),
+        ("sequence1\nfirst", "line 2: The line is not a sequence"),
+        ("sequence1\n\nsequence3", "line 3: The folder seq-03 does not exist"),
     ],
 )
 def test_bad_splits(train: str, message: str, kitchen: Path) -> None:
@@ -175,7 +175,7 @@ def test_bad_splits(train: str, message: str, kitchen: Path) -> None:
 def test_two_scenes_of_one_name(kitchen: Path) -> None:
     seven_scenes(kitchen.parent / "old/kitchen/seq-01")
     write_intrinsics(kitchen.parent, CAMERA)
-    with pytest.raises(DatasetError, match=r"Another scene is called kitchen"):
+    with pytest.raises(DatasetError, match=r"has the same name kitchen"):
         find_sequences(kitchen.parent)
 
 

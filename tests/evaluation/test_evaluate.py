@@ -302,7 +302,7 @@ def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_pat
         (["{room}", "--db", "0:4", "--queries", "5:6", "--max-overlap", "2"], "--max-overlap"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--metric", "l3"], "--metric"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--db-step", "0"], "--db-step"),
-        (["/nowhere", "--db", "0:4", "--queries", "5:6"], "no such file or folder"),
+        (["/nowhere", "--db", "0:4", "--queries", "5:6"], "does not exist"),
     ],
 )
 def test_wrong_options_are_one_line_and_exit_code_2(

@@ -140,7 +140,7 @@ def test_what_cannot_be_done_is_one_line(
     first = every_frame([building / "room-000"])[0].reference
     (single / first.path.name).write_bytes(first.path.read_bytes())
     for arguments, said in (
-        ([str(tmp_path / "nowhere")], "no such file or folder"),
+        ([str(tmp_path / "nowhere")], "does not exist"),
         ([room, room], "Give each path once"),
         ([room, str(building)], "Give each path once"),
         ([str(single)], "a pair has two"),

@@ -207,7 +207,7 @@ def test_points_of_all_versions_lie_on_the_walls(
         assert meta.T_base_sensor is not None
         assert np.array(meta.T_base_sensor.matrix) == pytest.approx(LOCAL, abs=1e-6)
         assert meta.captured_at is not None
-    assert sequence.note.startswith("3 frames taken, poses of odometry, as the database stores no")
+    assert sequence.note.startswith("3 frames taken, odometry poses, because the database has no")
     moved = pickle.loads(pickle.dumps(sequence.frames[0]))
     assert moved.read_bytes() == sequence.frames[0].read_bytes()
 
@@ -321,10 +321,10 @@ def test_what_is_damaged_costs_only_its_node(room: Any, tmp_path: Path) -> None:
     nodes[5]["depth"] = nodes[5]["depth"][:200]
     [sequence] = find_sequences(write(tmp_path / "a.db", "0.21.4", nodes))
     assert [one.sequence for one in sequence.frames] == [1, 6]
-    for said in ("1 damaged nodes (a calibration is", "1 nodes without a pose", "without a calib"):
+    for said in ("1 damaged nodes (a calibration has", "1 nodes without a pose", "without a calib"):
         assert said in sequence.note
     assert error_of(room, sequence.frames[0]) < 1e-3
-    with pytest.raises(UnreadableFrame, match="ends early"):
+    with pytest.raises(UnreadableFrame, match="is truncated"):
         sequence.frames[1].read()
 
 
@@ -339,12 +339,12 @@ def test_old_incomplete_and_foreign_databases_are_refused(room: Any, tmp_path: P
     assert len(find_sequences(newer)[0].frames) == 3  # the tables are what counts
     with closing(sqlite3.connect(newer)) as database, database:
         database.execute("ALTER TABLE Data RENAME COLUMN calibration TO intrinsics")
-    with pytest.raises(DatasetError, match=r"newer than those known.*lacks calibration.*--as-map"):
+    with pytest.raises(DatasetError, match=r"newer than 0.23.*lacks calibration.*--as-map"):
         find_sequences(newer)
     foreign = tmp_path / "foreign.db"
     with closing(sqlite3.connect(foreign)) as database, database:
         database.execute("CREATE TABLE history (url TEXT)")
-    with pytest.raises(DatasetError, match="not one of RTAB-Map"):
+    with pytest.raises(DatasetError, match="no tables Node and Link"):
         find_sequences(foreign)
 
 
@@ -358,7 +358,7 @@ def test_a_database_that_is_cut_off_is_refused(room: Any, tmp_path: Path) -> Non
 def test_a_database_in_use_is_refused(room: Any, tmp_path: Path) -> None:
     path = write(tmp_path / "a.db", "0.21.4", nodes_of(room, "0.21.4"))
     (tmp_path / "a.db-journal").write_bytes(b"half")
-    with pytest.raises(DatasetError, match=r"unfinished a\.db-journal.*Close RTAB-Map"):
+    with pytest.raises(DatasetError, match=r"unfinished journal a\.db-journal.*Close RTAB-Map"):
         find_sequences(path)
 
 
@@ -370,7 +370,7 @@ def test_views_in_the_place_of_tables_are_not_run(room: Any, tmp_path: Path) -> 
             "CREATE VIEW Node AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
             "SELECT id, 0 AS map_id, 0 AS stamp, NULL AS pose FROM n"
         )
-    with pytest.raises(DatasetError, match="not one of RTAB-Map"):
+    with pytest.raises(DatasetError, match="no tables Node and Link"):
         find_sequences(path)
 
 

@@ -267,7 +267,9 @@ def test_without_poses_frames_are_taken_by_time(
     assert [f.name[-2:] for f in sequence.frames] == ["00", "05", "10", "15"]
     assert sequence.frames[0].pose is None
     assert sequence.parent_frame == "run"
-    assert "poses of 0 of 20 frames; 20 without: no transforms lead from camera" in sequence.note
+    assert (
+        "poses of 0 of 20 frames; 20 without: there are no transforms from camera" in sequence.note
+    )
     assert len(only(path, RecordingOptions(keyframe_s=0)).frames) == 20
 
 
@@ -493,7 +495,8 @@ def test_an_uncalibrated_camera(tmp_path: Path, ros: SimpleNamespace) -> None:
 
 def test_a_camera_of_another_size(tmp_path: Path, ros: SimpleNamespace) -> None:
     (frame,) = only(one_image(ros, tmp_path, size=(640, 480))).frames
-    with pytest.raises(InvalidIntrinsics, match="80 x 60 pixels, the intrinsics are of 640 x 480"):
+    reason = "80 x 60 pixels, but the intrinsics are for 640 x 480"
+    with pytest.raises(InvalidIntrinsics, match=reason):
         frame.read()
 
 
@@ -517,8 +520,8 @@ def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: 
     with pytest.raises(DatasetError) as caught:
         only(path)
     assert str(caught.value) == (
-        f"{path}: 2 topics can be taken: /camera/depth/image_raw (Image, 1 messages), /points "
-        "(PointCloud2, 1 messages). Choose one with --topic."
+        f"{path}: 2 topics have frames: /camera/depth/image_raw (Image, 1 messages), /points "
+        "(PointCloud2, 1 messages). Select one with --topic."
     )
     assert only(path, RecordingOptions(topic="/points")).frames[0].kind == "cloud"
     compressed = "/camera/depth/image_raw/compressedDepth"

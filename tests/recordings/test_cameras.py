@@ -46,7 +46,7 @@ def test_each_frame_has_the_camera_info_of_its_time(
     focal = [one.camera.intrinsics.fx for one in found.frames if one.camera]
     assert focal == [70.0] * 4 + [50.0] * 4
     assert found.note.endswith(
-        "2 cameras, as the camera info changes: each frame has that of its time"
+        "2 cameras, because the camera info changes: each frame has that of its time"
     )
 
 
@@ -90,7 +90,7 @@ def test_metres_have_no_depth_scale(tmp_path: Path, ros: SimpleNamespace) -> Non
         writer.camera_info(0.0)
         writer.image(0.0, np.full((60, 80), 1.5), "32FC1")
 
-    with pytest.raises(DatasetError, match=r"is 32FC1 in metres, .* Leave --depth-scale out"):
+    with pytest.raises(DatasetError, match=r"has 32FC1 in metres, .* Omit --depth-scale"):
         find_sequences(ros.write(tmp_path, fill), RecordingOptions(depth_scale=4000))
 
 

@@ -207,14 +207,14 @@ def test_bags_beside_other_frames_are_an_error(
     for command in (("upload", "mixed"), ("query", "folder"), ("localize", "folder"), ("sign",)):
         done = sceneprint(*command, mixed, expect=2)
         assert done.stderr == (
-            f"sceneprint {command[0]}: {mixed}: There are recordings of ROS here, such as "
-            "run.mcap, and other frames, in room (7-Scenes). Name one of them, or put the "
-            "recordings into a folder of their own.\n"
+            f"sceneprint {command[0]}: {mixed}: The folder has both ROS recordings, such as "
+            "run.mcap, and other frames, in room (7-Scenes). Specify one of them, or move the "
+            "recordings to a separate folder.\n"
         )
     (mixed / "room").rename(tmp_path / "room")
     (mixed / "run.bag").write_bytes(b"")
     done = sceneprint("upload", "mixed", mixed, expect=2)
-    assert "The recording would have the same name, run, as run.bag." in done.stderr
+    assert "The recording would have the same name as run.bag, run." in done.stderr
 
 
 def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
@@ -255,12 +255,12 @@ def test_files_that_are_no_bags(sceneprint: Run, tmp_path: Path) -> None:
     done = sceneprint("bag", tmp_path / "a.mcap", expect=2)
     assert re.fullmatch(
         r"sceneprint bag: .*a\.mcap: The recording cannot be read \(File magic is invalid\.\)\. If "
-        r"the recorder was stopped before it closed the file, run `mcap recover`; else copy it "
+        r"the recorder was killed before it closed the file, run `mcap recover`; else copy it "
         r"again\.\n",
         done.stderr,
     )
     done = sceneprint("bag", tmp_path / "gone.mcap", expect=2)
-    assert "There is no such file or folder" in done.stderr
+    assert "The file or folder does not exist" in done.stderr
 
 
 def test_without_rosbags_the_extra_is_named(
@@ -270,7 +270,7 @@ def test_without_rosbags_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     done = sceneprint("upload", "bag", recording, expect=2)
     assert done.stderr == (
-        "sceneprint upload: Recordings of ROS are read with rosbags, which is not installed. Run: "
+        "sceneprint upload: ROS recordings require rosbags, which is not installed. Run: "
         "pip install 'sceneprint[ros]'\n"
     )
 

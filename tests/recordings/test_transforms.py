@@ -65,7 +65,7 @@ def test_a_clock_that_is_set_back_splits_a_recording(
     assert found[0].note == (
         "10 of 13 frames of /camera/depth/image_raw taken, poses of 10 of 13 frames in odom; 3 "
         "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); left out: 3 without "
-        "a pose; split into 3 parts, as stamps go back"
+        "a pose; split into 3 parts, because stamps go back"
     )
 
 
@@ -124,7 +124,7 @@ def test_two_publishers_that_contradict_each_other(
         "0 of 35 frames of /camera/depth/image_raw taken, poses of 0 of 35 frames; 35 without: "
         "samples of odom -> base_link contradict each other (two publishers, or 50 m/s)"
     ) in str(caught.value)
-    assert str(caught.value).endswith("choose another frame with --pose-frame.")
+    assert str(caught.value).endswith("select another frame with --pose-frame.")
 
 
 def test_frames_within_a_jump_are_left_out(tmp_path: Path, ros: SimpleNamespace) -> None:
@@ -158,7 +158,7 @@ def test_quaternions_that_are_not_of_length_1(
     (found,) = sequences(ros, tmp_path, fill)
     if length == 1.02:
         assert found.note.endswith(
-            "base_link -> camera is normalised, as its quaternion has the length 1.02"
+            "base_link -> camera is normalised: its quaternion has the length 1.02"
         )
         expected = ros.transform(2, 0, 0) @ ros.camera
         np.testing.assert_allclose(found.frames[2].pose, expected, atol=1e-9)
@@ -167,8 +167,8 @@ def test_quaternions_that_are_not_of_length_1(
         assert found.lost == 3
         assert [one.pose for one in found.frames] == [None] * 3
         assert found.note.endswith(
-            "poses of 0 of 3 frames; 3 without: no transforms lead from camera to a frame in which "
-            "it moves; base_link -> camera is passed over as its quaternion has the length "
+            "poses of 0 of 3 frames; 3 without: there are no transforms from camera to a frame in "
+            "which it moves; base_link -> camera is ignored because its quaternion has the length "
             f"{length:.3g}"
         )
 
@@ -187,8 +187,8 @@ def test_a_fixed_transform_with_two_values_is_passed_over(
     (found,) = sequences(ros, tmp_path, fill)
     assert [one.pose for one in found.frames] == [None] * 3
     assert found.note.endswith(
-        "base_link -> camera is passed over as it is fixed, and has values that differ by 0.3 m or "
-        "rad"
+        "base_link -> camera is ignored because it is static, but has values that differ by 0.3 m "
+        "or rad"
     )
 
 
@@ -223,7 +223,7 @@ def test_registered_clouds_are_taken_back_to_their_sensor(
         ros, tmp_path, lambda writer: registered(ros, writer, frame=frame, tf="yes")
     )
     assert found.parent_frame == f"run/{frame}"
-    assert found.note.endswith(f"; points are taken from {frame} to their sensor, lidar")
+    assert found.note.endswith(f"; points are transformed from {frame} to their sensor, lidar")
     for i, one in enumerate(found.frames):
         np.testing.assert_allclose(one.read().points, SEEN, atol=1e-5)
         T = ros.transform(3.0 * i, 0.5 * i, 1, 0, 0, np.sin(0.2 * i), np.cos(0.2 * i))
@@ -241,7 +241,7 @@ def test_registered_clouds_of_an_unknown_sensor_are_refused(
     two = ros.write(
         tmp_path / "two", lambda w: registered(ros, w, frame="map", tf="yes", leaf="camera")
     )
-    with pytest.raises(DatasetError, match="Choose one of camera, lidar with --sensor-frame"):
+    with pytest.raises(DatasetError, match="Select one of camera, lidar with --sensor-frame"):
         find_sequences(two, ALL)
     (found,) = find_sequences(two, RecordingOptions(keyframe_m=0, sensor_frame="lidar"))
     np.testing.assert_allclose(found.frames[2].read().points, SEEN, atol=1e-5)

@@ -222,7 +222,7 @@ def test_a_file_that_ends_early_is_refused(file: bytes, share: float) -> None:
         (b'recordCount="3000"', b'recordCount="9000"', "they end before point 9000"),
         (b'recordCount="3000"', b'recordCount="3e+3"', "missing or damaged"),
         (b'recordCount="3000"', b"recordCount='-300'", "at most 200000000"),
-        (b'fileOffset="48"', b'fileOffset="49"', "not where its header says"),
+        (b'fileOffset="48"', b'fileOffset="49"', "wrong offset of points"),
         (b"<cartesianX", b"<cartesianW", "damaged"),  # and its end tag stays
         (b"<formatName ", b"<!DOCTYPE a ", "declares entities"),
         (b"<data3D ", b"<data4D ", "damaged"),
@@ -240,7 +240,7 @@ def test_a_later_version_and_huge_pages_are_refused(file: bytes) -> None:
         everything(changed(file, 8, struct.pack("<I", 2)))
     with pytest.raises(UnreadableCloud, match="pages of 1125899906842624 bytes"):
         everything(changed(file, 40, struct.pack("<Q", 1 << 50)))
-    with pytest.raises(UnreadableCloud, match="no E57 file"):
+    with pytest.raises(UnreadableCloud, match="not an E57 file"):
         everything(b"ply\n" + file[4:])
 
 

@@ -33,7 +33,7 @@ def changed(data: bytes, at: int, form: str, value: float) -> bytes:
 @pytest.mark.parametrize(
     ("at", "form", "value", "message"),
     [
-        (107, "I", 13, "13 points of 30 bytes, and 360 of 390"),
+        (107, "I", 13, "13 points of 30 bytes, but 360 of 390"),
         (107, "I", 50_000_000, "announces 50000000 points"),
         (105, "H", 27, "records of 27 bytes"),
         (105, "H", 31, "360 of 372"),
@@ -41,7 +41,7 @@ def changed(data: bytes, at: int, form: str, value: float) -> bytes:
         (25, "B", 5, "version 1.5"),
         (96, "I", 2**32 - 1, "points from byte 4294967295"),
         (96, "I", 3, "points from byte 3"),
-        (94, "H", 9, "header has 9 bytes"),
+        (94, "H", 9, "a size of 9 bytes"),
         (131, "d", 0.0, "scale"),
         (139, "d", np.nan, "scale"),
         (155, "d", np.inf, "scale"),
@@ -112,20 +112,20 @@ def test_packed_lies(laz: Write, form: int) -> None:
     wide = "Q" if form > 5 else "I"
     length = struct.unpack_from("<H", whole, 105)[0]
     lies = [
-        (count, wide, 20_000_000, "more than 250 times as much"),
-        (count, wide, 50_001, "chunks of the LAZ file"),
-        (105, "H", length + 1, "does not fit"),
-        (vlr, "H", 1, "does not fit"),  # compressor
-        (vlr + 2, "H", 7, "does not fit"),  # coder
-        (vlr + 34, "H", 12, "does not fit"),  # first value
+        (count, wide, 20_000_000, "exceeds 250 times the size"),
+        (count, wide, 50_001, "chunk table of the LAZ file"),
+        (105, "H", length + 1, "contradictory or not supported"),
+        (vlr, "H", 1, "contradictory or not supported"),  # compressor
+        (vlr + 2, "H", 7, "contradictory or not supported"),  # coder
+        (vlr + 34, "H", 12, "contradictory or not supported"),  # first value
         (vlr + 12, "I", 0, "how its points are packed"),  # chunk size
         (vlr + 32, "H", 65_535, "how its points are packed"),  # values
         (100, "I", 0, "how its points are packed"),  # records before the points
-        (start, "q", 2**62, "chunks of the LAZ file"),
-        (table + 4, "I", 2**31, "chunks of the LAZ file"),
+        (start, "q", 2**62, "chunk table of the LAZ file"),
+        (table + 4, "I", 2**31, "chunk table of the LAZ file"),
     ]
     if form == 7:  # layers of the first chunk, behind its first point and its count
-        lies += [(start + 8 + length + 4, "I", 2**32 - 1, "chunks of the LAZ file")]
+        lies += [(start + 8 + length + 4, "I", 2**32 - 1, "chunk table of the LAZ file")]
     for at, kind, value, message in lies:
         with pytest.raises(UnreadableCloud, match=message):
             decode_cloud(changed(data, at, kind, value))

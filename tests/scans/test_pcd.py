@@ -47,12 +47,12 @@ def test_headers_of_other_writers(pcd: Write, points: np.ndarray) -> None:
 
 
 LIES = {
-    "no z": (b"FIELDS normal x y z", b"FIELDS normal x y w", "no single z"),
-    "z of three": (b"COUNT 3 1 1 1 1", b"COUNT 1 1 1 3 1", "no single z"),
+    "no z": (b"FIELDS normal x y z", b"FIELDS normal x y w", "exactly one field z"),
+    "z of three": (b"COUNT 3 1 1 1 1", b"COUNT 1 1 1 3 1", "exactly one field z"),
     "a field too few": (b"SIZE 4 4 4 8 2", b"SIZE 4 4 4 8", "5 FIELDS, 4 SIZE"),
     "half floats": (b"SIZE 4 4 4 8 2", b"SIZE 4 2 4 8 2", "TYPE 'F' and SIZE '2'"),
-    "endless values": (b"COUNT 3 1", b"COUNT 99999999999 1", "99999999999 of TYPE"),
-    "other counts": (b"POINTS 12", b"POINTS 13", "says 13 and 12"),
+    "endless values": (b"COUNT 3 1", b"COUNT 99999999999 1", "COUNT 99999999999"),
+    "other counts": (b"POINTS 12", b"POINTS 13", "states 13 and 12"),
     "fifty million": (b"12\nHEIGHT 1\n", b"50000000\n", "50000000"),
     "more than there are": (
         b"12\nHEIGHT 1\nV",
@@ -63,7 +63,7 @@ LIES = {
     "a negative count": (b"WIDTH 12", b"WIDTH -12", "WIDTH '-12'"),
     "an unknown form": (b"DATA binary", b"DATA zipped", "DATA 'zipped'"),
     "twice": (b"HEIGHT 1", b"WIDTH 12", "line 'WIDTH 12'"),
-    "no data": (b"DATA binary", b"# nothing", "no line DATA|has a line"),
+    "no data": (b"DATA binary", b"# nothing", "no DATA line|has the invalid line"),
 }
 
 
@@ -119,16 +119,22 @@ def compressed(count: int, inflated: int, packed: bytes) -> bytes:
 def test_bombs() -> None:
     zeros = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * 1000  # 1 + 264,000 bytes of 3,002
     assert inflate(np.frombuffer(zeros, np.uint8), 264_001).sum() == 0
-    with pytest.raises(UnreadableCloud, match=r"announces 240000000 bytes packed into 3002"):
+    with pytest.raises(UnreadableCloud, match=r"announces 240000000 bytes compressed to 3002"):
         decode_cloud(compressed(20_000_000, 240_000_000, zeros))
-    with pytest.raises(UnreadableCloud, match=r"240000000 bytes of points, and 264001 packed"):
+    with pytest.raises(
+        UnreadableCloud, match=r"240000000 bytes of points, but the body states 264001"
+    ):
         decode_cloud(compressed(20_000_000, 264_001, zeros))
-    with pytest.raises(UnreadableCloud, match="do not become 120 bytes"):  # and no more than these
+    with pytest.raises(
+        UnreadableCloud, match="do not expand to 120 bytes"
+    ):  # and no more than these
         decode_cloud(compressed(10, 120, zeros))
-    with pytest.raises(UnreadableCloud, match="do not become 132000 bytes"):
+    with pytest.raises(UnreadableCloud, match="do not expand to 132000 bytes"):
         decode_cloud(compressed(11_000, 132_000, zeros[:1502] + b"\0"))
     wide = compressed(20_000_000, 2**32 - 1, zeros).replace(b"SIZE 4 4 4", b"SIZE 8 8 8")
-    with pytest.raises(UnreadableCloud, match="480000000 bytes of points, and 4294967295"):
+    with pytest.raises(
+        UnreadableCloud, match="480000000 bytes of points, but the body states 4294967295"
+    ):
         decode_cloud(wide)
 
 

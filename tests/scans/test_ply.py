@@ -89,25 +89,29 @@ def described(lines: str, body: bytes = b"\0" * 120) -> bytes:
 
 LIES = {
     "no vertices": (described("element face 0\nproperty float x\n"), "0 elements called vertex"),
-    "no z": (described("element vertex 10\nproperty float x\nproperty float y\n"), "no single z"),
-    "two x": (described(f"element vertex 10\n{XYZ}property float x\n"), "no single x"),
+    "no z": (
+        described("element vertex 10\nproperty float x\nproperty float y\n"),
+        "exactly one property z",
+    ),
+    "two x": (described(f"element vertex 10\n{XYZ}property float x\n"), "exactly one property x"),
     "a list of z": (
         described("element vertex 10\nproperty float x\nproperty float y\n"
                   "property list uchar float z\n"),
-        "no single",
+        "exactly one property",
     ),
     "fifty million": (described(f"element vertex 50000000\n{XYZ}"), "announces 50000000 points"),
-    "more than there are": (described(f"element vertex 11\n{XYZ}"), "at least 132 bytes, and 120"),
+    "more than there are": (described(f"element vertex 11\n{XYZ}"), "at least 132 bytes, but 120"),
     "fewer than there are": (described(f"element vertex 9\n{XYZ}"), "12 bytes follow"),
     "doubles for floats": (
-        described(f"element vertex 10\n{XYZ.replace('float', 'double')}"), "240 bytes, and 120",
+        described(f"element vertex 10\n{XYZ.replace('float', 'double')}"), "240 bytes, but 120",
     ),
     "more before": (
         described(f"element camera 999999999999\nproperty int a\nelement vertex 10\n{XYZ}"),
         "999999999999 rows of camera",
     ),
     "nothing, often": (
-        described(f"element camera 999999999999999\nelement vertex 10\n{XYZ}"), "nothing in them",
+        described(f"element camera 999999999999999\nelement vertex 10\n{XYZ}"),
+        "without properties",
     ),
     "a list of billions": (
         described(f"element vertex 10\n{XYZ}element face 1\nproperty list uint int a\n",
@@ -126,7 +130,10 @@ LIES = {
     "a count of words": (described(f"element vertex ten\n{XYZ}"), "count 'ten'"),
     "a negative count": (described(f"element vertex -10\n{XYZ}"), "count '-10'"),
     "an unknown line": (described(f"vertices 10\n{XYZ}"), "line 'vertices 10'"),
-    "no format": (b"ply\nelement vertex 10\n" + XYZ.encode() + b"end_header\n", "which format"),
+    "no format": (
+        b"ply\nelement vertex 10\n" + XYZ.encode() + b"end_header\n",
+        "not state the format",
+    ),
     "no end": (BINARY.encode() + b"comment " * 20_000, "no end_header"),
     "many properties": (
         described("element vertex 10\n" + "property int a\n" * 1001), "more than 1000 properties",
@@ -148,10 +155,10 @@ def test_lies(case: str) -> None:
         ("1.00 2.00 3.00\n" * 9, "Row 10 of 10.*file ends before"),
         ("1.0 2.0 3.0\n" * 9 + "1.0 2.0\n", "Row 10 of 10.*fewer values"),
         ("1.0 2.0 3.0 4.0\n" * 10, "Row 1 of 10.*more values"),
-        ("1.0 2.0 3.0\n" * 4 + "1.0 x 3.0\n" * 6, "Row 5 of 10.*no number"),
-        ("1.0 2.0 3.0\n" * 4 + "1.0 2e 3.0\n" * 6, "Row 5 of 10.*no number"),
-        ("1.0 2.0 3.0\n" * 4 + "1.0 0x2 3.0\n" * 6, "Row 5 of 10.*no number"),
-        ("1.0 2.0 3.0\n" * 4 + "1.0 2.0 3.0\0\n" * 6, "Row 5 of 10.*no number"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 x 3.0\n" * 6, "Row 5 of 10.*not a number"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 2e 3.0\n" * 6, "Row 5 of 10.*not a number"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 0x2 3.0\n" * 6, "Row 5 of 10.*not a number"),
+        ("1.0 2.0 3.0\n" * 4 + "1.0 2.0 3.0\0\n" * 6, "Row 5 of 10.*not a number"),
     ],
 )
 def test_rows_that_are_none(rows: str, message: str) -> None:

@@ -105,7 +105,7 @@ def test_other_files_are_no_clouds(serialize: Any, points: np.ndarray) -> None:
         assert format_of(other) is None
     kitti = np.hstack([points, np.ones((len(points), 1))]).astype("<f4").tobytes()
     assert format_of(kitti) is None
-    with pytest.raises(UnreadableCloud, match="This is no KITTI scan"):
+    with pytest.raises(UnreadableCloud, match="This is not a KITTI scan"):
         decode_scan(data, file_format="kitti")
 
 

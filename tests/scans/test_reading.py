@@ -54,7 +54,7 @@ def test_ten_kilometres(npy: Write, points: np.ndarray) -> None:
     points[3] = (0.0, -10_000.0, 10_000.0)
     np.testing.assert_array_equal(decode_cloud(npy(points)).points, points)
     points[3, 1] = -10_000.1
-    with pytest.raises(UnreadableCloud, match="at most 10000 m"):
+    with pytest.raises(UnreadableCloud, match="the limit is 10000 m"):
         decode_cloud(npy(points))
 
 
@@ -68,7 +68,7 @@ def test_missing_points(pcd: Write, npy: Write, points: np.ndarray) -> None:
     with pytest.raises(UnreadableCloud, match=r"1e\+300 m from"):
         decode_cloud(npy(points))
     points[:3] = np.nan
-    with pytest.raises(UselessFrame, match="4 of 12 points are missing, and the 8 left"):
+    with pytest.raises(UselessFrame, match="4 of 12 points are missing, and the 8 valid"):
         decode_cloud(npy(points))
     with pytest.raises(UselessFrame, match="12 of 12 points are missing"):
         decode_cloud(npy(np.full((12, 3), np.nan)))
@@ -94,7 +94,7 @@ def test_pose(npy: Write) -> None:
 
 
 def test_errors_begin_with_the_name(npy: Write) -> None:
-    with pytest.raises(UnreadableCloud, match=r"^scan-7: This is none of"):
+    with pytest.raises(UnreadableCloud, match=r"^scan-7: According to its first bytes"):
         decode_cloud(b"?", name="scan-7")
 
 
@@ -132,5 +132,5 @@ def test_nothing_of_more_than_five_million_is_left(monkeypatch: pytest.MonkeyPat
     rows = np.full((100, 4), 2.0, "<f4")
     assert len(decode_scan(rows.tobytes(), file_format="kitti").cloud.points) == 100
     monkeypatch.setattr(reading, "MOST_POINTS", 99)
-    with pytest.raises(UselessFrame, match="100 points lie in 1 places"):
+    with pytest.raises(UselessFrame, match="100 points occupy 1 voxels"):
         decode_scan(rows.tobytes(), file_format="kitti")

@@ -111,7 +111,7 @@ def add_block(
         except errors.StoreError:
             raise
         except errors.SceneprintError as error:
-            outcomes.append(UploadOutcome(None, error=type(error)(archive.told(error))))
+            outcomes.append(UploadOutcome(None, error=type(error)(archive.message_of(error))))
         except MemoryError:
             outcomes.append(_too_large())
     rest = iter(_added(uploads, task.of_map.name, uploaded, fence))

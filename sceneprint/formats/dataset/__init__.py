@@ -1,4 +1,4 @@
-"""Frames in and out: depth images, cameras, clouds, poses, and the sequences they come in.
+"""Readers and writers of datasets: sequences of depth images or clouds with cameras and poses.
 
 path  --find_sequences-->  FrameSequence  --FrameReference.read-->  Frame
 bytes  --decode_frame-->  Frame

@@ -1,4 +1,4 @@
-"""What a sequence of frames is, before any of its frames is read, and its metadata in uploads."""
+"""References to the frames of a sequence, which read a frame on demand, and their metadata."""
 
 from __future__ import annotations
 
@@ -20,30 +20,32 @@ from sceneprint_client.frame_files import FrameFile, is_kitti
 from sceneprint_client.poses import SensorTrajectory
 from sceneprint_client.sidecars import CloudSource
 
-_TOLERANCE = 1e-2  #: how far a written quaternion may be from a true one
-_MAXIMUM_TRAJECTORY_BYTES = 2**26  # an hour at 200 Hz
+_TOLERANCE = 1e-2  #: maximum difference of the length of a quaternion from 1
+_MAXIMUM_TRAJECTORY_BYTES = 2**26  #: size of an hour of poses at 200 Hz
 
 
 def read_trajectory(path: Path) -> SensorTrajectory:
-    """Return the poses of a TUM text file, lines `t tx ty tz qx qy qz qw`, # comments.
+    """Return the poses of a TUM text file, with lines `t tx ty tz qx qy qz qw` and # comments.
 
-    Lines are put in order of time; of equal stamps the first stays.
+    The poses are sorted by time. If several lines have the same time stamp, the first one counts.
 
     Raises
     ------
-    InvalidPose : the file cannot be read, has no pose, or a line is not 8 finite numbers
-        with a quaternion of unit length to 1e-2; names file and line.
+    InvalidPose : If the file cannot be read or has no pose, or a line does not consist of 8 finite
+        numbers with a quaternion of unit length. The message names file and line.
     """
     numbers, rows = [], []
     for number, line in data_lines(read_text(path, _MAXIMUM_TRAJECTORY_BYTES, InvalidPose)):
         words = line.replace(",", " ").split()
         with naming(f"{path}, line {number}"):
             if len(words) != 8:
-                raise InvalidPose(f"The line has {len(words)} words. Write t tx ty tz qx qy qz qw.")
+                raise InvalidPose(
+                    f"The line has {len(words)} words, not 8. Write t tx ty tz qx qy qz qw."
+                )
             rows.append(_numbers(words))
         numbers.append(number)
     if not rows:
-        raise InvalidPose(f"{path}: The file holds no pose. Remove it, or write some.")
+        raise InvalidPose(f"{path}: The file has no pose. Remove the file, or add poses.")
     table = np.array(rows)
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0)
@@ -51,7 +53,8 @@ def read_trajectory(path: Path) -> SensorTrajectory:
     if bad.any():
         raise InvalidPose(
             f"{path}, line {numbers[int(np.argmax(bad))]}: The pose is not finite, or its "
-            "quaternion not of unit length. Write t tx ty tz qx qy qz qw, or leave the line out."
+            "quaternion does not have unit length. Write t tx ty tz qx qy qz qw, or remove the "
+            "line."
         )
     stamps, first = np.unique(table[:, 0], return_index=True)
     quaternions = table[first, 4:]
@@ -63,25 +66,25 @@ def _numbers(words: list[str]) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as cause:
-        raise InvalidPose(f"A word is no number ({cause}). Write numbers only.") from cause
+        raise InvalidPose(f"A word is not a number ({cause}). Write only numbers.") from cause
 
 
 def read_cloud(
     path: Path, source: CloudSource, *, name: str = "", pose: Floats | None = None
 ) -> Scan:
-    """Return the points of a file, and how they were read.
+    """Return the cloud of a file with the parameters used to read it.
 
     Raises
     ------
-    UnreadableCloud : the file is absent or too large; and as `decode_scan`. Each error names the
-        file.
+    UnreadableCloud : If the file is missing or too large, or `decode_scan` raises the error. The
+        message names the file.
     """
     data = read_bytes(path, MAXIMUM_CLOUD_BYTES, UnreadableCloud)
-    told = source.file_format or ("kitti" if is_kitti(path) else None)
+    file_format = source.file_format or ("kitti" if is_kitti(path) else None)
     with naming(str(path)):
         scan = decode_scan(
             data,
-            file_format=told,
+            file_format=file_format,
             viewpoint=source.viewpoint,
             units_per_metre=source.units_per_metre,
             pose=pose,
@@ -93,32 +96,32 @@ Split = Literal["train", "test"]
 
 
 class Layout(Enum):
-    """How the files of a sequence are named."""
+    """Layout of the files of a sequence."""
 
-    #: `frame-%06d.depth.png`, each with `frame-%06d.pose.txt` where its pose is known.
+    #: Files `frame-%06d.depth.png`, each with a file `frame-%06d.pose.txt` if its pose is known.
     SEVEN_SCENES = "7-Scenes"
-    #: `depth.txt` lists time stamps and files, `groundtruth.txt` poses at other stamps.
+    #: File `depth.txt` with time stamps and files, and `groundtruth.txt` with poses.
     TUM = "TUM RGB-D"
-    #: Depth files of any name, PNG or NPY, in natural order; poses as `find_pose_file` finds them.
+    #: Depth images with arbitrary names in natural order, and poses that `find_pose_file` finds.
     PLAIN = "plain"
-    #: Files of points (any format of clouds) of any name; poses likewise.
+    #: Point clouds with arbitrary names in natural order, and poses that `find_pose_file` finds.
     CLOUDS = "clouds"
-    #: Messages of a recording of ROS; poses of its transforms.
+    #: Messages of a ROS recording, and poses from its transforms.
     RECORDING = "recording"
-    #: A database of RTAB-Map: nodes with depth or laser scans, and their poses.
+    #: Database of RTAB-Map: nodes with depth images or laser scans, and their poses.
     RTABMAP = "RTAB-Map"
-    #: A folder of Polycam: `keyframes` with depth, and cameras with poses.
+    #: Folder of Polycam: `keyframes` with depth images, and cameras with poses.
     POLYCAM = "Polycam"
-    #: A folder or .r3d file of Record3D: metadata with poses, depth.
+    #: Folder or .r3d file of Record3D: metadata with poses, and depth images.
     RECORD3D = "Record3D"
-    #: A `transforms.json` of nerfstudio that names depth images.
+    #: File `transforms.json` of nerfstudio that names depth images.
     NERFSTUDIO = "nerfstudio"
-    #: An E57 file: scans with the poses of their scanner.
+    #: E57 file: scans with the poses of their scanner.
     E57 = "E57"
 
     @property
     def is_export(self) -> bool:
-        """Whether another system has written it, so that nothing around it names its frames."""
+        """Whether another system wrote the sequence; parent folders then say nothing about it."""
         return self in _EXPORTS
 
 
@@ -131,10 +134,10 @@ _EXPORTS = frozenset(
 
 
 class FrameReference(FrameFile):
-    """One frame of a sequence, not yet read; `find_sequences` gives each a name of its own."""
+    """Frame of a sequence that is read on demand; `find_sequences` assigns unique names."""
 
     def read(self) -> AnyFrame:
-        """Return the frame; raises as `read_frame`, `read_cloud` and `pose`."""
+        """Read the frame; raise the errors of `read_frame`, `read_cloud` and `pose`."""
         if self.cloud is None:
             return self.read_depth()
         if self.source is None and self.row is None:
@@ -150,16 +153,16 @@ class FrameReference(FrameFile):
         return replace(scan.cloud, name=self.name)
 
     def read_depth(self) -> DepthFrame:
-        """Return the frame, where only a depth image will do; raises as `read_frame` and `pose`.
+        """Read a depth image; raise the errors of `read_frame` and `pose`.
 
         Raises
         ------
-        DatasetError : it is a cloud.
+        DatasetError : If the frame is a cloud.
         """
         if self.camera is None:
             raise DatasetError(
-                f"{self.path}: This is a cloud, and a depth image is needed here. Name a folder or "
-                "file of depth images."
+                f"{self.path}: This is a cloud, not a depth image. Specify a folder or file of "
+                "depth images."
             )
         camera = self.camera
         data = self.read_bytes()
@@ -180,16 +183,17 @@ class FrameSequence:
 
     Parameters
     ----------
-    name : unique in what `find_sequences` returned
-    folder : where its files are
-    layout : how they are named
-    parent_frame : name of the frame its poses lead to. Sequences with the same name share
-        it, and their poses can be compared; others cannot
-    split : what the scene's authors use it for, or None where they do not say
-    frames : at least one
-    note : what was left out on the way, for people; empty where nothing was
-    unposed : why frames have no pose, for people; empty where all have one, and where `note` tells
-    lost : frames with depth or points that are left out, or whose poses are, though nobody said so
+    name : name that is unique among the sequences of `find_sequences`
+    folder : folder or file of the sequence
+    layout : layout of the files
+    parent_frame : name of the parent frame of the poses; only poses with the same parent frame can
+        be compared
+    split : use of the sequence according to the authors of the scene, or None
+    frames : at least one frame
+    note : description of the omitted data for users; empty if all data is used
+    unposed : reason for users why frames have no pose; empty if all have one or `note` says it
+    lost : number of frames that are omitted, or used without their pose, against the user's
+        expectation
     """
 
     name: str
@@ -204,14 +208,14 @@ class FrameSequence:
 
     @property
     def place(self) -> Path:
-        """Where its parent frame is named: the folder of the scene, or its own."""
+        """Folder whose name is the parent frame: the folder of the scene or of the sequence."""
         if self.layout.is_export or self.parent_frame == self.name:
             return self.folder
         return self.folder.parent
 
 
-#: Reasons to leave out what holds neither depth nor points of a place: nothing is lost by it.
-NOTHING_TO_TAKE = frozenset(
+#: Reasons for omissions that lose nothing, because the frames have neither depth nor points.
+EMPTY_FRAMES = frozenset(
     {
         "frames without a depth_file_path", "cameras without a depth image", "frames without depth",
         "scans without points", "stereo images without depth", "laser scans of two dimensions",
@@ -220,22 +224,27 @@ NOTHING_TO_TAKE = frozenset(
 
 
 def count_lost(left_out: Counter[str]) -> int:
-    """Return how many of the frames that were left out, by the reason, had something to take."""
-    return left_out.total() - sum(left_out[reason] for reason in NOTHING_TO_TAKE)
+    """Return the number of omitted frames with depth or points.
+
+    Parameters
+    ----------
+    left_out : numbers of omitted frames by reason
+    """
+    return left_out.total() - sum(left_out[reason] for reason in EMPTY_FRAMES)
 
 
-# What a sequence is called, as it is sent with the uploads of its frames.
+# Names and numbers of frames in uploads.
 
 
 def session_of(sequence: FrameSequence) -> str:
-    """Name of a sequence, the same whether its own folder was named or the scene's."""
+    """Return the session of a sequence, the same for a path to the sequence and to its scene."""
     if sequence.layout.is_export or sequence.parent_frame == sequence.name:
         return sequence.name
     return f"{sequence.parent_frame}/{sequence.folder.name}"
 
 
 def parent_frame_of(sequence: FrameSequence, robot: str | None) -> str:
-    """What poses lead to: folders of two robots may share a name, and their poses no frame."""
+    """Return the parent frame of the poses; the prefix keeps frames of different robots apart."""
     own = sequence.parent_frame
     return own if robot is None else f"{robot}/{own}"
 
@@ -243,25 +252,25 @@ def parent_frame_of(sequence: FrameSequence, robot: str | None) -> str:
 def numbered_sequences(
     sequences: Iterable[FrameSequence], session: str | None
 ) -> list[FrameSequence]:
-    """Sequences with the places of their frames within the sessions that they are sent to.
+    """Return sequences whose frames have unique numbers within their session.
 
-    Several sequences of one session are numbered one after the other, so that their frames do not
-    mix; frames of one folder that were named one by one keep the folder's numbers, or are numbered
-    as they were named.
+    If several sequences form one session, each continues the numbers of the previous one. Frames
+    of one folder that the user lists one by one keep the numbers of the folder, or else get numbers
+    in the order of the list.
 
     Parameters
     ----------
-    sequences : in the order in which they follow each other
-    session : of all of them; None: each has its own
+    sequences : sequences in chronological order
+    session : session of all sequences; None assigns a session to each sequence
     """
-    told, found = list(sequences), []
-    names = [session or session_of(one) for one in told]
+    unnumbered, numbered = list(sequences), []
+    names = [session or session_of(one) for one in unnumbered]
     alone = {name for name in names if names.count(name) == 1}
     first: dict[tuple[str, Path], int] = {}
-    free: dict[str, int] = {}  # the next number of each session
-    for name, one in zip(names, told, strict=True):
+    free: dict[str, int] = {}  # next unused number of each session
+    for name, one in zip(names, unnumbered, strict=True):
         if name in alone:
-            found.append(one)
+            numbered.append(one)
             continue
         offset = first.setdefault((name, one.folder), free.get(name, 0))
         frames = []
@@ -271,5 +280,5 @@ def numbered_sequences(
                 place = offset + frame.sequence
             frames.append(replace(frame, sequence=place))
             free[name] = max(free.get(name, 0), place + 1)
-        found.append(replace(one, frames=tuple(frames)))
-    return found
+        numbered.append(replace(one, frames=tuple(frames)))
+    return numbered

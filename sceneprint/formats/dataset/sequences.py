@@ -1,4 +1,4 @@
-"""From a path to the sequences below it, and sequences out: each of their files whole or absent.
+"""Find the sequences below a path, and write sequences whose files are complete or absent.
 
 path  --find_sequences-->  Sequence, ...
 Camera, depth (H, W), T_parent_sensor (4, 4)  -->  intrinsics.json, *.png, *.txt
@@ -22,7 +22,7 @@ import numpy as np
 from sceneprint.atomic_files import write_whole
 from sceneprint.errors import DatasetError, SceneprintError
 from sceneprint.formats.dataset.frame_names import (
-    WHAT_IS_LEFT_OUT,
+    OMITTED_IMAGES,
     is_beside_depth,
     is_depth,
     is_image,
@@ -67,13 +67,13 @@ _MAXIMUM_LIST_BYTES = 2**26
 
 
 def list_folder(folder: Path) -> tuple[list[str], list[str]]:
-    """Return the names of the files and of the folders in it, hidden ones left out.
+    """Return the names of the files and of the folders in a folder, except hidden ones.
 
-    Both are in natural order: frame 9 before frame 10.
+    Both lists are in natural order: frame 9 precedes frame 10.
 
     Raises
     ------
-    DatasetError : it may not be read.
+    DatasetError : If the folder cannot be read.
     """
     files: list[str] = []
     folders: list[str] = []
@@ -84,15 +84,15 @@ def list_folder(folder: Path) -> tuple[list[str], list[str]]:
                     (folders if _is_folder(entry) else files).append(entry.name)
     except OSError as cause:
         raise DatasetError(
-            f"{folder}: The folder cannot be read ({cause.strerror}). Check your rights."
+            f"{folder}: The folder cannot be read ({cause.strerror}). Check its permissions."
         ) from cause
     return sorted(files, key=natural), sorted(folders, key=natural)
 
 
 def natural(name: str) -> tuple[list[tuple[int, str]], str]:
-    """Sort key that takes digits as numbers; the name itself decides between 1 and 01."""
+    """Return a sort key that compares digits as numbers; equal numbers are compared as text."""
     parts = re.split(r"(\d+)", name, flags=re.ASCII)
-    # digits count by their length and then as text: no number is too long for that
+    # digits are compared by length and then as text, because a number may be arbitrarily long
     key = [
         (len(part.lstrip("0")), part.lstrip("0")) if i % 2 else (0, part)
         for i, part in enumerate(parts)
@@ -101,9 +101,9 @@ def natural(name: str) -> tuple[list[tuple[int, str]], str]:
 
 
 def layout_of(files: list[str]) -> Layout | None:
-    """Return the layout that these file names show, or None if they hold neither depth nor points.
+    """Return the layout of a folder with these files; None if none has depth or points.
 
-    Of depth images and points in one folder it is the images, unless clouds.json is there too.
+    If a folder has depth images and point clouds, the images count unless there is a clouds.json.
     """
     if any(SEVEN_SCENES.fullmatch(file) for file in files):
         return Layout.SEVEN_SCENES
@@ -119,22 +119,22 @@ def layout_of(files: list[str]) -> Layout | None:
 def references(
     folder: Path, files: list[str], layout: Layout, name: str, camera: Camera | None = None
 ) -> tuple[tuple[FrameReference, ...], str]:
-    """Return the frames of a folder, and why some have no pose.
+    """Return the frames of a folder, and the reason why some have no pose.
 
     Parameters
     ----------
-    folder : with `intrinsics.json` in it or above it, if it holds depth images
-    files : names of the files to take, in order, as `list_folder` gives them
-    layout : of the folder
-    name : of the sequence; frames are named after it
-    camera : of a 7-Scenes sequence without an intrinsics.json; None where it needs one
+    folder : folder; for depth images, it or a parent has an `intrinsics.json`
+    files : names of the files in the order of `list_folder`
+    layout : layout of the folder
+    name : name of the sequence, which prefixes the names of the frames
+    camera : camera of a 7-Scenes sequence without an intrinsics.json
 
     Raises
     ------
-    DatasetError : there is no intrinsics.json, depth.txt is damaged, or two frames would
-        have one name; or clouds.json says what it cannot.
-    InvalidIntrinsics : intrinsics.json describes no camera.
-    InvalidPose : groundtruth.txt holds a line that is no pose.
+    DatasetError : If intrinsics.json is missing, depth.txt or clouds.json is invalid, or two frames
+        would have the same name.
+    InvalidIntrinsics : If intrinsics.json does not describe a camera.
+    InvalidPose : If a line of groundtruth.txt is not a pose.
     """
     unposed = NO_POSE_FILE
     if layout is Layout.SEVEN_SCENES:
@@ -149,8 +149,8 @@ def references(
     for frame in frames:
         if frame.name in first:
             raise DatasetError(
-                f"{frame.path}: The frame would have the same name, {frame.name}, as "
-                f"{first[frame.name].name}. Rename or remove one of them."
+                f"{frame.path}: The frame would have the same name as {first[frame.name].name}, "
+                f"{frame.name}. Rename or remove one of them."
             )
         first[frame.name] = frame.path
     if all(frame.pose_source is not None for frame in frames):
@@ -159,9 +159,7 @@ def references(
 
 
 def _numbered(folder: Path, frame: FrameReference, place: int) -> FrameReference:
-    """A frame with its name within the folder and its number: its own where files are numbered, so
-    that a part of a folder has the numbers of the whole, else its place.
-    """
+    """Return a frame with its path in the folder and the number in its file name, or `place`."""
     number = seven_scenes_number(frame.path.name)
     return replace(
         frame,
@@ -199,10 +197,10 @@ def _plain(folder: Path, files: list[str], name: str) -> tuple[FrameReference, .
 
 def _clouds(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
     source = find_cloud_source(folder)
-    # beside clouds.json a .npy is of points
-    wanted = _may_be_cloud if CLOUDS_FILE in files else is_cloud
+    # a clouds.json says that the .npy files beside it are points
+    is_wanted = _may_be_cloud if CLOUDS_FILE in files else is_cloud
     frames = []
-    for file in filter(wanted, files):
+    for file in filter(is_wanted, files):
         stem = Path(file).stem
         pose = find_pose_file(folder, stem)
         frames.append(
@@ -216,13 +214,13 @@ def _tum(folder: Path, files: list[str], name: str) -> tuple[tuple[FrameReferenc
     listed = sorted(_depth_list(folder / _DEPTH_LIST))
     stamps = [stamp for stamp, _ in listed]
     poses: list[Floats | None] = [None] * len(stamps)
-    unposed = f"there is no {_TRAJECTORY}"
+    unposed = f"the folder has no {_TRAJECTORY}"
     if _TRAJECTORY in files:
         trajectory = read_trajectory(folder / _TRAJECTORY)
         poses = interpolate(trajectory, stamps, tolerance=TOLERANCE_S)
         alone = [stamp for stamp, pose in zip(stamps, poses, strict=True) if pose is None]
         unposed = (
-            f"{_TRAJECTORY} has no pose within {1000 * TOLERANCE_S:.0f} ms of them "
+            f"{_TRAJECTORY} has no pose within {1000 * TOLERANCE_S:.0f} ms of their time stamps "
             f"(nearest: {_least_distance(trajectory, alone):.3g} s away)"
         )
     return tuple(
@@ -232,14 +230,14 @@ def _tum(folder: Path, files: list[str], name: str) -> tuple[tuple[FrameReferenc
 
 
 def _least_distance(trajectory: SensorTrajectory, stamps: list[float]) -> float:
-    """Return the smallest time between one of the stamps and a pose, seconds."""
+    """Return the smallest time between a stamp and a pose, seconds."""
     after = np.searchsorted(trajectory.stamps, stamps)
     around = np.clip([after - 1, after], 0, len(trajectory.stamps) - 1)
     return float(np.abs(trajectory.stamps[around] - stamps).min(initial=math.inf))
 
 
 def _depth_list(path: Path) -> list[tuple[float, str]]:
-    """Return time stamp and file of each line of depth.txt."""
+    """Return the time stamp and the file of each line of depth.txt."""
     listed = []
     for number, line in data_lines(read_text(path, _MAXIMUM_LIST_BYTES, DatasetError)):
         place, words = f"{path}, line {number}", line.split(maxsplit=1)
@@ -247,29 +245,30 @@ def _depth_list(path: Path) -> list[tuple[float, str]]:
             stamp, file = float(words[0]), words[1]
         except (ValueError, IndexError) as cause:
             raise DatasetError(
-                f"{place}: The line is no time stamp and file. Write them, a space between."
+                f"{place}: The line is not a time stamp and a file. Write both, separated by a "
+                "space."
             ) from cause
         if not math.isfinite(stamp):
             raise DatasetError(f"{place}: The time stamp is not finite. Write it in seconds.")
-        # a list from elsewhere must not make us read any file of this machine
+        # an untrusted list must not select arbitrary files of this machine
         if PurePosixPath(file).is_absolute() or ".." in re.split(r"[/\\]", file):
             raise DatasetError(
-                f"{place}: The file lies outside the folder. List files below {path.parent}."
+                f"{place}: The file is outside the folder. List files below {path.parent}."
             )
         if not (path.parent / file).is_file():
             raise DatasetError(
-                f"{place}: There is no file {file}. Unpack it, or take the line out."
+                f"{place}: The file {file} does not exist. Unpack it, or remove the line."
             )
         listed.append((stamp, file))
     if not listed:
-        raise DatasetError(f"{path}: The list is empty. List the depth images in it.")
+        raise DatasetError(f"{path}: The list is empty. Add the depth images to it.")
     return listed
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
     try:
         return entry.is_dir()
-    except OSError:  # a symlink to itself
+    except OSError:  # a cycle of symlinks
         return False
 
 
@@ -277,10 +276,10 @@ def _may_be_cloud(file: str) -> bool:
     return format_named(file, "cloud") is not None
 
 
-_DEPTH = 4  #: folders below the one given that are looked into
-_MAXIMUM_FOLDERS = 10_000  #: that are looked into; more is no data set but a disk
+_DEPTH = 4  #: maximum depth of the search below the path of the user
+_MAXIMUM_FOLDERS = 10_000  #: maximum number of searched folders; a larger tree is not a data set
 _MAXIMUM_SPLIT_BYTES = 65_536
-_MOST_NAMES = 5  #: of what was left out, in a note
+_MOST_NAMES = 5  #: maximum number of omitted files in a note
 _SEQUENCE_FOLDER = re.compile(r"seq-?(\d+)", re.IGNORECASE | re.ASCII)
 _SPLIT_LINE = re.compile(r"(?:sequence|seq)[\s_-]*(\d{1,9})", re.IGNORECASE | re.ASCII)
 _SPLIT_FILES: tuple[tuple[str, Split], ...] = (
@@ -292,87 +291,88 @@ _SPLIT_FILES: tuple[tuple[str, Split], ...] = (
 def find_sequences(
     path: Path | str, recording: RecordingOptions | None = None, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences at a path or up to 4 folders below it; no frame is read.
+    """Return the sequences at a path or up to 4 folders below it, without reading a frame.
 
-    Understood are a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt), a TUM
-    RGB-D folder, a folder of depth images, a folder of point clouds (NPY beside a clouds.json), one
-    depth image or cloud, and folders of these. Files and folders whose names say colour, infrared,
-    confidence or labels are left out, and a note names them. Clouds in a folder seq-01 that such a
-    split file names are a sequence of a 7-Scenes scene as well. A sequence is named by its place
-    below the path, or by its own folder where that is the path. A recording of ROS is one sequence,
-    named after it, or one for each part between which its stamps go back; so is each of a folder of
-    recordings. Files and folders of other systems (RTAB-Map, E57, Polycam, Record3D, nerfstudio)
-    are sequences too.
+    Supported are:
+
+    * a 7-Scenes sequence or scene (with TrainSplit.txt, TestSplit.txt) of depth images or clouds,
+    * a TUM RGB-D folder,
+    * a folder of depth images or point clouds (NPY files of points need a clouds.json),
+    * a single depth image or cloud,
+    * ROS recordings, each of which is one sequence, or several if its stamps go back,
+    * files and folders of RTAB-Map, E57, Polycam, Record3D and nerfstudio,
+    * folders of these.
+
+    Files and folders whose names indicate colour, infrared, confidence or labels are omitted, and a
+    note names them. The name of a sequence is its position below the path, or the name of the path.
 
     Parameters
     ----------
     path : a folder or a file
-    recording : what to take of a recording; default: what is found in it
-    camera : of 7-Scenes sequences without an intrinsics.json, which the official download lacks
+    recording : options for recordings; by default, topics and frames are selected automatically
+    camera : camera of 7-Scenes sequences without an intrinsics.json, such as the official download
 
     Returns
     -------
-    sequences : at least one, in natural order of their names
+    sequences : at least one sequence, in natural order of the names
 
     Raises
     ------
-    DatasetError : nothing is there, there is no intrinsics.json for depth, a list names what is
-        not there, two scenes or recordings have one name, or recordings lie among other frames.
-    InvalidIntrinsics : an intrinsics.json describes no camera.
-    InvalidPose : a groundtruth.txt holds a line that is no pose.
-    MissingDependency : it is a recording, and rosbags is not installed.
+    DatasetError : If there are no frames, an intrinsics.json or a listed file is missing, two
+        scenes or recordings have the same name, or recordings are mixed with other frames.
+    InvalidIntrinsics : If an intrinsics.json does not describe a camera.
+    InvalidPose : If a line of a groundtruth.txt is not a pose.
+    MissingDependency : If the path is a recording and rosbags is not installed.
     """
-    # a name such as .. is none; a symlink's own name is what the user knows it by
+    # the name of `..` is that of its target; a symlink keeps its own name
     path = Path(path)
     root = path.resolve() if ".." in path.parts else path.absolute()
     from sceneprint.formats import exports
-    from sceneprint.formats import recording as ros  # what it takes, only bags need
+    from sceneprint.formats import recording as ros  # only recordings need this import
 
     if ros.is_recording(root) and root.exists():
         return ros.recording_sequences(root, recording or ros.RecordingOptions())
     if root.is_file():
         return exports.file_sequences(root) if exports.is_export(root) else (_single(root),)
     if not root.is_dir():
-        raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
+        raise DatasetError(f"{path}: The file or folder does not exist. Check the path.")
     left_out: list[Path] = []
     walked = list(_walk(root, left_out))
     if any(layout is Layout.RECORDING for _, _, layout in walked):
         return _recordings(root, walked, recording or ros.RecordingOptions())
-    found = tuple(each for one in walked for each in _sequences_in(*one, root, camera))
+    sequences = tuple(each for one in walked for each in _sequences_in(*one, root, camera))
     note = _note_of(left_out, root)
-    if not found:
+    if not sequences:
         raise DatasetError(
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below"
-            f"{note and f' ({note})'}. Name "
+            f"{note and f' ({note})'}. Specify "
             "a 7-Scenes scene or sequence (frame-000000.depth.png), a TUM RGB-D folder "
-            f"(depth.txt), a folder of depth images ({titles_of('depth')}), one of clouds "
-            f"({titles_of('cloud')}), one such file, recordings of ROS "
+            f"(depth.txt), a folder of depth images ({titles_of('depth')}) or clouds "
+            f"({titles_of('cloud')}), one such file, ROS recordings "
             f"({titles_of('recording')}), a file of {titles_of('capture', last='or')}, or an "
             "export of Polycam, Record3D or nerfstudio."
         )
-    _check_parent_frames(found)
-    return _with_note(found, note)
+    _check_parent_frames(sequences)
+    return _with_note(sequences, note)
 
 
-def _with_note(found: Sequence[FrameSequence], note: str) -> tuple[FrameSequence, ...]:
-    """Return sequences of which the first has one more note; there may be none."""
-    first = [replace(one, note="; ".join(filter(None, (one.note, note)))) for one in found[:1]]
-    return (*first, *found[1:])
+def _with_note(sequences: Sequence[FrameSequence], note: str) -> tuple[FrameSequence, ...]:
+    """Return the sequences, if any, with `note` appended to the note of the first one."""
+    first = [replace(one, note="; ".join(filter(None, (one.note, note)))) for one in sequences[:1]]
+    return (*first, *sequences[1:])
 
 
 def _note_of(left_out: list[Path], root: Path) -> str:
-    """Say which files and folders were left out by their names, a few of them by name."""
+    """Return a note on the files and folders that were omitted because of their names."""
     if not left_out:
         return ""
     names = [one.relative_to(root.parent).as_posix() for one in left_out]
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return f"left out: {', '.join(names[:_MOST_NAMES])}{more} ({WHAT_IS_LEFT_OUT})"
+    return f"left out: {', '.join(names[:_MOST_NAMES])}{more} ({OMITTED_IMAGES})"
 
 
 def find_recordings(path: Path) -> list[Path]:
-    """Return the recordings of ROS at a path: itself, or those in a folder and up to 4 below it, in
-    natural order.
-    """
+    """Return the ROS recordings at a path or up to 4 folders below it, in natural order."""
     from sceneprint.formats.recording import is_recording
 
     if is_recording(path):
@@ -381,7 +381,7 @@ def find_recordings(path: Path) -> list[Path]:
 
 
 def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
-    """Return the recordings among what `_walk` yields."""
+    """Return the paths of the recordings among the results of `_walk`."""
     return [folder / name for folder, names, layout in walked
             if layout is Layout.RECORDING for name in names]  # fmt: skip
 
@@ -389,11 +389,12 @@ def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
 def _recordings(
     root: Path, walked: list[tuple[Path, list[str], Layout]], options: RecordingOptions
 ) -> tuple[FrameSequence, ...]:
-    """Return the frames of several recordings, a sequence each, named by their places.
+    """Return the sequences of several recordings, named by their positions below `root`.
 
     Raises
     ------
-    DatasetError : as `recording_sequences`; other frames are there too, or two have one name.
+    DatasetError : If there are other frames too, two recordings have the same name, or
+        `recording_sequences` raises the error.
     """
     from sceneprint.formats.recording import recording_name, recording_sequences
 
@@ -401,16 +402,16 @@ def _recordings(
     other = next((one for one in walked if one[2] is not Layout.RECORDING), None)
     if other is not None:
         raise DatasetError(
-            f"{root}: There are recordings of ROS here, such as {bags[0].relative_to(root)}, and "
-            f"other frames, in {_name(other[0], root)} ({other[2].value}). Name one of them, or "
-            "put the recordings into a folder of their own."
+            f"{root}: The folder has both ROS recordings, such as {bags[0].relative_to(root)}, and "
+            f"other frames, in {_name(other[0], root)} ({other[2].value}). Specify one of them, or "
+            "move the recordings to a separate folder."
         )
     first: dict[str, Path] = {}
     for bag in bags:
         name = (bag.parent / recording_name(bag)).relative_to(root).as_posix()
         if name in first:
             raise DatasetError(
-                f"{bag}: The recording would have the same name, {name}, as {first[name].name}. "
+                f"{bag}: The recording would have the same name as {first[name].name}, {name}. "
                 "Rename or remove one of them."
             )
         first[name] = bag
@@ -424,23 +425,24 @@ def _recordings(
 def find_each(
     root: Path,
 ) -> tuple[tuple[FrameSequence, ...], tuple[tuple[str, SceneprintError], ...]]:
-    """As `find_sequences`, where a sequence that is damaged must not cost the others; recordings
-    of ROS are passed over.
+    """Return the readable sequences below a folder, and the errors of the unreadable ones.
+
+    ROS recordings are skipped; see `find_sequences` for the other layouts.
 
     Parameters
     ----------
-    root : a folder, absolute
+    root : absolute path of a folder
 
     Returns
     -------
-    sequences : that are sound; there may be none
-    refused : name of each other one, and why
+    sequences : readable sequences, if any
+    refused : name and error of each unreadable sequence
 
     Raises
     ------
-    DatasetError : there are too many folders, or two scenes have one name.
+    DatasetError : If there are too many folders, or two scenes have the same name.
     """
-    found: list[FrameSequence] = []
+    sequences: list[FrameSequence] = []
     refused = []
     left_out: list[Path] = []
     for one in _walk(root, left_out):
@@ -448,32 +450,33 @@ def find_each(
             continue
         name = _name(one[0], root)
         try:
-            found += _sequences_in(*one, root)
+            sequences += _sequences_in(*one, root)
         except SceneprintError as error:
             refused.append((name, error))
-    sequences = _with_note(found, _note_of(left_out, root))
-    _check_parent_frames(sequences)
-    return sequences, tuple(refused)
+    with_note = _with_note(sequences, _note_of(left_out, root))
+    _check_parent_frames(with_note)
+    return with_note, tuple(refused)
 
 
 def _walk(
     root: Path, left_out: list[Path] | None = None
 ) -> Iterator[tuple[Path, list[str], Layout]]:
-    """Yield the folders that are sequences, depth first in natural order; those that hold
-    recordings of ROS, with their names; and files that other systems wrote, which have no names.
+    """Yield the path, file names and layout of each sequence, depth first in natural order.
 
-    Images and folders that are passed over for their names are added to `left_out`.
+    For ROS recordings, the path is their folder, and the names are those of the recordings. For a
+    single file of another system, there are no names. Images and folders that are omitted because
+    of their names are added to `left_out`.
     """
     beside = [] if left_out is None else left_out
     from sceneprint.formats import exports
 
-    seen: set[Path] = set()  # resolved: a symlink back up is not entered twice
+    seen: set[Path] = set()  # resolved paths, so that cycles of symlinks end
     waiting = [(root, 0)]
     while waiting:
         folder, depth = waiting.pop()
         try:
             resolved = folder.resolve()
-        except (OSError, RuntimeError):  # a symlink to itself
+        except (OSError, RuntimeError):  # a cycle of symlinks
             continue
         if resolved in seen:
             continue
@@ -481,7 +484,7 @@ def _walk(
         if len(seen) > _MAXIMUM_FOLDERS:
             raise DatasetError(
                 f"{root}: There are more than {_MAXIMUM_FOLDERS} folders here. "
-                "Name the folder of the data set."
+                "Specify the folder of the data set."
             )
         files, folders = list_folder(folder)
         bags = _recordings_in(folder, files, folders)
@@ -493,7 +496,7 @@ def _walk(
             yield folder, files, layout
             continue
         layout = layout_of(files)
-        # a scene may hold a picture or a mesh of itself beside its sequences
+        # the folder of a scene may have an image or a mesh of the scene beside its sequences
         scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders) or (
             layout is Layout.CLOUDS
             and ("depth" in folders or _is_above_images(folder, files, folders, depth))
@@ -511,17 +514,18 @@ def _walk(
 
 
 def _recordings_in(folder: Path, files: list[str], folders: list[str]) -> list[str]:
-    """Return names of the recordings of ROS among the files and folders of a folder."""
+    """Return the names of the ROS recordings in a folder."""
     from sceneprint.formats.recording import is_recording
 
-    found = [name for name in files if format_named(name, "recording")]
-    found += [name for name in folders if is_recording(folder / name)]
-    return sorted(found, key=natural)
+    names = [name for name in files if format_named(name, "recording")]
+    names += [name for name in folders if is_recording(folder / name)]
+    return sorted(names, key=natural)
 
 
 def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: int) -> bool:
-    """Whether points lie above folders of depth images whose camera is known, and nothing says
-    that they are frames: they are a mesh of what is below, and must not hide it.
+    """Return whether a folder of points has subfolders of depth images with a known camera.
+
+    Without a clouds.json, such points are a mesh of the scene, not frames.
     """
     if CLOUDS_FILE in files:
         return False
@@ -533,13 +537,13 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
         if deep > _DEPTH or is_beside_depth(below.name):
             continue
         try:
-            own, deeper = list_folder(below)
-            if layout_of(own) not in (None, Layout.CLOUDS):
+            files_below, deeper = list_folder(below)
+            if layout_of(files_below) not in (None, Layout.CLOUDS):
                 find_camera(below)
                 return True
-        except DatasetError:  # colour images alone have no camera; others say why in their turn
+        except DatasetError:  # there is no camera, as for a folder of colour images
             continue
-        except SceneprintError:  # a camera that is none: whoever reads the images says why
+        except SceneprintError:  # the camera is invalid, which the reader of the images reports
             return True
         waiting += [(below / name, deep + 1) for name in deeper]
     return False
@@ -548,16 +552,16 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
 def _sequences_in(
     path: Path, files: list[str], layout: Layout, root: Path, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences of what `_walk` yields."""
+    """Return the sequences of one result of `_walk`."""
     from sceneprint.formats import exports
 
     if not layout.is_export:
         name = _name(path, root)
         frames, unposed = references(path, files, layout, name, camera)
-        found = _sequence_of(path, layout, name, frames, unposed)
+        sequence = _sequence_of(path, layout, name, frames, unposed)
         if _TRAJECTORY in files and all(one.pose_source is None for one in frames):
-            found = replace(found, lost=len(frames))  # no pose of the trajectory is of use
-        return (found,)
+            sequence = replace(sequence, lost=len(frames))  # the trajectory fits no frame
+        return (sequence,)
     if path.is_file():
         return exports.file_sequences(path, _name(path.with_suffix(""), root))
     return (exports.folder_sequence(path, layout, _name(path, root)),)
@@ -568,14 +572,13 @@ def _sequence_of(
 ) -> FrameSequence:
     seven, clouds = layout is Layout.SEVEN_SCENES, layout is Layout.CLOUDS
     split = _split(folder) if seven or clouds else None
-    # clouds are a sequence of a scene only where a split file of the scene says so
+    # clouds belong to a scene only if a split file of the scene lists them
     in_scene = split or (seven and _SEQUENCE_FOLDER.fullmatch(folder.name))
     parent_frame = folder.parent.name if in_scene else name
     return FrameSequence(name, folder, layout, parent_frame, split, frames, unposed=unposed)
 
 
 def _single(file: Path) -> FrameSequence:
-    """Return a sequence of one frame."""
     folder, frame = file.parent, FrameReference(**vars(find_frame_file(file)))
     unposed = NO_POSE_FILE if frame.pose_source is None else ""
     if frame.camera is not None and SEVEN_SCENES.fullmatch(file.name):
@@ -585,7 +588,7 @@ def _single(file: Path) -> FrameSequence:
 
 
 def _split(folder: Path) -> Split | None:
-    """Return what the scene's split files use this sequence for."""
+    """Return the use of a sequence according to the split files of its scene."""
     match = _SEQUENCE_FOLDER.fullmatch(folder.name)
     number = int(match[1]) if match else -1
     uses: list[Split] = []
@@ -595,14 +598,17 @@ def _split(folder: Path) -> Split | None:
             uses.append(use)
     if len(uses) > 1:
         raise DatasetError(
-            f"{folder.parent}: Sequence {number} is for training and for testing. "
-            "Take it out of TrainSplit.txt or TestSplit.txt."
+            f"{folder.parent}: Sequence {number} is listed for both training and testing. "
+            "Remove it from TrainSplit.txt or TestSplit.txt."
         )
     return uses[0] if uses else None
 
 
 def _split_numbers(path: Path) -> set[int]:
-    """Return the sequences that a split file lists, each of which must be there."""
+    """Return the numbers of the sequences that a split file lists; raise DatasetError if one lacks.
+
+    An evaluation of an incomplete split would be misleading.
+    """
     _, folders = list_folder(path.parent)
     present = {int(m[1]) for name in folders if (m := _SEQUENCE_FOLDER.fullmatch(name))}
     numbers = set()
@@ -610,13 +616,12 @@ def _split_numbers(path: Path) -> set[int]:
         match = _SPLIT_LINE.fullmatch(line)
         if match is None:
             raise DatasetError(
-                f"{path}, line {number}: This names no sequence. Write lines such as sequence1."
+                f"{path}, line {number}: The line is not a sequence. Write lines such as sequence1."
             )
         if int(match[1]) not in present:
-            # evaluating on part of a split in silence would be worse
             raise DatasetError(
-                f"{path}, line {number}: There is no folder seq-{int(match[1]):02d}. "
-                "Unpack it, or take the line out."
+                f"{path}, line {number}: The folder seq-{int(match[1]):02d} does not exist. "
+                "Unpack it, or remove the line."
             )
         numbers.add(int(match[1]))
     return numbers
@@ -627,20 +632,20 @@ def _name(folder: Path, root: Path) -> str:
 
 
 def _check_parent_frames(sequences: tuple[FrameSequence, ...]) -> None:
-    """Two scenes of one name would pass for one place, and their poses for comparable."""
+    """Raise DatasetError if two scenes share a name: their poses would seem comparable."""
     scenes: dict[str, Path] = {}
     for sequence in sequences:
         place = sequence.place
         if scenes.setdefault(sequence.parent_frame, place) != place:
             raise DatasetError(
-                f"{place}: Another scene is called {sequence.parent_frame} too, "
-                f"{scenes[sequence.parent_frame]}. Rename one, or read them one at a time."
+                f"{place}: Another scene, {scenes[sequence.parent_frame]}, has the same name "
+                f"{sequence.parent_frame}. Rename one of them, or specify one at a time."
             )
 
 
-# Sequences out: the files that `find_sequences` reads.
+# Writers of the files that `find_sequences` reads.
 
-_LARGEST = 65_534  #: stored units; 65535 reads as missing
+_LARGEST = 65_534  #: largest depth, stored units; 65535 means missing
 
 
 def write_intrinsics(folder: Path, camera: Camera) -> Path:
@@ -671,14 +676,13 @@ def write_depth_png(path: Path, depth: Floats32, depth_scale: float) -> None:
 
     Parameters
     ----------
-    path : the file
-    depth : (H, W) metres; what is not finite, not positive, or beyond 65534 stored units
-        is written as 0, missing
+    depth : (H, W) metres; samples that are not finite, not positive, or beyond 65534 stored units
+        are written as 0 (missing)
     depth_scale : stored units per metre
 
     Raises
     ------
-    ValueError : the depth is not two-dimensional or empty, or the scale is no positive
+    ValueError : If the depth is empty or not two-dimensional, or the scale is not a positive
         number.
     """
     from PIL import Image
@@ -696,11 +700,11 @@ def write_depth_png(path: Path, depth: Floats32, depth_scale: float) -> None:
 
 
 def write_pose(path: Path, T_parent_sensor: Floats) -> None:
-    """Write a (4, 4) pose as text, row by row, without loss.
+    """Write a pose (4, 4) as text, row by row, without loss of precision.
 
     Raises
     ------
-    InvalidPose : it is not a rigid transform.
+    InvalidPose : If the pose is not a rigid transform.
     """
     rows = rigid_transform(T_parent_sensor)
     text = "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)
@@ -708,19 +712,18 @@ def write_pose(path: Path, T_parent_sensor: Floats) -> None:
 
 
 def trajectory_row(stamp: float, T_parent_sensor: Floats) -> list[float]:
-    """Return a pose (4, 4) as TUM has it: t tx ty tz qx qy qz qw, seconds and metres."""
+    """Return a pose (4, 4) as a row of a TUM file: t tx ty tz qx qy qz qw, seconds and metres."""
     T = T_parent_sensor
     return [stamp, *T[:3, 3].tolist(), *quaternion_of(T[:3, :3]).tolist()]
 
 
 def trajectory_text(rows: Iterable[Sequence[float]], comments: Iterable[str] = ()) -> str:
-    """Return a TUM trajectory as text, without loss.
+    """Return a TUM trajectory as text, without loss of precision.
 
     Parameters
     ----------
-    rows : of `trajectory_row`
-    comments : lines of the head: the frames of the poses belong there. What is no printable
-        ASCII is escaped
+    rows : rows of `trajectory_row`
+    comments : lines of the header, such as the frames of the poses; escaped to printable ASCII
     """
     lines = [f"# {comment.encode('unicode_escape').decode('ascii')}" for comment in comments]
     lines += [" ".join(repr(float(number)) for number in row) for row in rows]

@@ -1,4 +1,4 @@
-"""What other systems write: databases, folders and files with depth and poses, as sequences.
+"""Readers for exports of other systems: databases, folders and files with depth and poses.
 
 path  --file_sequences-->  FrameSequence, ...
 folder  --folder_layout-->  Layout          folder, Layout  --folder_sequence-->  FrameSequence
@@ -25,54 +25,54 @@ _OF_FOLDER: dict[Layout, Callable[[Path, str], FrameSequence]] = {
 
 
 def is_export(path: Path) -> bool:
-    """Return whether a path is one file that another system wrote, with frames in it."""
-    found = format_named(path.name, "capture")
-    return found is not None and (found.name != "rtabmap" or is_rtabmap(path))
+    """Return whether a path is a single file of another system that contains frames."""
+    file_format = format_named(path.name, "capture")
+    return file_format is not None and (file_format.name != "rtabmap" or is_rtabmap(path))
 
 
 def file_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
-    """Return the sequences of one file that another system wrote.
+    """Return the sequences of a single file of another system.
 
     Parameters
     ----------
-    path : a file, absolute, for which `is_export` holds
-    name : of the sequences; default: that of the file
+    path : absolute path of a file for which `is_export` returns True
+    name : name of the sequences; default: name of the file
 
     Raises
     ------
-    DatasetError : the file is damaged, of a version that is not read, or holds no frame.
+    DatasetError : If the file is damaged, has an unsupported version, or has no frames.
     """
     name = name or path.stem
-    found = format_named(path.name, "capture")
-    if found is None or found.name == "rtabmap":
+    file_format = format_named(path.name, "capture")
+    if file_format is None or file_format.name == "rtabmap":
         return rtabmap_sequences(path, name)
-    sequence: FrameSequence = function_at(found.reader)(path, name)
+    sequence: FrameSequence = function_at(file_format.reader)(path, name)
     return (sequence,)
 
 
 def folder_layout(folder: Path, files: list[str], folders: list[str]) -> Layout | None:
-    """Return the layout of a folder that another system wrote; None for any other folder.
+    """Return the layout of a folder of another system; None for other folders.
 
     Parameters
     ----------
-    folder : the folder
-    files, folders : names in it
+    folder : path of the folder
+    files, folders : names of the files and folders in it
     """
     if is_polycam(folder, folders):
         return Layout.POLYCAM
     if record3d.is_record3d(files, folders):
         return Layout.RECORD3D
-    # an intrinsics.json was written for us, and says what is meant
+    # an intrinsics.json takes precedence, since users write it for this reader
     if TRANSFORMS in files and INTRINSICS_FILE not in files:
         return Layout.NERFSTUDIO
     return None
 
 
 def folder_sequence(folder: Path, layout: Layout, name: str) -> FrameSequence:
-    """Return the frames of a folder of such a layout.
+    """Return the sequence of a folder with a layout of `folder_layout`.
 
     Raises
     ------
-    DatasetError : the folder is damaged, or holds no frame with depth.
+    DatasetError : If the folder is damaged, or no frame has depth.
     """
     return _OF_FOLDER[layout](folder, name)

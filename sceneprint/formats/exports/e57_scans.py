@@ -1,4 +1,4 @@
-"""The scans of an E57 file as frames: clouds with the pose of their scanner.
+"""Read the scans of an E57 file as frames: clouds with the poses of their scanner.
 
 path  --e57_sequence-->  FrameSequence
 """
@@ -28,18 +28,18 @@ from sceneprint.formats.points.e57 import E57Scan, read_e57, with_viewpoint
 from sceneprint_client.files import naming
 from sceneprint_client.sidecars import CloudSource
 
-#: Farthest that a point may be from its scanner, metres; scanners write sky beyond.
+#: Maximum distance of a point from its scanner, metres; sky has larger values.
 _FARTHEST_M = 5_000.0
 
 
 @dataclass(frozen=True)
 class E57Source:
-    """A scan of an E57 file, as the bytes of a file.
+    """Source of the bytes of one scan of an E57 file.
 
     Parameters
     ----------
-    path : of the file
-    place : of the scan in it, from 0
+    path : path of the file
+    place : index of the scan in the file
     """
 
     path: Path
@@ -48,18 +48,18 @@ class E57Source:
     def read_bytes(self) -> bytes:
         """Return an NPY file of points (N, 3), float32 metres in the axes of the scan.
 
-        Of more than 5 million points, one per voxel is taken, as the service would.
+        A scan with more than 5 million points is thinned to one point per voxel, as by the service.
 
         Raises
         ------
-        UnreadableCloud : the file is damaged, or cannot be read.
+        UnreadableCloud : If the file is damaged or cannot be read.
         """
         with naming(f"{self.path}, scan {self.place + 1}"), _scans(self.path) as scans:
             if self.place >= len(scans):
-                raise UnreadableCloud("The scan is no longer there. Read the file again.")
+                raise UnreadableCloud("The scan no longer exists. Read the file again.")
             scan = scans[self.place]
             points, n = np.empty((scan.count, 3), np.float32), 0
-            with np.errstate(all="ignore"):  # what is no number is missing
+            with np.errstate(all="ignore"):  # points with NaN are missing
                 for block in scan.points().blocks:
                     near = block[(np.abs(block) <= _FARTHEST_M).all(axis=1)]
                     points[n : n + len(near)] = near
@@ -77,7 +77,7 @@ def _scans(path: Path) -> Iterator[tuple[E57Scan, ...]]:
             if file.seek(0, io.SEEK_END) == 0:
                 raise UnreadableCloud("The file is empty. Copy it again.")
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            yield read_e57(data)  # whose views of it are gone with the scans, and then the map
+            yield read_e57(data)  # the memory is unmapped when no scan refers to it
     except OSError as cause:
         raise UnreadableCloud(
             f"The file cannot be read ({cause.strerror}). Copy it again."
@@ -85,27 +85,27 @@ def _scans(path: Path) -> Iterator[tuple[E57Scan, ...]]:
 
 
 def e57_sequence(path: Path, name: str) -> FrameSequence:
-    """Return the scans of a file that were seen from one place.
+    """Return the scans of a file that have a single viewpoint.
 
     Parameters
     ----------
-    path : of the file
-    name : of the sequence
+    path : path of the file
+    name : name of the sequence
 
     Returns
     -------
-    sequence : its `note` says what was left out
+    sequence : sequence whose `note` lists the omitted scans
 
     Raises
     ------
-    DatasetError : the file is damaged, or holds only merged clouds.
+    DatasetError : If the file is damaged, or has only merged clouds.
     """
     try:
         with _scans(path) as scans:
-            seen = with_viewpoint(scans)
+            have_viewpoint = with_viewpoint(scans)
             left_out = Counter[str]()
             frames = list[FrameReference]()
-            for place, (scan, has_viewpoint) in enumerate(zip(scans, seen, strict=True)):
+            for place, (scan, has_viewpoint) in enumerate(zip(scans, have_viewpoint, strict=True)):
                 if scan.count < FEWEST_POINTS:
                     left_out["scans without points"] += 1
                 elif not has_viewpoint:
@@ -118,12 +118,12 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
     reasons = ", ".join(f"{count} {reason}" for reason, count in left_out.items())
     if not frames:
         raise DatasetError(
-            f"{path}: No scan of the file was seen from one place ({reasons}). Upload the file as "
-            "a whole with --as-map, or export structured scans with their poses."
+            f"{path}: No scan of the file has a single viewpoint ({reasons}). Upload the file as a "
+            "whole with --as-map, or export structured scans with their poses."
         )
     note = f"{len(frames)} of {len(scans)} scans taken"
     note += f"; left out: {reasons}" if reasons else ""
-    note += f"; {thick} of more than {MOST_POINTS} points are thinned" if thick else ""
+    note += f"; {thick} scans with more than {MOST_POINTS} points are thinned" if thick else ""
     lost = count_lost(left_out)
     return FrameSequence(name, path, Layout.E57, name, None, tuple(frames), note, lost=lost)
 

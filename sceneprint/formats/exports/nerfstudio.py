@@ -1,13 +1,13 @@
-"""Folders with a `transforms.json` of nerfstudio or Instant NGP that names depth images.
+"""Read folders with a `transforms.json` of nerfstudio or Instant NGP that names depth images.
 
 folder  --nerfstudio_sequence-->  FrameSequence
 
-By docs.nerf.studio (data conventions): fl_x, fl_y, cx, cy, w, h, k1 to k4, p1, p2 stand for all
-frames or in each of them; a frame has `transform_matrix`, camera to world in OpenGL's axes (x
-right, y up, z backward), and `depth_file_path` relative to the folder. `depth_unit_scale_factor`
-(0.001 unless stated) gives metres of what a depth file stores, PNG and NPY alike.
-`applied_transform` is what the exporter applied to the poses; it is undone, so that poses are in
-the frame of the original reconstruction.
+The format is described at docs.nerf.studio (data conventions). fl_x, fl_y, cx, cy, w, h, k1 to k4,
+p1 and p2 are fields of the file or of each frame. A frame has a `transform_matrix` from camera to
+world, with the camera in OpenGL axes (x right, y up, z backward), and a `depth_file_path` relative
+to the folder. `depth_unit_scale_factor` (default 0.001) is the number of metres per stored unit of
+PNG and NPY depth. The exporter applied `applied_transform` to the poses; the reader inverts it, so
+poses are in the frame of the original reconstruction.
 """
 
 from __future__ import annotations
@@ -42,36 +42,36 @@ _EXAMPLE = '{"fl_x": 525.0, "frames": [{"transform_matrix": ..., "depth_file_pat
 _DEPTH_KEYS = ("depth_file_path", "depth_path")
 _SCALE_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
 _REMEDY = (
-    "Only frames with a depth_file_path of PNG or NPY are read: process the capture with depth "
-    "(for Polycam, ns-process-data polycam --use-depth), or upload the raw capture."
+    "Frames need a depth_file_path to a PNG or NPY file. Process the capture with depth (for "
+    "Polycam, ns-process-data polycam --use-depth), or upload the raw capture."
 )
 
 
 @dataclass(frozen=True)
 class ScaledNpy:
-    """An NPY depth image of floating numbers that are no metres.
+    """Source of an NPY depth image whose floating-point samples are not in metres.
 
     Parameters
     ----------
-    path : of the file
-    metres : of one unit
+    path : path of the file
+    metres : metres per stored unit
     """
 
     path: Path
     metres: float
 
     def read_bytes(self) -> bytes:
-        """Return the bytes of an NPY file of metres; raises UnreadableFrame."""
+        """Read the file as an NPY file in metres. Raise UnreadableFrame if it is invalid."""
         return self.converted(read_bytes(self.path, MAXIMUM_IMAGE_BYTES, UnreadableFrame))
 
     def converted(self, data: bytes) -> bytes:
-        """Return an NPY file of metres, given the bytes of the file; raises UnreadableFrame."""
+        """Convert the bytes of the file to metres. Raise UnreadableFrame if they are invalid."""
         if not data.startswith(NPY_SIGNATURE):
             return data
         samples = decode_npy(data)
-        if samples.dtype == np.uint16:  # these are scaled by the camera's depth scale
+        if samples.dtype == np.uint16:  # the depth scale of the camera applies to them
             return data
-        with np.errstate(all="ignore"):  # what overflows is missing
+        with np.errstate(all="ignore"):  # samples that overflow are missing
             metres = (samples * np.float32(self.metres)).astype(np.float32)
         return encode_npy(metres)
 
@@ -81,22 +81,24 @@ def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:
 
     Parameters
     ----------
-    folder : that holds it
-    name : of the sequence
+    folder : folder with the file
+    name : name of the sequence
 
     Returns
     -------
-    sequence : its `note` says what was left out
+    sequence : sequence whose `note` lists the omitted frames
 
     Raises
     ------
-    DatasetError : the file is no such JSON, or no frame has depth.
+    DatasetError : If the JSON file is invalid, or no frame has depth.
     """
     file = folder / TRANSFORMS
     fields = read_object(file, _MAXIMUM_BYTES, DatasetError, _EXAMPLE)
     listed = fields.get("frames")
     if not isinstance(listed, list):
-        raise DatasetError(f"{file}: It has no list of frames. Write it such as {_EXAMPLE}.")
+        raise DatasetError(
+            f"{file}: The file has no list of frames. Write it in the form {_EXAMPLE}."
+        )
     T_original_saved, scale = _original(file, fields)
     frames, left_out = list[FrameReference](), Counter[str]()
     for place, one in enumerate(listed[:_MOST_FRAMES]):
@@ -116,7 +118,7 @@ def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:
 
 
 def _original(file: Path, fields: dict[str, Any]) -> tuple[Floats, float]:
-    """Return T_original_saved (4, 4), and the scale that the saved poses have."""
+    """Return T_original_saved (4, 4), and the scale of the saved poses."""
     try:
         scale = number(fields.get("applied_scale", 1.0), "applied_scale")
         if not scale > 0:
@@ -135,19 +137,19 @@ def _depth_name(fields: dict[str, Any]) -> str | None:
 
 
 def _frame(folder: Path, fields: dict[str, Any], name: str, place: int) -> FrameReference:
-    """Return a frame at its saved pose; a SceneprintError where it is none."""
+    """Return a frame with its saved pose. Raise a SceneprintError if it is invalid."""
     relative = PurePosixPath(str(_depth_name(fields)).replace("\\", "/"))
-    # a file from elsewhere must not make us read any file of this machine
+    # an untrusted file must not select arbitrary files of this machine
     if relative.is_absolute() or ".." in relative.parts:
-        raise DatasetError("a depth file lies outside the folder")
+        raise DatasetError("a depth file is outside the folder")
     path = folder / relative
     if path.suffix.lower() not in (".png", ".npy"):
-        raise DatasetError(f"depth in {path.suffix or 'files without a suffix'}")
+        raise DatasetError(f"unsupported depth format {path.suffix or 'without a suffix'}")
     if not path.is_file():
-        raise DatasetError("a depth file is not there")
+        raise DatasetError("a depth file is missing")
     metres = next((number(fields[key], key) for key in _SCALE_KEYS if key in fields), 1e-3)
     if not 1e-6 <= metres <= 1e3:
-        raise DatasetError(f"depth units of {metres:g} m")
+        raise DatasetError(f"invalid depth unit of {metres:g} m")
     source = ScaledNpy(path, metres) if path.suffix.lower() == ".npy" and metres != 1.0 else None
     return FrameReference(
         f"{name}/{place:06d}-{path.stem}",
@@ -162,7 +164,7 @@ def _frame(folder: Path, fields: dict[str, Any], name: str, place: int) -> Frame
 
 
 def _lens(fields: dict[str, Any]) -> Lens:
-    """Return the camera of a frame; DatasetError where it is none, or a fisheye."""
+    """Return the camera of a frame. Raise DatasetError if it is invalid or a fisheye camera."""
     model = fields.get("camera_model", "OPENCV")
     width, height = (pixels(fields.get(key), key) for key in ("w", "h"))
     if "fl_x" not in fields and "camera_angle_x" in fields:
@@ -176,6 +178,6 @@ def _lens(fields: dict[str, Any]) -> Lens:
         number(fields.get(key, 0.0), key) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     )
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") or k4:
-        raise DatasetError(f"a camera model {model!r:.40}: undistort the images")
+        raise DatasetError(f"unsupported camera model {model!r:.40}: undistort the images")
     distortion = (k1, k2, p1, p2, k3) if k3 else (k1, k2, p1, p2)
     return Lens(fx, fy, cx, cy, width, height, distortion if any(distortion) else ())

@@ -1,11 +1,11 @@
-"""Cameras as graphics and ARKit describe them: axes, principal points, sizes; frames of a folder.
+"""Convert cameras of OpenGL and ARKit to optical axes, and JSON values to checked numbers.
 
 T_world_camera (OpenGL)  --optical-->  T_world_camera (optical)
 Lens, size of the depth image  --depth_camera-->  Camera
 
-In OpenGL's and ARKit's axes a camera has x to the right, y up and z backward; ours are optical: x
-right, y down, z forward. Their principal point is measured from the corner of the image, so that
-the centre of the first pixel is at (0.5, 0.5); ours has it at (0, 0).
+The axes of OpenGL and ARKit cameras are x right, y up, z backward; optical axes are x right, y
+down, z forward. OpenGL and ARKit measure the principal point from the corner of the image, so the
+centre of the first pixel is at (0.5, 0.5) instead of (0, 0).
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from sceneprint_client.formats import HEAD, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.sidecars import Camera, Position
 
-#: From optical axes to those of OpenGL: y and z point the other way.
+#: Transform from optical to OpenGL axes, which inverts y and z.
 _T_OPENGL_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera of a colour image; the principal point is measured from its corner.
+    """Pinhole camera of a colour image, whose principal point is measured from the corner.
 
     Parameters
     ----------
-    fx, fy, cx, cy : pixels
-    width, height : of the image
-    distortion : k1, k2, p1, p2 and optionally k3; empty for none
+    fx, fy, cx, cy : intrinsics, pixels
+    width, height : size of the image, pixels
+    distortion : k1, k2, p1, p2 and optionally k3; empty without distortion
     """
 
     fx: float
@@ -57,32 +57,32 @@ class Lens:
 
 
 def optical(T_world_camera: Floats) -> Floats:
-    """Return the pose of optical axes (4, 4), of one of OpenGL's axes (4, 4)."""
+    """Convert the pose (4, 4) of a camera with OpenGL axes to the pose with optical axes."""
     return T_world_camera @ _T_OPENGL_OPTICAL
 
 
 def depth_camera(
     lens: Lens, size: tuple[int, int], depth_scale: float, up: Position | None = None
 ) -> Camera:
-    """Return the camera of a depth image that shows what a colour image shows.
+    """Return the camera of a depth image with the same view as a colour image.
 
     Parameters
     ----------
-    lens : of the colour image
+    lens : camera of the colour image
     size : width and height of the depth image, which may be smaller
     depth_scale : stored units per metre
     up : unit vector in optical axes, or None
 
     Raises
     ------
-    DatasetError : the depth image is of another shape than the colour image.
-    InvalidIntrinsics : the camera is none.
+    DatasetError : If the images have different aspect ratios.
+    InvalidIntrinsics : If the camera is invalid.
     """
     across, down = size[0] / lens.width, size[1] / lens.height
     if not math.isclose(across, down, rel_tol=0.02):
         raise DatasetError(
-            f"The depth image has {size[0]} x {size[1]} pixels and the camera {lens.width} x "
-            f"{lens.height}, which is of another shape. Export both in one orientation."
+            f"The depth image has {size[0]} x {size[1]} pixels, but the camera has the aspect "
+            f"ratio {lens.width} x {lens.height}. Export both in the same orientation."
         )
     intrinsics = Intrinsics(
         width=size[0], height=size[1], fx=lens.fx * across, fy=lens.fy * down,
@@ -92,22 +92,24 @@ def depth_camera(
 
 
 def depth_size(path: Path) -> tuple[int, int]:
-    """Return width and height of a depth image, by its first bytes.
+    """Return the width and height of a depth image from its first bytes.
 
     Raises
     ------
-    UnreadableFrame : the file cannot be read, or is of no format of depth.
+    UnreadableFrame : If the file cannot be read, or is not a depth image.
     """
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)
     except OSError as cause:
         raise UnreadableFrame(
-            f"{path.name}: The file cannot be read ({cause.strerror}). Check your rights."
+            f"{path.name}: The file cannot be read ({cause.strerror}). Check its permissions."
         ) from cause
     size = size_of(head)
     if size is None or 0 in size:
-        raise UnreadableFrame(f"{path.name}: This is none of {titles_of('depth')}. Copy it again.")
+        raise UnreadableFrame(
+            f"{path.name}: The format is none of {titles_of('depth')}. Copy the file again."
+        )
     return size
 
 
@@ -115,7 +117,7 @@ def depth_size(path: Path) -> tuple[int, int]:
 
 
 def number(value: object, what: str) -> float:
-    """Return a finite number of a JSON file; DatasetError where it is none."""
+    """Return a finite number of a JSON file. Raise DatasetError for other values."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             if math.isfinite(value):
@@ -126,7 +128,7 @@ def number(value: object, what: str) -> float:
 
 
 def pixels(value: object, what: str) -> int:
-    """Return a size of a JSON file in pixels; DatasetError where it is none."""
+    """Return a size in pixels of a JSON file. Raise DatasetError for other values."""
     size = number(value, what)
     if not 1 <= size <= 1e6 or size != int(size):
         raise DatasetError(f"{what} is {size:g}, not a size in pixels. Export it again.")
@@ -134,10 +136,10 @@ def pixels(value: object, what: str) -> int:
 
 
 def transform(rows: object, what: str) -> Floats:
-    """Return a transform (4, 4) of 3 or 4 rows of a JSON file; DatasetError if it is not rigid."""
+    """Return a transform (4, 4) from 3 or 4 rows. Raise DatasetError if it is not rigid."""
     T = np.eye(4)
     if not isinstance(rows, list) or len(rows) not in (3, 4):
-        raise DatasetError(f"{what} has not 3 or 4 rows. Export it again.")
+        raise DatasetError(f"{what} does not have 3 or 4 rows. Export it again.")
     for place, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != 4:
             raise DatasetError(f"{what} has a row without 4 numbers. Export it again.")
@@ -145,7 +147,7 @@ def transform(rows: object, what: str) -> Floats:
     try:
         return rigid_transform(T)
     except InvalidPose as cause:
-        raise DatasetError(f"{what} is none: {cause}") from cause
+        raise DatasetError(f"{what} is invalid: {cause}") from cause
 
 
 # Sequences.
@@ -155,19 +157,19 @@ def sequence_of(
     folder: Path, layout: Layout, name: str, frames: Sequence[FrameReference],
     left_out: Counter[str], remedy: str,
 ) -> FrameSequence:  # fmt: skip
-    """Return a sequence whose note says what was left out.
+    """Return a sequence whose note lists the omitted frames.
 
     Parameters
     ----------
-    folder : or file, of the frames
-    layout, name : of the sequence
-    frames : in order
-    left_out : number of frames by the reason
-    remedy : what to do where no frame is there
+    folder : folder or file of the frames
+    layout, name : layout and name of the sequence
+    frames : frames in order
+    left_out : numbers of omitted frames by reason
+    remedy : advice for users if there are no frames
 
     Raises
     ------
-    DatasetError : there is no frame.
+    DatasetError : If there are no frames.
     """
     reasons = [f"{count} {printable(reason)}" for reason, count in left_out.most_common(5)]
     if not frames:

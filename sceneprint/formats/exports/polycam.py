@@ -1,12 +1,12 @@
-"""Folders of Polycam's raw data: depth of a LiDAR, and cameras with ARKit's poses.
+"""Read folders of Polycam's raw data: LiDAR depth images, and cameras with ARKit poses.
 
 folder  --polycam_sequence-->  FrameSequence
 
-By the description in github.com/PolyCam/polyform: `keyframes/corrected_cameras/TIME.json`, or
-`keyframes/cameras/` where the poses were not optimised, has fx, fy, cx, cy, width and height of the
-colour image and the rows t_00 to t_23 of camera to world; `keyframes/depth/TIME.png` has 16-bit
-millimetres at a lower resolution. TIME is in microseconds. The camera has ARKit's axes (x right, y
-up, z backward); the world has y up against gravity.
+The format is described at github.com/PolyCam/polyform. `keyframes/corrected_cameras/TIME.json` (or
+`keyframes/cameras/` without optimised poses) has fx, fy, cx, cy, width and height of the colour
+image, and the rows t_00 to t_23 of the transform from camera to world. `keyframes/depth/TIME.png`
+has 16-bit millimetres at a lower resolution. TIME is in microseconds. The axes of the camera are
+those of ARKit (x right, y up, z backward), and the y axis of the world points up.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ KEYFRAMES, CAMERAS = "keyframes", ("corrected_cameras", "cameras")
 _MAXIMUM_CAMERA_BYTES = 65_536
 _MOST_FRAMES = 100_000
 _REMEDY = (
-    "In Polycam, turn developer mode on, capture in LiDAR or Room mode, and export raw data; photo "
+    "In Polycam, turn on developer mode, capture in LiDAR or Room mode, and export raw data. Photo "
     "captures have no depth."
 )
 
 
 def is_polycam(folder: Path, folders: list[str]) -> bool:
-    """Return whether a folder, with these folders in it, is an export of Polycam."""
+    """Return whether a folder with the subfolders `folders` is an export of Polycam."""
     if folder.name == KEYFRAMES:
         return any(one in folders for one in CAMERAS)
     return KEYFRAMES in folders and any((folder / KEYFRAMES / one).is_dir() for one in CAMERAS)
@@ -49,16 +49,16 @@ def polycam_sequence(folder: Path, name: str) -> FrameSequence:
 
     Parameters
     ----------
-    folder : that holds `keyframes`, or that itself
-    name : of the sequence
+    folder : folder `keyframes` or its parent
+    name : name of the sequence
 
     Returns
     -------
-    sequence : its `note` says what was left out
+    sequence : sequence whose `note` lists the omitted frames
 
     Raises
     ------
-    DatasetError : no frame has depth and a camera, or the folder cannot be read.
+    DatasetError : If no frame has depth and a camera, or the folder cannot be read.
     """
     from sceneprint.formats.dataset.sequences import list_folder
 
@@ -88,16 +88,14 @@ def _reason(error: SceneprintError, place: Path) -> str:
 
 
 def _frame(folder: Path, file: Path, depth: Path, name: str, place: int) -> FrameReference:
-    """Return a frame; DatasetError, InvalidIntrinsics or UnreadableFrame where it is none."""
+    """Return a frame. Raise DatasetError, InvalidIntrinsics or UnreadableFrame if it is invalid."""
     fields = read_object(file, _MAXIMUM_CAMERA_BYTES, DatasetError, '{"fx": 1, "t_00": 1, ...}')
     fx, fy, cx, cy = (number(fields.get(key), key) for key in ("fx", "fy", "cx", "cy"))
     width, height = (pixels(fields.get(key), key) for key in ("width", "height"))
     lens = Lens(fx, fy, cx, cy, width, height)
     rows = [[fields.get(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     T_world_camera = optical(transform(rows, "The pose t_00 to t_23"))
-    x, y, z = (
-        float(value) for value in T_world_camera[1, :3]
-    )  # the world's y, in the camera's axes
+    x, y, z = (float(value) for value in T_world_camera[1, :3])  # up in the axes of the camera
     return FrameReference(
         f"{name}/{file.stem}",
         depth,

@@ -1,13 +1,13 @@
-"""Captures of Record3D: .r3d files, and folders of one that was unpacked.
+"""Read captures of Record3D: .r3d files, and folders with their unpacked content.
 
 path  --record3d_sequence-->  FrameSequence
 
-An .r3d file is a zip with `metadata`, JSON, and for each frame `rgbd/N.depth`: float32 metres, dw x
-dh, packed with LZFSE. `metadata` has w and h of the colour images, `perFrameIntrinsicCoeffs` (fx,
-fy, cx, cy of each frame) or K (column by column), and `poses`: qx, qy, qz, qw, x, y, z of camera to
-world in ARKit's axes (x right, y up, z backward).
+An .r3d file is a zip with a JSON file `metadata`, and a depth image `rgbd/N.depth` for each frame:
+dw x dh float32 metres, compressed with LZFSE. `metadata` has w and h of the colour images,
+`perFrameIntrinsicCoeffs` (fx, fy, cx, cy of each frame) or K (column by column), and `poses`: qx,
+qy, qz, qw, x, y, z of the transform from camera to world in ARKit axes (x right, y up, z backward).
 
-The export "EXR + JPG sequence" has depth as OpenEXR, which is not read.
+The export "EXR + JPG sequence" has depth as OpenEXR, which is not supported.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ METADATA, FRAMES, DEPTH_SUFFIX = "metadata", "rgbd", ".depth"
 _MAXIMUM_METADATA_BYTES = 64 << 20
 _MOST_FRAMES = 100_000
 _REMEDY = "In Record3D, export the capture as .r3d (shareable internal format)."
-#: Width and height of depth in portrait, of the LiDAR, where an old file does not state it.
+#: Width and height of LiDAR depth in portrait orientation, for old files that do not state them.
 _LIDAR = (192, 256)
 
 
 def is_record3d(files: list[str], folders: list[str]) -> bool:
-    """Return whether a folder, with these files and folders in it, is an unpacked capture."""
+    """Return whether a folder with these files and subfolders is an unpacked capture."""
     return (METADATA in files and FRAMES in folders) or (
         "metadata.json" in files and "depth" in folders and "rgb" in folders
     )
@@ -64,13 +64,13 @@ def is_record3d(files: list[str], folders: list[str]) -> bool:
 
 @dataclass(frozen=True)
 class LzfseDepth:
-    """A depth image of a capture, as the bytes of a file.
+    """Source of a depth image of a capture.
 
     Parameters
     ----------
-    capture : the .r3d file, or the folder
-    name : of the depth file within
-    width, height : pixels
+    capture : .r3d file, or folder
+    name : name of the depth file in the capture
+    width, height : size of the depth image, pixels
     """
 
     capture: Path
@@ -83,57 +83,57 @@ class LzfseDepth:
 
         Raises
         ------
-        UnreadableFrame : the file is damaged, or of another size.
-        MissingDependency : lzfse is not installed.
+        UnreadableFrame : If the file is damaged, or its content has another size.
+        MissingDependency : If lzfse is not installed.
         """
         size = 4 * self.width * self.height
         with naming(str(self.capture / self.name)):
-            # what does not shrink is stored as it is: a little larger
-            samples = _inflated(_content(self.capture, self.name, size + 65_536), size)
+            # content that cannot be compressed is slightly larger in LZFSE
+            samples = _decompressed(_part(self.capture, self.name, size + 65_536), size)
         return encode_npy(np.frombuffer(samples, "<f4").reshape(self.height, self.width))
 
 
-def _inflated(packed: bytes, size: int) -> bytes:
-    """Return the content of a depth file; it has exactly so many bytes."""
+def _decompressed(packed: bytes, size: int) -> bytes:
+    """Return the content of a depth file. Raise UnreadableFrame unless it has `size` bytes."""
     if len(packed) == size:
         return packed
     try:
         import lzfse
     except ImportError as cause:
         raise MissingDependency(
-            "Depth of Record3D is packed with LZFSE, and the package lzfse is not installed. "
+            "Depth of Record3D is compressed with LZFSE, but the package lzfse is not installed. "
             "Run: pip install 'sceneprint[record3d]'"
         ) from cause
     try:
         samples: bytes = lzfse.decompress(packed)
     except (lzfse.error, ValueError, MemoryError) as cause:
         raise UnreadableFrame(
-            f"The depth does not inflate ({cause}). Copy the capture again."
+            f"The depth cannot be decompressed ({cause}). Copy the capture again."
         ) from cause
     if len(samples) != size:
         raise UnreadableFrame(
-            f"The depth has {len(samples)} bytes, and its metadata announce {size}. Export the "
+            f"The depth has {len(samples)} bytes, but the metadata announce {size}. Export the "
             "capture again."
         )
     return samples
 
 
-# Parts of a capture: of the zip, or of the folder.
+# Parts of a capture: members of the zip, or files of the folder.
 
 _LOCAL_HEADER = struct.Struct("<4s4xH16xHH")
 _STORED, _DEFLATED = 0, 8
 
 
-def _content(capture: Path, name: str, limit: int) -> bytes:
-    """Return the bytes of a part; UnreadableFrame where it is not there, damaged or too long."""
+def _part(capture: Path, name: str, limit: int) -> bytes:
+    """Return the bytes of a part. Raise UnreadableFrame if it is missing, damaged or too large."""
     if capture.is_dir():
         return read_bytes(capture / name, limit, UnreadableFrame)
     try:
         status = capture.stat()
-        place = _places(capture, status.st_mtime_ns, status.st_size).get(name)
+        place = _parts_of_zip(capture, status.st_mtime_ns, status.st_size).get(name)
         if place is None or place[2] > limit:
             raise UnreadableFrame(
-                f"There is no {name} of at most {limit} bytes. Export the capture again."
+                f"{name} is missing, or larger than {limit} bytes. Export the capture again."
             )
         start, packed, size = place
         with capture.open("rb") as file:
@@ -153,8 +153,8 @@ def _content(capture: Path, name: str, limit: int) -> bytes:
 
 
 @lru_cache(maxsize=4)
-def _places(capture: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int, int]]:
-    """Return place, packed size and size of each member of a zip."""
+def _parts_of_zip(capture: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int, int]]:
+    """Return offset, compressed size and size of each readable member of a zip, by name."""
     from sceneprint.formats.archive import zip_entries
 
     with capture.open("rb") as file:
@@ -173,25 +173,26 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
 
     Parameters
     ----------
-    capture : an .r3d file, or a folder with `metadata` and `rgbd`
-    name : of the sequence
+    capture : .r3d file, or folder with `metadata` and `rgbd`
+    name : name of the sequence
 
     Returns
     -------
-    sequence : its `note` says what was left out
+    sequence : sequence whose `note` lists the omitted frames
 
     Raises
     ------
-    DatasetError : the capture is damaged, exported in another form, or no frame has depth.
+    DatasetError : If the capture is damaged or exported in another format, or no frame has depth.
     """
     if capture.is_dir() and not (capture / METADATA).is_file():
         raise DatasetError(
-            f"{capture}: This export of Record3D has depth as OpenEXR, which is not read. {_REMEDY}"
+            f"{capture}: This export of Record3D has depth as OpenEXR, which is not supported. "
+            f"{_REMEDY}"
         )
     try:
-        fields = json.loads(_content(capture, METADATA, _MAXIMUM_METADATA_BYTES))
+        fields = json.loads(_part(capture, METADATA, _MAXIMUM_METADATA_BYTES))
         if not isinstance(fields, dict) or not isinstance(fields.get("poses"), list):
-            raise DatasetError("They have no list of poses.")
+            raise DatasetError("They do not contain a list of poses.")
         width, height = (pixels(fields.get(key), key) for key in ("w", "h"))
         portrait = _LIDAR if width < height else _LIDAR[::-1]
         size = (
@@ -199,7 +200,7 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
             pixels(fields.get("dh", portrait[1]), "dh"),
         )
         if size[0] * size[1] > MAXIMUM_SAMPLES:
-            raise DatasetError(f"They announce depth of {size[0]} x {size[1]} pixels.")
+            raise DatasetError(f"They announce {size[0]} x {size[1]} pixels of depth.")
     except (ValueError, RecursionError, SceneprintError) as cause:
         reason = printable(f"{cause!s:.200}")
         raise DatasetError(
@@ -208,7 +209,7 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
     frames, left_out = list[FrameReference](), Counter[str]()
     for place, pose in enumerate(fields["poses"][:_MOST_FRAMES]):
         file = f"{FRAMES}/{place}{DEPTH_SUFFIX}"
-        if not _is_there(capture, file):
+        if not _has_part(capture, file):
             left_out["frames without depth"] += 1
             continue
         try:
@@ -230,36 +231,36 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
     return sequence_of(capture, Layout.RECORD3D, name, frames, left_out, _REMEDY)
 
 
-def _is_there(capture: Path, file: str) -> bool:
+def _has_part(capture: Path, file: str) -> bool:
     if capture.is_dir():
         return (capture / file).is_file()
     status = capture.stat()
-    return file in _places(capture, status.st_mtime_ns, status.st_size)
+    return file in _parts_of_zip(capture, status.st_mtime_ns, status.st_size)
 
 
 def _lens(fields: dict[str, Any], place: int, width: int, height: int) -> Lens:
-    """Return the camera of a frame; DatasetError where it is none."""
+    """Return the camera of a frame. Raise DatasetError if it is invalid."""
     rows, K = fields.get("perFrameIntrinsicCoeffs"), fields.get("K")
     if isinstance(rows, list) and place < len(rows) and isinstance(rows[place], list):
         values = rows[place][:4]
     elif isinstance(K, list) and len(K) == 9:
-        values = [K[0], K[4], K[6], K[7]]  # column by column
+        values = [K[0], K[4], K[6], K[7]]  # K is stored column by column
     else:
-        raise DatasetError("neither K nor perFrameIntrinsicCoeffs")
+        raise DatasetError("K and perFrameIntrinsicCoeffs are missing")
     if len(values) != 4:
-        raise DatasetError("a camera with fewer than four numbers")
+        raise DatasetError("a camera has fewer than four numbers")
     fx, fy, cx, cy = (number(value, "an intrinsic") for value in values)
     return Lens(fx, fy, cx, cy, width, height)
 
 
 def _pose(values: object) -> Floats:
-    """Return T_world_camera (4, 4) in ARKit's axes; DatasetError where it is none."""
+    """Return T_world_camera (4, 4) in ARKit axes. Raise DatasetError if it is invalid."""
     if not isinstance(values, list) or len(values) != 7:
-        raise DatasetError("a pose without seven numbers")
+        raise DatasetError("a pose does not have seven numbers")
     numbers = np.array([number(value, "a pose") for value in values])
     length = float(np.linalg.norm(numbers[:4]))
     if not 0.9 < length < 1.1:
-        raise DatasetError("a pose without a unit quaternion")
+        raise DatasetError("the quaternion of a pose does not have unit length")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_of(numbers[:4] / length), numbers[4:]
     return transform(T.tolist(), "a pose")

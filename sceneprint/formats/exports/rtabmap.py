@@ -1,9 +1,9 @@
-"""RTAB-Map databases: the depth images or laser scans of their nodes, at the optimised poses.
+"""Read RTAB-Map databases: depth images or laser scans of their nodes, with optimised poses.
 
 path  --rtabmap_sequences-->  FrameSequence, ...
 
-Tables Node, Data and Admin are read, as rtabmap 0.10 to 0.23 writes them. The file is a stranger's:
-it is opened read-only, nothing in its schema is run, and what a query may read is bounded.
+The reader uses the tables Node, Data and Admin of rtabmap 0.10 to 0.23. The file is not trusted: it
+is opened read-only, code in its schema is not run, and queries are limited.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ from sceneprint_client.errors import printable
 from sceneprint_client.sidecars import Camera, CloudSource
 
 _SIGNATURE = b"SQLite format 3\0"
-#: Most bytes of one value, instructions of one query (times 100,000), and nodes.
+#: Maximum size of a value, bytes; maximum number of instructions of a query, in units of 100,000;
+#: and maximum number of nodes.
 _MAXIMUM_VALUE, _MOST_STEPS, _MOST_NODES = 256 << 20, 20_000, 1_000_000
 _COLUMNS = {
     "Node": {"id", "map_id", "stamp", "pose"},
@@ -62,40 +63,42 @@ _EXPORT_CLOUD = "export its cloud with `rtabmap-export --cloud` and upload that 
 
 
 def is_rtabmap(path: Path) -> bool:
-    """Return whether a path is a database that RTAB-Map may have written, by its name and head."""
+    """Return whether a path may be a database of RTAB-Map, by its suffix and first bytes."""
     if path.suffix.lower() != ".db":
         return False
     try:
         with path.open("rb") as file:
             return path.is_file() and file.read(len(_SIGNATURE)) == _SIGNATURE
-    except OSError:  # a reader that opens it states the reason
+    except OSError:  # a later reader reports the error
         return False
 
 
-_NodeCamera = tuple[Intrinsics, Floats]  #: of its part of the depth image, and T_base_camera
+_NodeCamera = tuple[
+    Intrinsics, Floats
+]  #: intrinsics of a camera's part of the image, T_base_camera
 
 
 @dataclass(eq=False)
 class _Node:
-    """A node of the graph, without its images."""
+    """Node of the graph without its images."""
 
     id: int
     session: int
     stamp: float
     pose: Floats | None
-    cameras: tuple[_NodeCamera, ...] = ()  #: with depth
+    cameras: tuple[_NodeCamera, ...] = ()  #: cameras with depth
     scan: tuple[int, Floats] | None = None  #: format and T_base_scan of its laser scan
 
 
 @dataclass(frozen=True)
 class RtabmapDepth:
-    """The depth image of one camera of a node, as the bytes of a file.
+    """Source of the depth image of one camera of a node.
 
     Parameters
     ----------
-    path : of the database
-    node : its id
-    camera, cameras : which of them it is, from the left, and how many share the image
+    path : path of the database
+    node : id of the node
+    camera, cameras : index of the camera from the left, and number of cameras that share the image
     """
 
     path: Path
@@ -108,12 +111,12 @@ class RtabmapDepth:
 
         Raises
         ------
-        DatasetError : the database cannot be read.
-        UnreadableFrame : the image is damaged or none.
+        DatasetError : If the database cannot be read.
+        UnreadableFrame : If the image is damaged or missing.
         """
         blob = _value(self.path, "depth", self.node)
-        known = depth_size(blob[:DEPTH_HEAD])
-        if self.cameras == 1 and known is not None and known[0] == "millimetres":
+        kind = depth_size(blob[:DEPTH_HEAD])
+        if self.cameras == 1 and kind is not None and kind[0] == "millimetres":
             return blob
         samples = depth_samples(blob)
         width = samples.shape[1] // self.cameras
@@ -125,13 +128,13 @@ class RtabmapDepth:
 
 @dataclass(frozen=True)
 class RtabmapScan:
-    """The laser scan of a node, as the bytes of a file.
+    """Source of the laser scan of a node.
 
     Parameters
     ----------
-    path : of the database
-    node : its id
-    form : rtabmap's number for what each point holds; 0 where not stored
+    path : path of the database
+    node : id of the node
+    form : format number of rtabmap for the points; 0 if not stored
     """
 
     path: Path
@@ -143,31 +146,31 @@ class RtabmapScan:
 
         Raises
         ------
-        DatasetError : the database cannot be read.
-        UnreadableCloud : the scan is damaged, or has no heights.
+        DatasetError : If the database cannot be read.
+        UnreadableCloud : If the scan is damaged or two-dimensional.
         """
         return encode_npy(scan_points(_value(self.path, "scan", self.node), self.form))
 
 
 def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
-    """Return the frames of a database: one sequence per camera, or of the laser scans.
+    """Return the frames of a database: one sequence per camera, or the laser scans.
 
-    Poses are the optimised ones that rtabmap stores when it closes a database. Where there are
-    none, they are those of odometry, and each session of the database has a frame of its own.
+    The poses are the optimised ones that rtabmap stores when it closes a database. If they are
+    missing, odometry provides the poses, and each session has its own parent frame.
 
     Parameters
     ----------
-    path : the database
-    name : of the sequences; default: that of the file
+    path : path of the database
+    name : name of the sequences; default: name of the file
 
     Returns
     -------
-    sequences : at least one; a `note` says what was left out
+    sequences : at least one sequence; the `note` lists the omitted nodes
 
     Raises
     ------
-    DatasetError : the file is no database of RTAB-Map, of a version that is not read, still in
-        use, or damaged; or no node has depth or a laser scan of three dimensions.
+    DatasetError : If the file is not a database of RTAB-Map, has an unsupported version, is in use
+        or damaged, or no node has depth or a three-dimensional laser scan.
     """
     name = name or path.stem
     with _opened(path) as database:
@@ -183,9 +186,9 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
         nodes = [node for node in nodes if node.cameras]
     if not nodes:
         raise DatasetError(
-            f"{path}: No node has a depth image or a laser scan of three dimensions"
-            f"{_listed(left_out, ' (', ')')}. Record with a depth camera or a 3D LiDAR and keep "
-            f"`Mem/BinDataKept` true; or {_EXPORT_CLOUD}."
+            f"{path}: No node has a depth image or a three-dimensional laser scan"
+            f"{_listed(left_out, ' (', ')')}. Record with a depth camera or a 3D LiDAR and with "
+            f"`Mem/BinDataKept` set to true, or {_EXPORT_CLOUD}."
         )
     sequences: list[FrameSequence] = []
     for world, of_world in _worlds(name, nodes, optimised is not None):
@@ -200,16 +203,16 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
 
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a database that nothing is run of, and turn its errors into ours."""
+    """Open an untrusted database with restrictions. Raise DatasetError for errors of SQLite."""
     for suffix in ("-wal", "-journal"):
         beside = path.with_name(path.name + suffix)
         if beside.is_file() and beside.stat().st_size:
             raise DatasetError(
-                f"{path}: There is an unfinished {beside.name} beside the database. Close "
-                "RTAB-Map; if it crashed, open the database in it once."
+                f"{path}: The database has an unfinished journal {beside.name}. Close RTAB-Map. If "
+                "it crashed, open the database in RTAB-Map once."
             )
     try:
-        # immutable: without locks, and without any file beside it
+        # with immutable=1, SQLite creates no locks and no other files
         uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAXIMUM_VALUE)
@@ -220,7 +223,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             steps = iter(range(_MOST_STEPS))
             database.set_progress_handler(lambda: next(steps, None) is None, 100_000)
             yield database
-    # what SQLite says may quote bytes of the file that are no text
+    # messages of SQLite may quote bytes of the file that are not valid UTF-8
     except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as cause:
         reason = printable(f"{cause!s:.120}")
         raise DatasetError(
@@ -230,18 +233,18 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _version(path: Path, database: sqlite3.Connection) -> Version:
-    """Return the version of a database that has the tables of RTAB-Map.
+    """Return the RTAB-Map version of a database.
 
     Raises
     ------
-    DatasetError : it has not, or another version's.
+    DatasetError : If tables or columns are missing, or the version is not supported.
     """
     tables = database.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchmany(500)
     names = {str(row[0]) for row in tables}
     if "Node" not in names or "Link" not in names:
         raise DatasetError(
-            f"{path}: This SQLite database is not one of RTAB-Map: it has no tables Node and Link. "
-            "Name a database that rtabmap has written."
+            f"{path}: This SQLite database has no tables Node and Link, so RTAB-Map did not write "
+            "it. Specify a database of RTAB-Map."
         )
     text = ""
     if "Admin" in names:
@@ -251,14 +254,15 @@ def _version(path: Path, database: sqlite3.Connection) -> Version:
     version = (int(match[1]), int(match[2]), int(match[3])) if match else (0, 0, 0)
     if version < _OLDEST:
         raise DatasetError(
-            f"{path}: The database is of RTAB-Map {printable(text[:20]) or 'before 0.5'}, and "
-            f"versions before 0.10 are not read. Convert it with `{_REPROCESS}` of a newer one."
+            f"{path}: The database is from RTAB-Map {printable(text[:20]) or 'before 0.5'}; "
+            f"versions before 0.10 are not supported. Convert it with `{_REPROCESS}` of a newer "
+            "version."
         )
     for table, columns in _COLUMNS.items():
         rows = database.execute(f"PRAGMA table_info({table})").fetchmany(500)
         missing = columns - {str(row[1]) for row in rows} if table in names else columns
         if missing:
-            newer = "newer than those known here, up to 0.23" if version > _NEWEST else "incomplete"
+            newer = "newer than 0.23, the last known version" if version > _NEWEST else "incomplete"
             raise DatasetError(
                 f"{path}: The table {table} of the database (RTAB-Map {text}, {newer}) lacks "
                 f"{', '.join(sorted(missing))}. Convert it with `{_REPROCESS}`, or {_EXPORT_CLOUD}."
@@ -267,7 +271,7 @@ def _version(path: Path, database: sqlite3.Connection) -> Version:
 
 
 def _optimised_poses(database: sqlite3.Connection) -> dict[int, Floats] | None:
-    """Return the optimised poses by node; None where the database stores none."""
+    """Return the optimised poses by node; None if the database has none."""
     columns = {str(row[1]) for row in database.execute("PRAGMA table_info(Admin)").fetchmany(500)}
     if not {"opt_ids", "opt_poses"} <= columns:
         return None
@@ -280,22 +284,22 @@ def _optimised_poses(database: sqlite3.Connection) -> dict[int, Floats] | None:
         return None
     if ids.dtype != np.int32 or poses.dtype != np.float32 or poses.size != 12 * ids.size:
         return None
-    known = {}
+    by_node = {}
     for node, numbers in zip(ids.tolist(), poses.reshape(-1, 12), strict=True):
         try:
             pose = transform(numbers.tobytes())
         except BrokenBlob:
             continue
-        if node > 0 and pose is not None:  # landmarks have negative numbers
-            known[node] = pose
-    return known or None
+        if node > 0 and pose is not None:  # landmarks have negative ids
+            by_node[node] = pose
+    return by_node or None
 
 
 def _nodes(
     path: Path, database: sqlite3.Connection, version: Version,
     optimised: dict[int, Floats] | None, left_out: Counter[str],
 ) -> Iterator[_Node]:  # fmt: skip
-    """Yield the nodes with data, in their order; what is wrong with some is counted."""
+    """Yield the nodes with data and a pose, in order, and count the others in `left_out`."""
     columns = {str(row[1]) for row in database.execute("PRAGMA table_info(Data)").fetchmany(500)}
     scan = "substr(d.scan, -12)" if "scan" in columns else "NULL"
     scan += ", d.scan_info" if "scan_info" in columns else ", NULL"
@@ -322,20 +326,20 @@ def _nodes(
 
 
 def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _Node:
-    """Return a node of a row, with its pose of odometry.
+    """Return the node of a row with its odometry pose.
 
     Raises
     ------
-    BrokenBlob, TypeError, ValueError, OverflowError : a column is not what it should be.
+    BrokenBlob, TypeError, ValueError, OverflowError : If a column has an invalid value.
     """
     number, session, stamp, odometry, head, calibration, scan_tail, scan_info = row
     node = _Node(int(number), int(session), float(stamp or 0.0), None)
     node.pose = transform(odometry) if isinstance(odometry, bytes) else None
-    known = depth_size(head) if isinstance(head, bytes) else None
-    if known is not None and isinstance(calibration, bytes):
+    depth = depth_size(head) if isinstance(head, bytes) else None
+    if depth is not None and isinstance(calibration, bytes):
         lenses = cameras(calibration, version)
-        node.cameras = tuple(_scaled(lens, known[1] // len(lenses), known[2]) for lens in lenses)
-    elif known is not None:
+        node.cameras = tuple(_scaled(lens, depth[1] // len(lenses), depth[2]) for lens in lenses)
+    elif depth is not None:
         left_out["depth images without a calibration"] += 1
     elif isinstance(head, bytes) and len(head) > 4:
         left_out["stereo images without depth"] += 1
@@ -349,20 +353,20 @@ def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _No
 
 
 def _scaled(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
-    """Return a camera for a depth image of this size, which may be smaller than the colour image.
+    """Scale the camera of a colour image to a depth image of this size, pixels.
 
     Raises
     ------
-    BrokenBlob : the image is of another shape, or the camera is none.
+    BrokenBlob : If the images have different aspect ratios, or the camera is invalid.
     """
     across = width / lens.width if lens.width else 1.0
     down = height / lens.height if lens.height else 1.0
     if not math.isclose(across, down, rel_tol=0.02):
         raise BrokenBlob(
-            f"depth of {width} x {height} pixels, calibrated for {lens.width} x {lens.height}"
+            f"depth has {width} x {height} pixels, but its camera {lens.width} x {lens.height}"
         )
     try:
-        # as rtabmap scales cameras: pixel centres have whole coordinates, and (0, 0) stays
+        # rtabmap scales about (0, 0), and its pixel centres have integer coordinates
         intrinsics = Intrinsics(
             width=width, height=height, fx=lens.fx * across, fy=lens.fy * down,
             cx=lens.cx * across, cy=lens.cy * down,
@@ -373,12 +377,12 @@ def _scaled(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
 
 
 def _value(path: Path, column: str, node: int) -> bytes:
-    """Return a binary value of a node; DatasetError where it is not there."""
+    """Return a binary value of a node. Raise DatasetError if it is missing."""
     with _opened(path) as database:
         row = database.execute(f"SELECT {column} FROM Data WHERE id = ?", (node,)).fetchone()
     if row is None or not isinstance(row[0], bytes):
         raise DatasetError(
-            f"{path}: Node {node} has no {column} any more. Read the database again."
+            f"{path}: Node {node} no longer has the column {column}. Read the database again."
         )
     return row[0]
 
@@ -387,7 +391,7 @@ def _value(path: Path, column: str, node: int) -> bytes:
 
 
 def _worlds(name: str, nodes: list[_Node], is_optimised: bool) -> Iterator[tuple[str, list[_Node]]]:
-    """Yield the nodes whose poses lead to one frame, with that frame's name."""
+    """Yield each parent frame with the nodes whose poses lead to it."""
     sessions = sorted({node.session for node in nodes})
     if is_optimised or len(sessions) == 1:
         yield name, nodes
@@ -399,17 +403,17 @@ def _worlds(name: str, nodes: list[_Node], is_optimised: bool) -> Iterator[tuple
 def _sequences(path: Path, name: str, world: str, nodes: list[_Node]) -> Iterator[FrameSequence]:
     count = max(len(node.cameras) for node in nodes)
     if not count:
-        frames = tuple(_of_scan(path, name, node) for node in nodes)
+        frames = tuple(_scan_frame(path, name, node) for node in nodes)
         yield FrameSequence(world, path, Layout.RTABMAP, world, None, frames)
     for place in range(count):
         sequence = world if count == 1 else f"{world}/camera-{place}"
         frames = tuple(
-            _of_camera(path, name, node, place) for node in nodes if place < len(node.cameras)
+            _camera_frame(path, name, node, place) for node in nodes if place < len(node.cameras)
         )
         yield FrameSequence(sequence, path, Layout.RTABMAP, world, None, frames)
 
 
-def _of_camera(path: Path, name: str, node: _Node, place: int) -> FrameReference:
+def _camera_frame(path: Path, name: str, node: _Node, place: int) -> FrameReference:
     assert node.pose is not None
     count, (intrinsics, T_base_camera) = len(node.cameras), node.cameras[place]
     label = f"{node.id:06d}" if count == 1 else f"{node.id:06d}-{place}"
@@ -426,7 +430,7 @@ def _of_camera(path: Path, name: str, node: _Node, place: int) -> FrameReference
     )
 
 
-def _of_scan(path: Path, name: str, node: _Node) -> FrameReference:
+def _scan_frame(path: Path, name: str, node: _Node) -> FrameReference:
     assert node.scan is not None
     assert node.pose is not None
     form, T_base_scan = node.scan
@@ -445,13 +449,13 @@ def _of_scan(path: Path, name: str, node: _Node) -> FrameReference:
 
 
 def _note(sequences: list[FrameSequence], is_optimised: bool, left_out: Counter[str]) -> str:
-    """Return what was taken and what was left out, for people."""
+    """Return a note for users on the frames, their poses and the omitted nodes."""
     frames = sum(len(one.frames) for one in sequences)
     poses = "optimised poses"
     if not is_optimised:
         poses = (
-            "poses of odometry, as the database stores no optimised ones: "
-            "open and close it in RTAB-Map to have them"
+            "odometry poses, because the database has no optimised poses: "
+            "open and close it in RTAB-Map to store them"
         )
     return f"{frames} frames taken, {poses}{_listed(left_out, '; left out: ', '')}"
 

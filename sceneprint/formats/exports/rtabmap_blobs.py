@@ -1,12 +1,12 @@
-"""Binary columns of RTAB-Map's databases: transforms, matrices, calibrations, depth, laser scans.
+"""Decode binary columns of RTAB-Map databases: transforms, calibrations, depth, laser scans.
 
 bytes  --transform-->  (4, 4)          bytes  --matrix-->  array
 bytes, version  --cameras-->  RtabmapCamera, ...          bytes  --depth_samples-->  (H, W)
 
-The layouts are those of rtabmap's DBDriverSqlite3.cpp, CameraModel.cpp, Compression.cpp and
-rvl_codec.cpp, of the versions 0.10 to 0.23. Axes: the robot's base has x forward, y left, z up;
-`local_transform` leads from the optical axes of a camera (x right, y down, z forward) to the base.
-Pixel centres have whole coordinates.
+The layouts follow DBDriverSqlite3.cpp, CameraModel.cpp, Compression.cpp and rvl_codec.cpp of
+rtabmap 0.10 to 0.23. The axes of the robot's base are x forward, y left, z up. `local_transform`
+maps the optical axes of a camera (x right, y down, z forward) to the base. Pixel centres have
+integer coordinates.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from sceneprint_client.files import PNG_SIGNATURE
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import rvl_samples
 
-#: Of a database: major, minor and patch.
+#: Version of a database: major, minor, patch.
 Version = tuple[int, int, int]
 
-#: Most bytes of a matrix once it is inflated.
+#: Maximum size of a decompressed matrix, bytes.
 _MAXIMUM_MATRIX_BYTES = 256 << 20
-#: Element types of OpenCV's matrices by their code.
+#: Element types of OpenCV matrices, by type code.
 _ELEMENTS = ("u1", "i1", "<u2", "<i2", "<i4", "<f4", "<f8")
 _RVL = b"DEPTHRVL"
 _RVL_HEADER = len(_RVL) + 8
-#: Bytes that tell what a depth image is, and its size.
+#: Number of first bytes of a depth image that determine its kind and size.
 DEPTH_HEAD = 32
 _AGAIN = "Copy the database again, or export it with rtabmap-reprocess."
-#: Rotation from optical axes to those of a base: what rtabmap assumes where nothing is stored.
+#: Rotation from optical axes to the base, which rtabmap assumes if none is stored.
 _OPTICAL = (
     (0.0, 0.0, 1.0, 0.0),
     (-1.0, 0.0, 0.0, 0.0),
@@ -50,13 +50,13 @@ _OPTICAL = (
 
 @dataclass(frozen=True, eq=False)
 class RtabmapCamera:
-    """A camera of a node.
+    """Camera of a node.
 
     Parameters
     ----------
-    fx, fy, cx, cy : pixels of the rectified image
-    width, height : of the colour image that they are for; 0 where not stored
-    T_base_camera : (4, 4), optical axes to the robot's base
+    fx, fy, cx, cy : intrinsics of the rectified image, pixels
+    width, height : size of the colour image, pixels; 0 if not stored
+    T_base_camera : (4, 4) transform from optical axes to the robot's base
     """
 
     fx: float
@@ -69,18 +69,18 @@ class RtabmapCamera:
 
 
 class BrokenBlob(ValueError):
-    """A column that does not hold what it should; its text says why."""
+    """Error for a column with an invalid value; the message says why."""
 
 
 def transform(blob: bytes) -> Floats | None:
-    """Return the transform (4, 4) of 3 x 4 float32, row by row; None for the null transform.
+    """Return the transform (4, 4) from 3 x 4 float32, row by row; None for the null transform.
 
     Raises
     ------
-    BrokenBlob : the length is another, or it is not rigid.
+    BrokenBlob : If the length is wrong, or the transform is not rigid.
     """
     if len(blob) != 48:
-        raise BrokenBlob(f"a transform has {len(blob)} bytes and not 48")
+        raise BrokenBlob(f"a transform has {len(blob)} bytes, not 48")
     T = np.eye(4)
     T[:3] = np.frombuffer(blob, "<f4").reshape(3, 4)
     if not T[:3].any():
@@ -92,31 +92,31 @@ def transform(blob: bytes) -> Floats | None:
 
 
 def matrix(blob: bytes) -> NDArray[Any]:
-    """Return the array (rows, columns, channels) of a matrix that rtabmap deflated.
+    """Return the array (rows, columns, channels) of a compressed matrix.
 
-    Three 32-bit integers behind the deflated bytes give rows, columns and OpenCV's type.
+    Three 32-bit integers after the compressed bytes are rows, columns and the OpenCV type.
 
     Raises
     ------
-    BrokenBlob : it is damaged, or larger than 256 MiB.
+    BrokenBlob : If the matrix is damaged, or larger than 256 MiB.
     """
     if len(blob) < 12:
-        raise BrokenBlob("a matrix ends early")
+        raise BrokenBlob("a matrix is truncated")
     rows, columns, kind = struct.unpack("<3i", blob[-12:])
     channels = ((kind >> 3) & 511) + 1
     if kind & 7 >= len(_ELEMENTS) or min(rows, columns) < 0:
-        raise BrokenBlob("the size or type of a matrix is none")
+        raise BrokenBlob("the size or type of a matrix is invalid")
     dtype = np.dtype(_ELEMENTS[kind & 7])
     size = rows * columns * channels * dtype.itemsize
     if size > _MAXIMUM_MATRIX_BYTES:
-        raise BrokenBlob(f"a matrix announces {size} bytes")
+        raise BrokenBlob(f"a matrix announces {size} bytes, which exceeds the limit")
     stream = zlib.decompressobj()
     try:
         content = stream.decompress(blob[:-12], size + 1)
     except zlib.error as cause:
-        raise BrokenBlob("a matrix does not inflate") from cause
+        raise BrokenBlob("a matrix cannot be decompressed") from cause
     if len(content) != size:
-        raise BrokenBlob("a matrix is shorter or longer than it announces")
+        raise BrokenBlob("the size of a matrix differs from the announced size")
     return np.frombuffer(content, dtype).reshape(rows, columns, channels)
 
 
@@ -124,17 +124,17 @@ def matrix(blob: bytes) -> NDArray[Any]:
 
 
 def cameras(blob: bytes, version: Version) -> tuple[RtabmapCamera, ...]:
-    """Return the cameras of a node, from left to right in its images; none for a stereo camera.
+    """Return the cameras of a node, from left to right in its images; empty for a stereo camera.
 
     Parameters
     ----------
-    blob : calibration. From 0.18 on, one record per camera; before, float32 numbers: fx, fy, cx,
-        cy, (from 0.11.2 on) width, height, and the local transform of each camera
-    version : of the database
+    blob : calibration. Since 0.18, it has one record per camera. Before, it had the float32 numbers
+        fx, fy, cx, cy, (since 0.11.2) width, height, and the local transform of each camera
+    version : version of the database
 
     Raises
     ------
-    BrokenBlob : it is damaged.
+    BrokenBlob : If the calibration is damaged.
     """
     if version >= (0, 18, 0):
         return _serialized_cameras(blob)
@@ -143,9 +143,9 @@ def cameras(blob: bytes, version: Version) -> tuple[RtabmapCamera, ...]:
     if len(numbers) % of_camera == 0 and len(numbers):
         rows = numbers.reshape(-1, of_camera)
         return tuple(_camera_of(*row[:-12].tolist(), local=row[-12:].tobytes()) for row in rows)
-    if len(numbers) in (17, 19):  # a baseline, and of newer ones the size of the image
+    if len(numbers) in (17, 19):  # a stereo camera has a baseline, and since 0.11.2 a size
         return ()
-    raise BrokenBlob(f"a calibration has {len(blob)} bytes")
+    raise BrokenBlob(f"a calibration has the invalid size of {len(blob)} bytes")
 
 
 def _camera_of(
@@ -160,11 +160,11 @@ def _camera_of(
 
 
 def _serialized_cameras(blob: bytes) -> tuple[RtabmapCamera, ...]:
-    """Return the cameras of records: 11 integers, then K, D, R, P as float64, a transform."""
+    """Return the cameras of records of 11 integers, K, D, R and P as float64, and a transform."""
     cameras, at = [], 0
     while at < len(blob):
         if len(blob) - at < 44:
-            raise BrokenBlob("a calibration ends early")
+            raise BrokenBlob("a calibration is truncated")
         header = struct.unpack_from("<11i", blob, at)
         kind, width, height, k, d, r, p, local = header[3:]
         if kind == 1:
@@ -172,9 +172,9 @@ def _serialized_cameras(blob: bytes) -> tuple[RtabmapCamera, ...]:
         sizes_fit = k in (0, 9) and 0 <= d <= 14 and r in (0, 9) and p in (0, 12)
         end = at + 44 + 8 * (k + d + r + p) + 4 * local
         if kind != 0 or not sizes_fit or local not in (0, 12) or end > len(blob):
-            raise BrokenBlob("a calibration is of an unknown form")
+            raise BrokenBlob("a calibration has an unknown format")
         numbers = np.frombuffer(blob, "<f8", k + d + r + p, at + 44)
-        # P is the camera of the rectified images, which are the ones stored
+        # P is the camera of the rectified images, which the database stores
         P, K = numbers[k + d + r :].reshape(-1, 4), numbers[:k].reshape(-1, 3)
         lens = P if len(P) and P[0, 0] > 0 else K
         if not len(lens):
@@ -188,17 +188,17 @@ def _serialized_cameras(blob: bytes) -> tuple[RtabmapCamera, ...]:
     return tuple(cameras)
 
 
-# Depth images: PNG of 16-bit millimetres, PNG of float metres as four bytes of colour, or RVL.
+# Depth images: PNG of 16-bit millimetres, PNG of float metres in four colour channels, or RVL.
 
 DepthKind = Literal["millimetres", "metres", "rvl"]
 
 
 def depth_size(head: bytes) -> tuple[DepthKind, int, int] | None:
-    """Return kind, width and height of a depth image; None for any other image.
+    """Return the kind, width and height of a depth image; None for other images.
 
     Parameters
     ----------
-    head : its first `DEPTH_HEAD` bytes
+    head : first `DEPTH_HEAD` bytes of the image
     """
     if head.startswith(_RVL) and len(head) >= _RVL_HEADER:
         width, height = struct.unpack_from("<II", head, len(_RVL))
@@ -217,16 +217,16 @@ def depth_samples(blob: bytes) -> Samples:
 
     Raises
     ------
-    UnreadableFrame : it is damaged, too large, or no depth image.
+    UnreadableFrame : If the image is damaged, too large, or not a depth image.
     """
-    known = depth_size(blob[:DEPTH_HEAD])
-    if known is None:
-        raise UnreadableFrame(f"The image of the node holds no depth. {_AGAIN}")
-    kind, width, height = known
+    header = depth_size(blob[:DEPTH_HEAD])
+    if header is None:
+        raise UnreadableFrame(f"The image of the node is not a depth image. {_AGAIN}")
+    kind, width, height = header
     if not 1 <= width * height <= MAXIMUM_SAMPLES:
         raise UnreadableFrame(
-            f"The depth image announces {width} x {height} samples; 1 to {MAXIMUM_SAMPLES} are "
-            f"read. {_AGAIN}"
+            f"The depth image announces {width} x {height} samples; it must have 1 to "
+            f"{MAXIMUM_SAMPLES}. {_AGAIN}"
         )
     if kind == "millimetres":
         return decode_png(blob)
@@ -237,38 +237,38 @@ def _float_samples(blob: bytes) -> Floats32:
     from PIL.PngImagePlugin import PngImageFile
 
     try:
-        # not by Image.open, whose limit of pixels is the program's
+        # the pixel limit of Image.open is a setting of the whole process
         with PngImageFile(io.BytesIO(blob)) as image:
             colours = np.asarray(image)
     except (OSError, ValueError, SyntaxError) as cause:
         raise UnreadableFrame(f"The depth image is damaged ({cause}). {_AGAIN}") from cause
-    # OpenCV's order is blue, green, red, alpha: the four bytes of a float32
+    # in the channel order of OpenCV (blue, green, red, alpha), the bytes are a float32
     return np.ascontiguousarray(colours[:, :, [2, 1, 0, 3]]).view("<f4")[:, :, 0]
 
 
 # Laser scans.
 
-#: Formats of scans with x, y and z; before 0.16.1 the number of values per point says it.
+#: Formats of three-dimensional scans, and their numbers of values per point before 0.16.1.
 _SOLID_FORMATS, _SOLID_CHANNELS = range(5, 12), (3, 4, 6, 7)
 
 
 def scan_placement(blob: bytes | None, version: Version) -> tuple[int, Floats]:
-    """Return the format of a laser scan (0 where not stored) and T_base_scan (4, 4).
+    """Return the format of a laser scan (0 if not stored) and T_base_scan (4, 4).
 
     Parameters
     ----------
-    blob : scan_info, or None
-    version : of the database
+    blob : column scan_info, or None
+    version : version of the database
 
     Raises
     ------
-    BrokenBlob : it is damaged.
+    BrokenBlob : If the column is damaged.
     """
     if not blob:
         return 0, np.eye(4)
     leading = len(blob) // 4 - 12
     if len(blob) % 4 or leading not in ((7,) if version >= (0, 18, 0) else (2, 3)):
-        raise BrokenBlob(f"the description of a laser scan has {len(blob)} bytes")
+        raise BrokenBlob(f"the description of a laser scan has the invalid size {len(blob)}")
     T = transform(blob[-48:])
     form = {7: 0, 3: 2}.get(leading)
     number = 0.0 if form is None else struct.unpack_from("<f", blob, 4 * form)[0]
@@ -276,12 +276,12 @@ def scan_placement(blob: bytes | None, version: Version) -> tuple[int, Floats]:
 
 
 def is_solid(tail: bytes, form: int) -> bool:
-    """Return whether a laser scan has heights.
+    """Return whether a laser scan is three-dimensional.
 
     Parameters
     ----------
-    tail : the last 12 bytes of the scan, which say how many values each point has
-    form : as of `scan_placement`
+    tail : last 12 bytes of the scan, which contain the number of values per point
+    form : format from `scan_placement`
     """
     kind = struct.unpack("<3i", tail)[2] if len(tail) == 12 else 0
     channels = ((kind >> 3) & 511) + 1
@@ -291,18 +291,16 @@ def is_solid(tail: bytes, form: int) -> bool:
 
 
 def scan_points(blob: bytes, form: int) -> Floats32:
-    """Return the points (N, 3) of a laser scan, metres in its own axes.
+    """Return the points (N, 3) of a laser scan, metres in the axes of the scan.
 
     Raises
     ------
-    UnreadableCloud : it is damaged, or has no heights.
+    UnreadableCloud : If the scan is damaged or two-dimensional.
     """
     try:
         rows = matrix(blob)
     except BrokenBlob as cause:
         raise UnreadableCloud(f"The laser scan is damaged: {cause}. {_AGAIN}") from cause
     if not is_solid(blob[-12:], form):
-        raise UnreadableCloud(
-            "The laser scan has no heights. Only scans of three dimensions are read."
-        )
+        raise UnreadableCloud("The laser scan is two-dimensional. Use three-dimensional scans.")
     return np.ascontiguousarray(rows.reshape(-1, rows.shape[2])[:, :3])

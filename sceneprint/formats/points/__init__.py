@@ -1,4 +1,4 @@
-"""Read untrusted files of points: PLY, PCD, KITTI, NPY, LAS, LAZ and E57.
+"""Readers of untrusted point clouds: PLY, PCD, KITTI, NPY, LAS, LAZ and E57.
 
 bytes  --decode_cloud-->  Cloud
 """

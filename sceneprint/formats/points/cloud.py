@@ -1,10 +1,10 @@
-"""Read clouds: the bytes of a file become a `Cloud`.
+"""Read point clouds from the bytes of a file.
 
-bytes  --decode_scan-->  Scan: the cloud, and how it was read
+bytes  --decode_scan-->  Scan: the cloud, and the parameters used to read it
 bytes  --read_kitti | read_npy | read_pointcloud2-->  FilePoints
 
-This module reads plain arrays itself: KITTI's .bin, NPY, and serialised messages of the type
-sensor_msgs/PointCloud2 of ROS 2.
+This module reads plain arrays: KITTI's .bin, NPY, and serialised ROS 2 messages of the type
+sensor_msgs/PointCloud2. Other modules read the other formats.
 """
 
 from __future__ import annotations
@@ -50,39 +50,39 @@ def read_kitti(data: bytes) -> FilePoints:
 
     Raises
     ------
-    UnreadableCloud : The size is no whole number of rows, or the rows have another length.
+    UnreadableCloud : If the size is not a multiple of a row, or the rows have another length.
     """
     count, rest = divmod(len(data), _KITTI_ROW)
     if (floats := _row_length(data)) is not None:
         row = ",".join(("x", "y", "z", "i", "ring", "time", "a", "b")[:floats])
         raise UnreadableCloud(
-            f"A row of the file holds {floats} numbers, by their values, and one of a KITTI scan "
-            f'holds 4. Name them with `--row {row}` or with "row" in clouds.json, or send x, y and '
-            "z as NPY of shape (N, 3)."
+            f"According to the values, a row of the file has {floats} numbers, but a row of a "
+            f'KITTI scan has 4. State the row with `--row {row}` or with "row" in clouds.json, or '
+            "send x, y and z as NPY with the shape (N, 3)."
         )
     if rest or not count:
         raise UnreadableCloud(
-            f"The file has {len(data)} bytes, and each point of a KITTI scan has {_KITTI_ROW}: "
-            "x, y, z and intensity as float32. Copy the file again, or say its true format."
+            f"The file has {len(data)} bytes, but each point of a KITTI scan has {_KITTI_ROW}: "
+            "x, y, z and intensity as float32. Copy the file again, or state its actual format."
         )
     check_count(count, MAXIMUM_POINTS)
     rows = np.frombuffer(data, "<f4").reshape(count, 4)
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
 
 
-#: Row lengths that are recognised, and minimum number of rows for a decision.
+#: Row lengths that can be recognised, and minimum number of rows for a decision.
 _LENGTHS, _FEWEST_ROWS = range(3, 9), 500
-_LEAST_SPREAD = 0.02  #: minimum spread of columns for a decision
-_LEAST_OF_BEST = 0.93  #: minimum spread of rows of four, relative to the largest
+_LEAST_SPREAD = 0.02  #: minimum column spread for a decision
+_LEAST_OF_BEST = 0.93  #: minimum column spread at length four, relative to the largest spread
 
 
 def _row_length(data: bytes) -> int | None:
     """Return the number of float32 in a row if it is clearly not four, else None.
 
-    At a wrong length, columns mix all fields and have similar means. The variance of the means of
-    columns, relative to that of all values, is largest for the true length. In 57 scans of three
-    sensors, written in rows of 3 to 8, the value for rows of four was at least .99 of the largest
-    if four was true, and at most .87 otherwise.
+    With a wrong length, columns mix all fields and have similar means. The variance of the column
+    means, relative to the variance of all values, is therefore largest for the correct length. In
+    57 scans of three sensors, written in rows of 3 to 8, the value for length four was at least .99
+    of the largest value if four was correct, and at most .87 otherwise.
     """
     values = np.frombuffer(data, "<f4", len(data) // 4)
     if len(values) < _FEWEST_ROWS * _KITTI_ROW // 4:
@@ -95,7 +95,7 @@ def _row_length(data: bytes) -> int | None:
 
 
 def _column_spread(values: Floats32, length: int) -> float:
-    """Return the variance of the means of columns relative to that of all values, compressed."""
+    """Return the variance of the column means relative to that of all values, after compression."""
     rows = len(values) // length
     chosen = np.linspace(0, rows - 1, min(rows, 20_000 // length)).astype(np.int64)
     table = values[: rows * length].reshape(rows, length)[chosen].astype(np.float64)
@@ -110,16 +110,16 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 
     Raises
     ------
-    UnreadableCloud : The file is not NPY, has another type or shape or more than `most` points, or
-        its size contradicts its header.
+    UnreadableCloud : If the file is not NPY, has another type or shape or more than `most` points,
+        or its size contradicts its header.
     """
     if data[: len(NPY_SIGNATURE)] != NPY_SIGNATURE:
-        raise UnreadableCloud("This is no NPY file. Write the points with numpy.save.")
+        raise UnreadableCloud("This is not an NPY file. Write the points with numpy.save.")
     shapes = (
-        "The shape of the NPY array is not that of points, (N, 3) or (N, 4). "
+        "The NPY array does not have the shape of points, (N, 3) or (N, 4). "
         "Write x, y and z of each point in a row."
     )
-    advice = "points are float32 in metres (float64 and float16 are taken too). Convert it."
+    advice = "points must be float32, float64 or float16 in metres. Convert it."
     header = npy_header(data[:HEAD], UnreadableCloud, advice, shapes)
     count, width = header.shape
     if width not in (3, 4):
@@ -128,7 +128,7 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     expected = count * width * header.dtype.itemsize
     if len(data) - header.start != expected:
         raise UnreadableCloud(
-            f"The NPY header announces {count} points of {width} values, and "
+            f"The NPY header announces {count} points of {width} values, but "
             f"{len(data) - header.start} of {expected} bytes follow. Copy or write the file again."
         )
     numbers = np.frombuffer(data, header.dtype, offset=header.start)
@@ -136,16 +136,16 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
 
 
-# Points of ROS 2.
+# ROS 2 messages.
 
 
 def read_pointcloud2(data: bytes) -> FilePoints:
-    """Return the points of a serialised PointCloud2; those at the origin count as missing.
+    """Return the points of a serialised PointCloud2; points at the origin count as missing.
 
     Raises
     ------
-    UnreadableCloud : The bytes are no such message, damaged, lack x, y or z, or their sizes
-        contradict each other.
+    UnreadableCloud : If the bytes are not such a message, are damaged, lack x, y or z, or their
+        sizes contradict each other.
     """
     table = cloud_table(read_point_cloud(data))
     return FilePoints(table.size, cloud_blocks(table))
@@ -153,7 +153,7 @@ def read_pointcloud2(data: bytes) -> FilePoints:
 
 # Thinning and decoding of clouds.
 
-#: Edge of the smallest voxels, metres: 2^21 voxels extend over 20 km.
+#: Smallest edge of a voxel, metres. 2^21 such voxels extend over 20 km.
 _FINEST = 0.01
 
 Keys = NDArray[np.int64]
@@ -166,34 +166,35 @@ def thinned(points: Floats32, most: int, finest: float = _FINEST) -> tuple[Float
 
     Parameters
     ----------
-    points : (N, 3), none beyond a million times `finest`
+    points : (N, 3) points with coordinates up to a million times `finest`
     most : maximum number; at least 8, because eight voxels of any size meet at the origin
     finest : smallest edge of a voxel
 
     Returns
     -------
-    points : (n, 3)
+    points : (n, 3) selected points
     edge : edge of the voxels
     """
     slots = 1 << max(4, math.ceil(math.log2(1.5 * most)))
-    table, kept = np.empty(slots, np.int64), np.empty(most, np.int32)
-    # a secret, because a file could be written whose voxels all share a slot of a known hash; the
-    # choice of points does not depend on it
+    table, indices = np.empty(slots, np.int64), np.empty(most, np.int32)
+    # the secret prevents files whose voxels all collide in the hash table; it does not affect the
+    # selection of points
     secret, step = secrets.randbits(62), 0
     while True:
         edge = finest * math.sqrt(2.0) ** step
-        n = _firsts(points, 1.0 / edge, secret, table, kept)
+        n = _first_points(points, 1.0 / edge, secret, table, indices)
         if n >= 0:
-            return points[kept[:n]], edge
+            return points[indices[:n]], edge
         step += 1
 
 
 @kernel
-def _firsts(
-    points: Floats32, scale: float, secret: int, table: Keys, kept: NDArray[np.int32]
+def _first_points(
+    points: Floats32, scale: float, secret: int, table: Keys, indices: NDArray[np.int32]
 ) -> int:
-    """Write the indices of the first point of each voxel to `kept`; return their number, or -1 if
-    there is no room.
+    """Write the index of the first point of each voxel to `indices`.
+
+    Return the number of indices, or -1 if there are too many.
     """
     table[:] = -1
     mask, n = len(table) - 1, 0
@@ -208,21 +209,21 @@ def _firsts(
         while table[slot] >= 0 and table[slot] != key:
             slot = (slot + 1) & mask
         if table[slot] < 0:
-            if n == len(kept):
+            if n == len(indices):
                 return -1
             table[slot] = key
-            kept[n] = i
+            indices[n] = i
             n += 1
     return n
 
 
-#: Minimum and maximum number of points of a cloud; larger ones are thinned.
+#: Minimum and maximum number of points of a cloud; larger clouds are thinned.
 FEWEST_POINTS, MOST_POINTS = 10, 5_000_000
 
 #: Maximum distance of a point from the viewpoint, metres.
 FARTHEST_M = 10_000.0
 
-#: Maximum distance of a viewpoint from the origin of its file, metres: half round the Earth.
+#: Maximum distance of a viewpoint from the origin of its file, metres: half of Earth's perimeter.
 _FARTHEST_VIEWPOINT_M = 2e7
 
 _READERS = {one.name: one.reader for one in formats_of("cloud")}
@@ -230,12 +231,12 @@ _READERS = {one.name: one.reader for one in formats_of("cloud")}
 
 @dataclass(frozen=True, eq=False)
 class ReadPoints:
-    """The content of a file of points.
+    """Content of a file of points.
 
     Parameters
     ----------
-    points : (n, 3) float32, metres from the viewpoint; finite, none beyond `FARTHEST_M`
-    viewpoint : metres in the file's axes; None without a viewpoint
+    points : (n, 3) float32, metres relative to the viewpoint; finite and at most `FARTHEST_M` away
+    viewpoint : position of the sensor, metres in the file's axes; None without a viewpoint
     file_points : number of points in the file, including missing points
     """
 
@@ -244,19 +245,19 @@ class ReadPoints:
     file_points: int
 
 
-#: A function with the parameters of `read_points`.
+#: Function with the parameters of `read_points`.
 PointsOf = Callable[[bytes, CloudFormat, Position | Unsaid | None, float], ReadPoints]
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A cloud with the parameters that it was read with.
+    """Cloud with the parameters used to read it.
 
     Parameters
     ----------
     cloud : points relative to the viewpoint
     file_format : format of the file
-    viewpoint : viewpoint that was used, metres in the file's axes; None without a viewpoint
+    viewpoint : position of the sensor, metres in the file's axes; None without a viewpoint
     file_points : number of points in the file, including missing points
     """
 
@@ -276,7 +277,7 @@ def decode_cloud(
     pose: Floats | None = None,
     points_of: PointsOf | None = None,
 ) -> Cloud:
-    """Return the cloud of a file's bytes; as `decode_scan`."""
+    """Return the cloud of a file's bytes; see `decode_scan`."""
     return decode_scan(
         data,
         file_format=file_format,
@@ -298,15 +299,16 @@ def decode_scan(
     pose: Floats | None = None,
     points_of: PointsOf | None = None,
 ) -> Scan:
-    """Return the cloud of a file's bytes with the parameters that it was read with.
+    """Return the cloud of a file's bytes with the parameters used to read it.
 
     Parameters
     ----------
     data : the whole file
-    file_format : format of the file; None: recognised by its first bytes, except for KITTI scans
+    file_format : format of the file; None recognises all formats except KITTI scans by their first
+        bytes
     viewpoint : position of the sensor, metres in the file's axes; None for points of many views;
         default: the VIEWPOINT of a PCD file, else the origin
-    units_per_metre : of the file's coordinates: 1000 for millimetres
+    units_per_metre : units of the file's coordinates per metre, such as 1000 for millimetres
     name : name of the frame in messages
     pose : (4, 4) T_parent_sensor, or None if unknown
     points_of : reader of the file; default: `read_points`
@@ -318,37 +320,37 @@ def decode_scan(
 
     Raises
     ------
-    UnreadableCloud : The bytes are of another format or damaged; there are more than 20 million
-        points, or one is more than 10 km from the viewpoint.
-    UselessFrame : There are fewer than 10 points.
-    InvalidPose : The pose is not a rigid transform.
-    MissingDependency : The file is LAZ, and lazrs is not installed.
+    UnreadableCloud : If the bytes have another format or are damaged, there are more than 20
+        million points, or a point is more than 10 km from the viewpoint.
+    UselessFrame : If there are fewer than 10 points.
+    InvalidPose : If the pose is not a rigid transform.
+    MissingDependency : If the file is LAZ and lazrs is not installed.
     """
     with naming(name):
         _check_units(units_per_metre)
         if len(data) > MAXIMUM_CLOUD_BYTES:
             raise UnreadableCloud(
-                f"The file has {len(data)} bytes, the limit is {MAXIMUM_CLOUD_BYTES}. "
-                "Thin the cloud out, or send it in parts."
+                f"The file has {len(data)} bytes; the limit is {MAXIMUM_CLOUD_BYTES}. "
+                "Thin the cloud, or send it in parts."
             )
-        found = _format(data, file_format)
-        raw = (points_of or read_points)(data, found, viewpoint, units_per_metre)
+        recognised = _format(data, file_format)
+        raw = (points_of or read_points)(data, recognised, viewpoint, units_per_metre)
         points, missing = raw.points, raw.file_points - len(raw.points)
         if len(points) < FEWEST_POINTS:
             raise UselessFrame(
                 f"{missing} of {raw.file_points} points are missing, and the {len(points)} valid "
-                f"points are fewer than {FEWEST_POINTS}. Check that the sensor saw something."
+                f"points are fewer than {FEWEST_POINTS}. Check that the sensor saw surfaces."
             )
         note = f"{missing} missing points left out" if missing else ""
         if len(points) > MOST_POINTS:
             before = len(points)
             points, edge = thinned(points, MOST_POINTS)
-            told = f"thinned from {before} points to {len(points)}, one to {100 * edge:.1f} cm"
-            note = f"{note}; {told}" if note else told
+            thinning = f"thinned from {before} points to {len(points)}, one to {100 * edge:.1f} cm"
+            note = f"{note}; {thinning}" if note else thinning
             if len(points) < FEWEST_POINTS:
                 raise UselessFrame(
-                    f"{before} points lie in {len(points)} places {100 * edge:.1f} cm apart or "
-                    f"more, fewer than {FEWEST_POINTS}. Check that the sensor saw something."
+                    f"The {before} points occupy {len(points)} voxels of {100 * edge:.1f} cm, "
+                    f"fewer than {FEWEST_POINTS}. Check that the sensor saw surfaces."
                 )
         cloud = Cloud(
             points,
@@ -357,7 +359,7 @@ def decode_scan(
             pose=None if pose is None else rigid_transform(pose),
             note=note,
         )
-        return Scan(cloud, found, raw.viewpoint, raw.file_points)
+        return Scan(cloud, recognised, raw.viewpoint, raw.file_points)
 
 
 def read_points(
@@ -368,31 +370,31 @@ def read_points(
 ) -> ReadPoints:
     """Return the points of a file of a known format; see `decode_scan`."""
     raw: FilePoints = function_at(_READERS[file_format])(data)
-    place = _place(viewpoint, raw, units_per_metre)
-    # the reader has checked that the file has bytes for the points that its header announces
-    points = _from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
+    place = _viewpoint(viewpoint, raw, units_per_metre)
+    # the reader has already compared the number of points with the size of the file
+    points = _points_from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
     return ReadPoints(points, place, raw.count)
 
 
-def _format(data: bytes, told: CloudFormat | None) -> CloudFormat:
-    found = format_of(data)
-    if told == "kitti" and found is not None:
+def _format(data: bytes, stated: CloudFormat | None) -> CloudFormat:
+    recognised = format_of(data)
+    if stated == "kitti" and recognised is not None:
         raise UnreadableCloud(
-            f"This is no KITTI scan: it begins as a {found.upper()} file does. Say that, or "
-            "nothing, for its format."
+            f"This is not a KITTI scan: it starts like a {recognised.upper()} file. State that "
+            "format, or none."
         )
-    if told is not None and told not in _READERS:
+    if stated is not None and stated not in _READERS:
         raise UnreadableCloud(
-            f"{told!r:.40} is no format of points. Known are {', '.join(_READERS)}."
+            f"{stated!r:.40} is not a format of points. Use one of {', '.join(_READERS)}."
         )
     if not data:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
-    if told is None and found is None:
+    if stated is None and recognised is None:
         raise UnreadableCloud(
-            f"This is none of {titles_of('cloud')} by its first bytes. Write one of these; for a "
-            "KITTI scan, say kitti as its format."
+            f"According to its first bytes, the format is none of {titles_of('cloud')}. Write one "
+            "of these; for a KITTI scan, state the format kitti."
         )
-    chosen = told or found
+    chosen = stated or recognised
     assert chosen is not None
     return chosen
 
@@ -400,28 +402,32 @@ def _format(data: bytes, told: CloudFormat | None) -> CloudFormat:
 def _check_units(units: float) -> None:
     if not (math.isfinite(units) and 1e-6 <= units <= 1e9):
         raise UnreadableCloud(
-            f"The units per metre are {units}, no such number. Say 1 for metres, 1000 for "
-            "millimetres."
+            f"The units per metre are {units}, not a number from 1e-6 to 1e9. Specify 1 for metres "
+            "or 1000 for millimetres."
         )
 
 
-def _place(told: Position | Unsaid | None, raw: FilePoints, units: float) -> Position | None:
+def _viewpoint(
+    viewpoint: Position | Unsaid | None, raw: FilePoints, units: float
+) -> Position | None:
     """Return the position of the sensor, metres; None for points of many views."""
-    if isinstance(told, Unsaid):
+    if isinstance(viewpoint, Unsaid):
         x, y, z = raw.viewpoint or (0.0, 0.0, 0.0)
-        told = (x / units, y / units, z / units)
-    if told is not None and not all(abs(value) <= _FARTHEST_VIEWPOINT_M for value in told):
+        viewpoint = (x / units, y / units, z / units)
+    if viewpoint is not None and not all(
+        abs(value) <= _FARTHEST_VIEWPOINT_M for value in viewpoint
+    ):
         raise UnreadableCloud(
-            f"The viewpoint {told} is not finite, or none on Earth. Give where the sensor was, in "
-            "metres along the axes of the points."
+            f"The viewpoint {viewpoint} is not finite, or not on Earth. Specify the position of "
+            "the sensor, in metres along the axes of the points."
         )
-    return told
+    return viewpoint
 
 
-def _from(raw: FilePoints, place: Position, units: float) -> Floats32:
-    """Return points (n, 3) relative to a place, metres, without missing ones."""
+def _points_from(raw: FilePoints, place: Position, units: float) -> Floats32:
+    """Return the valid points (n, 3) relative to a position, metres."""
     points, n = np.empty((raw.count, 3), np.float32), 0
-    with np.errstate(all="ignore"):  # overflowing points become infinite, and so missing
+    with np.errstate(all="ignore"):  # points that overflow are missing
         for block in raw.blocks:
             block /= units
             block -= place
@@ -435,7 +441,7 @@ def _from(raw: FilePoints, place: Position, units: float) -> Floats32:
 def _check_reach(far: float) -> None:
     if far > FARTHEST_M:
         raise UnreadableCloud(
-            f"A point lies {far:.6g} m from the viewpoint along an axis, and at most "
-            f"{FARTHEST_M:g} m is read. Say units_per_metre if these are no metres, and shift "
-            "coordinates of a map (UTM) to the sensor, or give the viewpoint in them."
+            f"A point is {far:.6g} m from the viewpoint along an axis; the limit is "
+            f"{FARTHEST_M:g} m. Specify units_per_metre if the coordinates are not metres. For map "
+            "coordinates (UTM), specify the viewpoint, or shift the points to the sensor."
         )

@@ -2,10 +2,10 @@
 
 bytes  --read_e57-->  E57Scan, ...  --points-->  FilePoints
 
-A file is a sequence of pages that each end with a checksum. Their payload is sections of packed
-points and an XML text that describes them. Points are decoded a block at a time, so a scan takes no
-more memory than a few megabytes beside its file. The reference implementation (libE57) opens files
-by name and seeks in them, which a confined decoder may not do; therefore the format is read here.
+A file is a sequence of pages that each end with a checksum. Their payload consists of sections with
+packed points, and of an XML text that describes them. Points are decoded in blocks, so a scan needs
+a few megabytes of memory besides its file. The reference implementation (libE57) opens files by
+name, which a confined decoder may not do. This module therefore reads the format itself.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from sceneprint.types import Bytes, Floats
 from sceneprint_client.errors import printable
 from sceneprint_client.poses import rigid_transform, rotation_of
 
-#: Types of the bytes of an E57 file.
+#: Types that can hold the bytes of an E57 file.
 Buffer = bytes | bytearray | memoryview | mmap
 
 E57_SIGNATURE = b"ASTM-E57"
 _HEADER = struct.Struct("<8sIIQQQQ")
 _SECTION = struct.Struct("<B7xQQQ")
 _CHECKSUM_BYTES = 4
-_PAGE_BYTES = (256, 1 << 16)  #: smallest and largest page; the standard asks for 1024
-_WINDOW_BYTES = 4 << 20  #: size of the pages whose checksums are compared at once, bytes
+_PAGE_BYTES = (256, 1 << 16)  #: smallest and largest page; the standard requires 1024
+_WINDOW_BYTES = 4 << 20  #: size of the window of pages that is verified at once, bytes
 _MAXIMUM_XML_BYTES = 64 << 20
 _MAXIMUM_SCANS = 10_000
-#: Maximum number of points of a scan: points of few bits take time, but hardly any bytes.
+#: Maximum number of points of a scan. Points of few bits take time even in a small file.
 MAXIMUM_SCAN_POINTS = 200_000_000
 _NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
 _AGAIN = "Copy the file again, or export it again as E57."
@@ -52,15 +52,15 @@ _INDEX, _DATA, _EMPTY = 0, 1, 2  #: kinds of packets
 
 @dataclass(frozen=True)
 class _Field:
-    """A field of every point, and its packing.
+    """Field of a point, and its packing.
 
     Parameters
     ----------
-    name : such as "cartesianX"; empty for a field of an extension
+    name : name such as "cartesianX"; empty for a field of an extension
     bits : number of bits of a value
-    dtype : type of a floating-point field; None for whole numbers
-    minimum : smallest whole number, which is stored as 0
-    scale, offset : value = scale * whole number + offset
+    dtype : type of a floating-point field; None for integers
+    minimum : smallest integer, which is stored as 0
+    scale, offset : parameters of value = scale * integer + offset
     """
 
     name: str
@@ -73,15 +73,15 @@ class _Field:
 
 @dataclass(frozen=True, eq=False)
 class E57Scan:
-    """One scan of an E57 file; its points are decoded by `points`.
+    """Scan of an E57 file, whose points `points` decodes.
 
     Parameters
     ----------
     name : name in the file; may be empty
-    count : number of points, including invalid ones
+    count : number of points, including invalid points
     T_world_scan : (4, 4) float64 pose of the scan in the file's frame, metres
-    has_pose : whether the file states that pose; otherwise it is the identity
-    is_structured : whether the points have rows and columns, as one scanner at one place sees them
+    has_pose : whether the file states the pose; otherwise it is the identity
+    is_structured : whether the points have rows and columns, as seen from a single viewpoint
     is_spherical : whether the points are ranges and angles from the scanner
     """
 
@@ -98,8 +98,8 @@ class E57Scan:
     def points(self) -> FilePoints:
         """Return the points in the axes of the scan, metres; invalid points are NaN.
 
-        The blocks are decoded during iteration, and raise UnreadableCloud if the packed points are
-        damaged or truncated.
+        The blocks are decoded during iteration, which raises UnreadableCloud if the packed points
+        are damaged or truncated.
         """
         return FilePoints(self.count, self._blocks())
 
@@ -107,18 +107,18 @@ class E57Scan:
         names = _SPHERICAL if self.is_spherical else _CARTESIAN
         state = "sphericalInvalidState" if self.is_spherical else "cartesianInvalidState"
         by_name = {one.name: place for place, one in enumerate(self._fields)}
-        wanted = [by_name[name] for name in (*names, state) if name in by_name]
-        streams = [_Stream(self._fields[place]) for place in wanted]
+        columns = [by_name[name] for name in (*names, state) if name in by_name]
+        streams = [_Stream(self._fields[place]) for place in columns]
         packets = _packets(self._pages, self._start, len(self._fields))
         for first, n in steps(self.count):
             while not all(one.holds(n) for one in streams):
                 packet = next(packets, None)
                 if packet is None:
                     raise UnreadableCloud(
-                        f"The scan announces {self.count} points, and they end before point "
+                        f"The scan announces {self.count} points, but they end before point "
                         f"{first + n}. {_AGAIN}"
                     )
-                for stream, place in zip(streams, wanted, strict=True):
+                for stream, place in zip(streams, columns, strict=True):
                     stream.add(packet[place])
             values = [one.take(n) for one in streams]
             block = _from_angles(*values[:3]) if self.is_spherical else np.stack(values[:3], axis=1)
@@ -128,7 +128,7 @@ class E57Scan:
 
 
 def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats:
-    """Return positions (n, 3); azimuth (n,) turns from x to y, elevation (n,) from there to z."""
+    """Return positions (n, 3) from spherical coordinates (n,); elevation is relative to x and y."""
     with np.errstate(all="ignore"):
         level = distance * np.cos(elevation)
         return np.stack(
@@ -137,54 +137,56 @@ def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats
 
 
 def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
-    """Return the scans of an E57 file in their order; their points are not decoded yet.
+    """Return the scans of an E57 file in their order, without decoding their points.
 
     Parameters
     ----------
-    data : the whole file; it must stay unchanged while points are decoded
+    data : the whole file, which must not change while points are decoded
 
     Returns
     -------
-    scans : at least one
+    scans : at least one scan
 
     Raises
     ------
-    UnreadableCloud : The file is not E57, damaged, or of a later version; it has no scan; a scan
-        has no coordinates, or more than 200 million points; a pose is not rigid.
+    UnreadableCloud : If the file is not E57, is damaged, has a later version or no scan, a scan has
+        no coordinates or more than 200 million points, or a pose is not rigid.
     """
     if len(data) < _HEADER.size or bytes(data[:8]) != E57_SIGNATURE:
-        raise UnreadableCloud(f"This is no E57 file. {_AGAIN}")
+        raise UnreadableCloud(f"This is not an E57 file. {_AGAIN}")
     _, major, _, length, xml_start, xml_bytes, page = _HEADER.unpack(bytes(data[: _HEADER.size]))
     if major != 1:
         raise UnreadableCloud(
-            f"The file is of version {major} of E57, and only version 1 is read. {_AS_PLY}"
+            f"The file has version {major} of E57; only version 1 is supported. {_AS_PLY}"
         )
     if not _PAGE_BYTES[0] <= page <= _PAGE_BYTES[1] or page % 4:
         raise UnreadableCloud(f"The header of the file announces pages of {page} bytes. {_AGAIN}")
     if length > len(data) or length % page:
         raise UnreadableCloud(
-            f"The header of the file announces {length} bytes, and it has {len(data)}. {_AGAIN}"
+            f"The header of the file announces {length} bytes, but it has {len(data)}. {_AGAIN}"
         )
     if xml_bytes > _MAXIMUM_XML_BYTES:
-        raise UnreadableCloud(f"The description of the scans takes {xml_bytes} bytes. {_AS_PLY}")
+        raise UnreadableCloud(
+            f"The description of the scans has {xml_bytes} bytes, too many to read. {_AS_PLY}"
+        )
     pages = _Pages(memoryview(data)[:length], page)
     root = _description(pages.read(pages.logical(xml_start), xml_bytes))
     scans = root.findall(f"{_NAMESPACE}data3D/{_NAMESPACE}vectorChild")
     if not scans:
-        raise UnreadableCloud(f"The file holds no scan. {_AGAIN}")
+        raise UnreadableCloud(f"The file has no scan. {_AGAIN}")
     if len(scans) > _MAXIMUM_SCANS:
         raise UnreadableCloud(
-            f"The file holds {len(scans)} scans, and at most {_MAXIMUM_SCANS} are read. Split it."
+            f"The file has {len(scans)} scans; the limit is {_MAXIMUM_SCANS}. Split the file."
         )
     return tuple(_scan(pages, node, number) for number, node in enumerate(scans, start=1))
 
 
 def with_viewpoint(scans: tuple[E57Scan, ...]) -> list[bool]:
-    """Return, for each scan of a file, whether its points were seen from the scan's origin.
+    """Return, for each scan of a file, whether the scan's origin is the viewpoint of its points.
 
-    That holds for structured scans and for ranges and angles. It also holds for scans with a pose
-    in a file whose poses differ or turn a scan: merged clouds have none, or one that shifts them
-    to the coordinates of a map.
+    This is true for structured scans and for ranges and angles. It is also true for scans with a
+    pose if the poses of the file differ or contain a rotation: merged clouds have no pose, or one
+    that shifts them to map coordinates.
     """
     poses = [one.T_world_scan for one in scans if one.has_pose]
     turned = any(not np.allclose(T[:3, :3], np.eye(3), atol=1e-9) for T in poses)
@@ -197,7 +199,7 @@ def with_viewpoint(scans: tuple[E57Scan, ...]) -> list[bool]:
 
 @lru_cache(maxsize=1)
 def _crc_table() -> NDArray[np.uint32]:
-    """Return the table of CRC-32C for two bytes at once."""
+    """Return the table of CRC-32C for two bytes at a time."""
     table = np.arange(1 << 16, dtype=np.uint32)
     for _ in range(16):
         odd = (table & np.uint32(1)) * np.uint32(0x82F63B78)
@@ -216,22 +218,22 @@ def _checksums(payloads: Bytes) -> NDArray[np.uint32]:
 
 
 class _Pages:
-    """The payload of a file's pages as one sequence of bytes; reading compares checksums.
+    """Payload of a file's pages as one sequence of bytes, with verified checksums.
 
     Parameters
     ----------
-    data : whole pages
+    data : complete pages
     page : size of a page, bytes
     """
 
     def __init__(self, data: memoryview, page: int) -> None:
         self._data, self._page = data, page
         self._payload = page - _CHECKSUM_BYTES
-        self._group = max(1, _WINDOW_BYTES // page)  # pages in a window
+        self._group = max(1, _WINDOW_BYTES // page)  # number of pages in a window
         self._window, self._number = b"", -1
 
     def logical(self, physical: int) -> int:
-        """Return the offset in the payload of an offset in the file."""
+        """Convert an offset in the file to an offset in the payload."""
         number, within = divmod(physical, self._page)
         if physical >= len(self._data) or within >= self._payload:
             raise UnreadableCloud(f"A part of the file lies beyond its end. {_AGAIN}")
@@ -242,7 +244,7 @@ class _Pages:
 
         Raises
         ------
-        UnreadableCloud : The bytes are beyond the end, or a page's checksum is wrong.
+        UnreadableCloud : If the bytes are beyond the end, or the checksum of a page is wrong.
         """
         total = len(self._data) // self._page * self._payload
         if length > total - start:
@@ -272,13 +274,13 @@ class _Pages:
         return self._window
 
 
-# The XML text, which describes the scans and the packing of their points.
+# XML text that describes the scans and the packing of their points.
 
 
 def _description(text: bytes) -> Element:
     try:
         content = text.decode("utf-8-sig")
-        # entities of a document type could expand without limit, and E57 uses none
+        # entities could expand without limit, and E57 does not use them
         if "<!DOCTYPE" in content or "<!ENTITY" in content:
             raise UnreadableCloud(f"The description of the scans declares entities. {_AGAIN}")
         return ElementTree.fromstring(content)
@@ -297,12 +299,12 @@ def _scan(pages: _Pages, node: Element, number: int) -> E57Scan:
         raise UnreadableCloud(f"{place} has no points. {_AGAIN}")
     for codec in points.iterfind(f"{_NAMESPACE}codecs/{_NAMESPACE}vectorChild/*"):
         if codec.tag not in (f"{_NAMESPACE}inputs", f"{_NAMESPACE}bitPackCodec"):
-            raise UnreadableCloud(f"{place} is packed by an unknown codec. {_AS_PLY}")
+            raise UnreadableCloud(f"{place} uses an unknown codec. {_AS_PLY}")
     count = _whole(points.get("recordCount"), place)
     if not 0 <= count <= MAXIMUM_SCAN_POINTS:
         raise UnreadableCloud(
-            f"{place} announces {count} points, and at most {MAXIMUM_SCAN_POINTS} are read. Thin "
-            "it out, or export it in parts."
+            f"{place} announces {count} points; the limit is {MAXIMUM_SCAN_POINTS}. Thin the scan, "
+            "or export it in parts."
         )
     fields = tuple(_fields(prototype, place))
     bits = {one.name: one.bits for one in fields}
@@ -311,7 +313,7 @@ def _scan(pages: _Pages, node: Element, number: int) -> E57Scan:
     if not all(name in bits for name in coordinates):
         raise UnreadableCloud(f"{place} has neither Cartesian nor spherical points. {_AGAIN}")
     if count > 1 and not any(bits[name] for name in coordinates):
-        raise UnreadableCloud(f"All {count} points of {place} are the same. {_AGAIN}")
+        raise UnreadableCloud(f"All {count} points of {place} are identical. {_AGAIN}")
     pose = node.find(f"{_NAMESPACE}pose")
     return E57Scan(
         name=name,
@@ -327,7 +329,7 @@ def _scan(pages: _Pages, node: Element, number: int) -> E57Scan:
 
 
 def _fields(prototype: Element, place: str, *, nested: bool = False) -> Iterator[_Field]:
-    """Yield the fields in the order in which their values are packed."""
+    """Yield the fields in the order of their packed values."""
     for node in prototype:
         kind = node.get("type")
         name = "" if nested else node.tag.removeprefix(_NAMESPACE)
@@ -348,7 +350,7 @@ def _fields(prototype: Element, place: str, *, nested: bool = False) -> Iterator
             if kind == "Integer":
                 scale, offset = 1.0, 0.0
             yield _Field(name, (high - low).bit_length(), None, low, scale, offset)
-        else:  # text, whose length varies
+        else:  # a text field, whose length varies
             yield _Field("", 0)
 
 
@@ -365,7 +367,7 @@ def _pose(node: Element, place: str) -> Floats:
         quaternion = numbers("rotation", "xyzw")
         length = float(np.linalg.norm(quaternion))
         if not 0.9 < length < 1.1:
-            raise UnreadableCloud(f"The rotation of {place} is no unit quaternion. {_AGAIN}")
+            raise UnreadableCloud(f"The rotation of {place} is not a unit quaternion. {_AGAIN}")
         T[:3, :3] = rotation_of(quaternion / length)
     try:
         return rigid_transform(T)
@@ -392,7 +394,7 @@ def _number(text: str, place: str) -> float:
     return value
 
 
-# Packets: some bytes of every field, which continue those of the previous packet.
+# Packets, each of which has the next bytes of every field.
 
 
 def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
@@ -406,7 +408,7 @@ def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
     """
     kind, length, data_start, _ = _SECTION.unpack(pages.read(start, _SECTION.size))
     if kind != 1:
-        raise UnreadableCloud(f"The points of the file are not where its header says. {_AGAIN}")
+        raise UnreadableCloud(f"The header of the file has a wrong offset of points. {_AGAIN}")
     place, end = pages.logical(data_start), start + length
     while place + 4 <= end:
         packet, _, last = struct.unpack("<BBH", pages.read(place, 4))
@@ -425,7 +427,7 @@ def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
 
 
 def _sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
-    """Return the number of bytes of each field in a packet, checked against its size."""
+    """Return the size of each field in a packet, bytes; the sum is compared with the packet."""
     head = 6 + 2 * fields
     if len(content) == size >= head and struct.unpack_from("<H", content, 4)[0] == fields:
         sizes: tuple[int, ...] = struct.unpack_from(f"<{fields}H", content, 6)
@@ -435,7 +437,7 @@ def _sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
 
 
 class _Stream:
-    """The values of one field, whose bytes arrive in packets."""
+    """Values of one field, whose bytes arrive in packets."""
 
     def __init__(self, packing: _Field) -> None:
         self._field, self._bytes = packing, bytearray()
@@ -448,7 +450,7 @@ class _Stream:
         return 8 * len(self._bytes) >= n * self._field.bits
 
     def take(self, n: int) -> Floats:
-        """Return the next n values; n is a multiple of 8, except for the last values."""
+        """Return the next n values; except at the end, n must be a multiple of 8."""
         one = self._field
         size = -(-n * one.bits // 8)
         content = bytes(self._bytes[:size])
@@ -460,7 +462,7 @@ class _Stream:
 
 
 def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
-    """Return n whole numbers of 0 to 64 bits that are packed without gaps, lowest bit first."""
+    """Return n integers of 0 to 64 bits, packed without gaps and least significant bit first."""
     if bits == 0:
         return np.zeros(n, np.uint64)
     source = np.frombuffer(content + bytes(9), np.uint8)
@@ -470,7 +472,7 @@ def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
     for k in range(min(8, (bits + 14) // 8)):
         values |= source[first + k].astype(np.uint64) << np.uint64(8 * k)
     values >>= shift
-    if bits > 57:  # the highest bits are in a ninth byte, unless the number starts with its byte
+    if bits > 57:  # a number that does not start at a byte boundary may extend to a ninth byte
         ninth = source[first + 8].astype(np.uint64)
         values |= np.where(shift > 0, ninth << ((np.uint64(64) - shift) & np.uint64(63)), 0)
     return values & np.uint64(2**bits - 1)

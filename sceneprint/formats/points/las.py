@@ -2,7 +2,8 @@
 
 bytes  --read_las-->  FilePoints
 
-Every point format starts with X, Y, Z as whole numbers, with a scale and an offset.
+Each point format starts with X, Y, Z as integers, to which the scale and offset of the header
+apply.
 """
 
 from __future__ import annotations
@@ -22,22 +23,23 @@ from sceneprint.formats.points.rows import MAXIMUM_POINTS, FileBytes, FilePoints
 from sceneprint.types import Floats
 from sceneprint_client.files import LAS_SIGNATURE
 
-# The compressed points of LAZ files, read by lazrs (Rust), which is an extra.
+# Compressed points of LAZ files, which the optional package lazrs (Rust) decompresses.
 #
-# bytes  --inflated_records-->  records, a block at a time
+# bytes  --inflated_records-->  blocks of records
 #
 # lazrs allocates memory according to the file, and Rust aborts if an allocation fails. All numbers
-# by which it allocates are therefore compared with the length of the file first (M. Isenburg,
+# that determine allocations are therefore compared with the length of the file first (M. Isenburg,
 # LASzip 1.3 and 1.4): the kinds of values in a record, the number of chunks, and, from format 6 on,
 # the lengths of the layers of each chunk.
 
 _VLR = 54  #: size of the header of a variable-length record, bytes
 _MAXIMUM_VLRS = 10_000
-_VARIABLE = 0xFFFFFFFF  #: chunk size that means that each chunk has its own
-_MOST = 2 << 30  #: maximum size of all records, bytes; they are decompressed block by block
-_MOST_RATIO, _FREE = 250, 64 << 20  #: maximum compression ratio, beyond so many bytes of records
+_VARIABLE = 0xFFFFFFFF  #: chunk size in the header if the chunks have different sizes
+_MOST = 2 << 30  #: maximum size of all records, bytes; they are decompressed in blocks
+#: Maximum compression ratio, and size of records that are exempt from it, bytes.
+_MOST_RATIO, _FREE = 250, 64 << 20
 
-#: Size of a value by its kind, bytes; from kind 10 on, the number of its layers.
+#: Size of a value by kind, bytes.
 _ITEMS = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 _BYTES, _LAYERED_BYTES = 0, 14
@@ -50,32 +52,32 @@ def inflated_records(
 
     Parameters
     ----------
-    data : the file
+    data : the whole file
     start : offset of the points
     form : point format
     length : size of a record, bytes
     count : number of points
-    row : type of a record
+    row : dtype of a record
 
     Raises
     ------
-    MissingDependency : lazrs is not installed.
-    UnreadableCloud : The compressed points contradict the header, or are damaged.
+    MissingDependency : If lazrs is not installed.
+    UnreadableCloud : If the compressed points are damaged or contradict the header.
     """
     lazrs = _lazrs()
     vlr = _laszip_vlr(data)
     compressor, coder, chunk, kinds = _described(vlr)
     layered = compressor == 3
-    known = layered == (form >= 6) and coder == 0 and compressor in (2, 3)
-    if not known or not _fits(kinds, layered, length):
+    is_supported = layered == (form >= 6) and coder == 0 and compressor in (2, 3)
+    if not is_supported or not _fits(kinds, layered, length):
         raise UnreadableCloud(
-            f"The LAZ file packs records of {length} bytes of format {form} as {kinds[:20]} by "
-            f"compressor {compressor}, which does not fit. {_AGAIN}"
+            f"The LAZ file stores records of {length} bytes of format {form} as {kinds[:20]} with "
+            f"compressor {compressor}, which is contradictory or not supported. {_AGAIN}"
         )
     if count * length > min(_MOST, _FREE + _MOST_RATIO * len(data)):
         raise UnreadableCloud(
-            f"The LAZ file announces {count} points of {length} bytes in {len(data)} bytes, more "
-            f"than {_MOST_RATIO} times as much. {_AGAIN}"
+            f"The LAZ file announces {count} points of {length} bytes, which exceeds "
+            f"{_MOST_RATIO} times the size of the file, {len(data)} bytes. {_AGAIN}"
         )
     _check_chunks(data, start, length, kinds, count, chunk)
     return _records(lazrs, data, start, vlr, count, row)
@@ -86,8 +88,8 @@ def _records(
 ) -> Iterator[NDArray[np.void]]:
     source = io.BytesIO(data) if isinstance(data, bytes) else data
     source.seek(start)
-    wanted = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
-    selection = lazrs.DecompressionSelection(wanted)
+    fields = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
+    selection = lazrs.DecompressionSelection(fields)
     reader: Any = _guarded(lazrs.LasZipDecompressor, source, vlr, selection)
     most = max(1, (4 << 20) // row.itemsize)
     for _, n in steps(count):
@@ -99,12 +101,12 @@ def _records(
         yield table
 
 
-def _guarded(function: Any, *given: Any) -> Any:
+def _guarded(function: Any, *arguments: Any) -> Any:
     try:
-        return function(*given)
+        return function(*arguments)
     except (KeyboardInterrupt, SystemExit):
         raise
-    except BaseException as cause:  # a panic of Rust is no Exception
+    except BaseException as cause:  # a Rust panic is not an Exception
         raise UnreadableCloud(
             f"The compressed points of the LAZ file are damaged ({str(cause)[:80]}). {_AGAIN}"
         ) from cause
@@ -115,15 +117,15 @@ def _lazrs() -> ModuleType:
         import lazrs
     except ImportError as cause:
         raise MissingDependency(
-            "LAZ needs the package lazrs, which is not installed. Install sceneprint[las], or "
-            "send the points as LAS, which needs nothing."
+            "LAZ requires the package lazrs, which is not installed. Install sceneprint[las], or "
+            "send the points as LAS."
         ) from cause
     module: ModuleType = lazrs
     return module
 
 
 def las_records(data: FileBytes) -> Iterator[tuple[bytes, int, bytes]]:
-    """Yield user, number and content of the records between the header and the points."""
+    """Yield the user id, record id and content of each variable-length record of the header."""
     at, end, count = struct.unpack_from("<HII", data, 94)
     for _ in range(min(count, _MAXIMUM_VLRS)):
         if at + _VLR > end:
@@ -134,7 +136,7 @@ def las_records(data: FileBytes) -> Iterator[tuple[bytes, int, bytes]]:
 
 
 def _laszip_vlr(data: FileBytes) -> bytes:
-    """Return the record that describes the compression of the points."""
+    """Return the variable-length record that describes the compression of the points."""
     for user, number, content in las_records(data):
         if (user, number) == (b"laszip encoded", 22204):
             return content
@@ -142,7 +144,7 @@ def _laszip_vlr(data: FileBytes) -> bytes:
 
 
 def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
-    """Return compressor, coder, points per chunk, and kind and size of each value."""
+    """Return the compressor, the coder, the points per chunk, and kind and size of each value."""
     if len(vlr) >= 34:
         compressor, coder = struct.unpack_from("<HH", vlr, 0)
         (chunk,) = struct.unpack_from("<I", vlr, 12)
@@ -154,7 +156,7 @@ def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
 
 
 def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
-    """Return whether these kinds form a record: the point first, then each kind once at most."""
+    """Return whether these kinds form a record: the point first, then each kind at most once."""
     names = [kind for kind, _ in kinds]
     free = _LAYERED_BYTES if layered else _BYTES
     return (
@@ -169,34 +171,34 @@ def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
 def _check_chunks(
     data: FileBytes, start: int, length: int, kinds: list[tuple[int, int]], count: int, chunk: int
 ) -> None:
-    """Raise UnreadableCloud for chunks that are longer than their file, too many, or too few."""
-    lie = UnreadableCloud(f"The chunks of the LAZ file are not those of its points. {_AGAIN}")
+    """Raise UnreadableCloud if the chunks are longer than the file, or too many or too few."""
+    error = UnreadableCloud(f"The chunk table of the LAZ file contradicts its points. {_AGAIN}")
     if len(data) - start < 8:
-        raise lie
+        raise error
     (table,) = struct.unpack_from("<q", data, start)
-    if table == -1:  # a file written to a pipe, which has the offset at the end
+    if table == -1:  # a file that was written to a pipe has the offset at its end
         (table,) = struct.unpack_from("<q", data, len(data) - 8)
     if not start + 8 <= table <= len(data) - 8:
-        raise lie
+        raise error
     version, chunks = struct.unpack_from("<II", data, table)
-    # the first point of each chunk is not compressed
+    # the first point of each chunk is uncompressed, which limits the number of chunks
     if version != 0 or chunks * length > len(data) or chunks > count:
-        raise lie
+        raise error
     if chunk != _VARIABLE and chunks != -(-count // chunk):
-        raise lie
+        raise error
     if kinds[0][0] != 10:
         return
     layers = sum(_LAYERS.get(kind, size) for kind, size in kinds)
     at, points = start + 8, 0
-    while points < count:  # a last chunk may be empty
+    while points < count:  # the last chunk may be empty
         head = at + length
         if head + 4 + 4 * layers > table:
-            raise lie
+            raise error
         points += struct.unpack_from("<I", data, head)[0]
         at = head + 4 + 4 * layers
         at += sum(struct.unpack_from(f"<{layers}I", data, head + 4))
     if points != count or at > table or (at < table and chunk != _VARIABLE):
-        raise lie
+        raise error
 
 
 _SMALLEST_HEADER = 227  #: bytes
@@ -213,32 +215,34 @@ def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 
     Raises
     ------
-    UnreadableCloud : The file is not LAS, of an unknown point format, has more than `most` points,
-        or its header does not fit the rest.
-    MissingDependency : The file is LAZ, and lazrs is not installed.
+    UnreadableCloud : If the file is not LAS, has an unknown point format or more than `most`
+        points, or its size contradicts its header.
+    MissingDependency : If the file is LAZ and lazrs is not installed.
     """
     if len(data) < _SMALLEST_HEADER or data[:4] != LAS_SIGNATURE:
-        raise UnreadableCloud("This is no LAS file, or its header is cut off. Copy it again.")
+        raise UnreadableCloud(
+            "This is not a LAS file, or its header is truncated. Copy the file again."
+        )
     minor, (header, start) = data[25], struct.unpack_from("<HI", data, 94)
     form, length, count = struct.unpack_from("<BHI", data, 104)
     packed, form = bool(form & 0x80), form & 0x3F
     if data[24] != 1 or minor > 4 or form >= len(_RECORDS) or length < _RECORDS[form]:
         raise UnreadableCloud(
-            f"The LAS header tells version {data[24]}.{minor}, point format {form} and records of "
-            f"{length} bytes, and known are versions up to 1.4, formats up to 10 and their sizes. "
-            f"{_AGAIN}"
+            f"The LAS header states version {data[24]}.{minor}, point format {form} and records of "
+            f"{length} bytes; versions up to 1.4 and formats up to 10 with their standard sizes "
+            f"are supported. {_AGAIN}"
         )
     if minor == 4 and len(data) >= 255 and header >= 375:
-        (count,) = struct.unpack_from("<Q", data, 247)  # for more than 32 bits, and from format 6
+        (count,) = struct.unpack_from("<Q", data, 247)  # 64-bit count of LAS 1.4
     if not _SMALLEST_HEADER <= header <= start <= len(data):
         raise UnreadableCloud(
-            f"The LAS header has {header} bytes, and points from byte {start} of {len(data)}. "
-            f"{_AGAIN}"
+            f"The LAS header states a size of {header} bytes and points from byte {start}, but "
+            f"the file has {len(data)} bytes. {_AGAIN}"
         )
     check_count(count, most)
     transform = struct.unpack_from("<6d", data, 131)
     if not all(map(math.isfinite, transform)) or 0.0 in transform[:3]:
-        raise UnreadableCloud(f"The scale of the LAS file is {transform[:3]}. {_AGAIN}")
+        raise UnreadableCloud(f"The scale of the LAS file, {transform[:3]}, is invalid. {_AGAIN}")
     row = np.dtype({"names": list("xyz"), "formats": ["<i4"] * 3, "offsets": [0, 4, 8],
                     "itemsize": length})  # fmt: skip
     if packed:
@@ -246,7 +250,7 @@ def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     else:
         if count * length > len(data) - start:
             raise UnreadableCloud(
-                f"The LAS header announces {count} points of {length} bytes, and "
+                f"The LAS header announces {count} points of {length} bytes, but "
                 f"{len(data) - start} of {count * length} bytes follow. {_AGAIN}"
             )
         table = np.frombuffer(data, row, count, start)

@@ -1,4 +1,4 @@
-"""Read PCD files of the Point Cloud Library: ascii, binary and binary_compressed.
+"""Read PCD files of the Point Cloud Library (ascii, binary and binary_compressed).
 
 bytes  --read_pcd-->  FilePoints
 """
@@ -34,11 +34,11 @@ from sceneprint_client.sidecars import Position
 #
 # packed, size  --inflate-->  bytes
 #
-# A control byte c below 32 is followed by c + 1 literal bytes. Any other is a back reference: its
-# upper three bits are the number of bytes to repeat minus two (7: the next byte is added), and its
-# lower five bits the upper part of the distance.
+# A control byte c below 32 is followed by c + 1 literal bytes. Other control bytes are back
+# references: the upper three bits are the number of bytes to repeat minus two (for 7, the next byte
+# is added), and the lower five bits are the upper part of the distance.
 
-#: Maximum compression ratio: three bytes of a back reference expand to 264.
+#: Maximum compression ratio: the three bytes of a back reference expand to 264.
 MOST_RATIO = 88
 
 
@@ -48,21 +48,21 @@ def inflate(packed: Bytes, size: int) -> Bytes:
     Parameters
     ----------
     packed : (n,) compressed bytes
-    size : exact size of the result, which the caller has checked
+    size : exact size of the result, which the caller has limited, bytes
 
     Raises
     ------
-    UnreadableCloud : The result has another size, or the compressed bytes are damaged.
+    UnreadableCloud : If the result has another size, or the compressed bytes are damaged.
     """
-    if size > MOST_RATIO * len(packed):  # before anything is allocated
+    if size > MOST_RATIO * len(packed):  # this check must precede the allocation
         raise UnreadableCloud(
-            f"The file announces {size} bytes packed into {len(packed)}, and LZF packs at most "
-            f"{MOST_RATIO} into one. Copy or write the file again."
+            f"The file announces {size} bytes compressed to {len(packed)}, but the maximum ratio "
+            f"of LZF is {MOST_RATIO}. Copy or write the file again."
         )
     out = np.empty(size, np.uint8)
     if _inflate(packed, out) != size:
         raise UnreadableCloud(
-            f"The compressed points are damaged: they do not become {size} bytes. "
+            f"The compressed points are damaged: they do not expand to {size} bytes. "
             "Copy or write the file again."
         )
     return out
@@ -70,7 +70,7 @@ def inflate(packed: Bytes, size: int) -> Bytes:
 
 @kernel
 def _inflate(packed: Bytes, out: Bytes) -> int:
-    """Fill `out` and return the number of bytes; -1 if they do not fit or are damaged."""
+    """Fill `out` and return the number of bytes, or -1 if they do not fit or are damaged."""
     i, o, size, room = 0, 0, len(packed), len(out)
     while i < size:
         control = int(packed[i])
@@ -96,7 +96,7 @@ def _inflate(packed: Bytes, out: Bytes) -> int:
             i += 1
             if back < 0 or o + length > room:
                 return -1
-            for k in range(length):  # byte by byte, because source and target may overlap
+            for k in range(length):  # source and target may overlap, so bytes are copied singly
                 out[o + k] = out[back + k]
         o += length
     return o
@@ -119,10 +119,10 @@ _ENTRIES = (
 
 @dataclass(frozen=True)
 class Field:
-    """A field of each row: a number of values of one type."""
+    """Field of each row, with a number of values of one type."""
 
     name: str
-    kind: str  #: type in numpy
+    kind: str  #: numpy type
     count: int
 
     @property
@@ -132,12 +132,12 @@ class Field:
 
 
 def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """Return the points of a PCD file, and its VIEWPOINT if that is not the origin.
+    """Return the points of a PCD file, and its VIEWPOINT unless it is the origin.
 
     Raises
     ------
-    UnreadableCloud : The file is not PCD, its points lack x, y or z, there are more than `most`
-        points, or the header does not fit the rest.
+    UnreadableCloud : If the file is not PCD, its points lack x, y or z, there are more than `most`
+        points, or the header contradicts the rest of the file.
     """
     entries, start = _header(data)
     fields, count = _fields(entries), _points(entries)
@@ -145,83 +145,87 @@ def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     wrong = [k for k in _XYZ if names.count(k) != 1 or fields[names.index(k)].count != 1]
     if wrong:
         raise UnreadableCloud(
-            f"The points of the PCD file have no single {' or '.join(wrong)}. "
-            "Write each point's x, y and z."
+            f"The points of the PCD file do not have exactly one field {' or '.join(wrong)}. "
+            "Write x, y and z of each point."
         )
     check_count(count, most)
     form = " ".join(entries["DATA"])
     width = sum(field.size for field in fields)
     if form == "ascii":
-        blocks = _written_out(data, start, count, fields)
+        blocks = _ascii_blocks(data, start, count, fields)
     elif form == "binary":
-        if len(data) - start < count * width:  # some programs pad their files
+        if (
+            len(data) - start < count * width
+        ):  # more bytes are accepted, since some files are padded
             raise UnreadableCloud(
-                f"The PCD header announces {count} points of {width} bytes, and "
+                f"The PCD header announces {count} points of {width} bytes, but "
                 f"{len(data) - start} of {count * width} bytes follow. {_AGAIN}"
             )
         kinds = [(field.name, field.kind, field.count) for field in fields]
         blocks = record_blocks(data, start, count, kinds)
     elif form == "binary_compressed":
-        blocks = _compressed(data, start, count, fields, most)
+        blocks = _compressed_blocks(data, start, count, fields, most)
     else:
         raise UnreadableCloud(
-            f"The PCD file has DATA {form!r:.40}, and known are ascii, binary and "
-            f"binary_compressed. {_AGAIN}"
+            f"The PCD file has DATA {form!r:.40}; ascii, binary and binary_compressed are "
+            f"supported. {_AGAIN}"
         )
     return FilePoints(count, blocks, _viewpoint(entries.get("VIEWPOINT")))
 
 
-def _written_out(data: FileBytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
+def _ascii_blocks(data: FileBytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
     text, counts = np.frombuffer(data, np.uint8), [field.count for field in fields]
     width = sum(counts)
-    if not count:  # a header alone must not allocate columns
+    if not count:  # the header of an empty file must not cause an allocation
         return iter(())
     check_room(text, start, count, width)
     column = [_XYZ.index(field.name) if field.name in _XYZ else -1 for field in fields]
-    wanted = np.repeat(np.array(column, np.int8), counts)
-    return parse_blocks(text, start, count, wanted, np.zeros(width, np.bool_))
+    axes = np.repeat(np.array(column, np.int8), counts)
+    return parse_blocks(text, start, count, axes, np.zeros(width, np.bool_))
 
 
-def _compressed(
+def _compressed_blocks(
     data: FileBytes, start: int, count: int, fields: list[Field], most: int
 ) -> Iterator[Floats]:
-    """Yield the blocks of a compressed body, which stores each field for all points."""
+    """Yield the blocks of a compressed body, which stores the fields one after the other."""
     size = count * sum(field.size for field in fields)
     if len(data) - start < 8:
         raise UnreadableCloud(f"The PCD file ends before its compressed points. {_AGAIN}")
     packed, inflated = struct.unpack_from("<II", data, start)
     if inflated != size or packed > len(data) - start - 8:
         raise UnreadableCloud(
-            f"The PCD header announces {size} bytes of points, and {inflated} packed into "
-            f"{packed} follow, of which {len(data) - start - 8} are there. {_AGAIN}"
+            f"The PCD header announces {size} bytes of points, but the body states {inflated} "
+            f"bytes compressed to {packed}, of which {len(data) - start - 8} exist. {_AGAIN}"
         )
     most_bytes = MAXIMUM_INFLATED // MAXIMUM_POINTS * most
     if size > most_bytes:
         raise UnreadableCloud(
-            f"The compressed points are {size} bytes, and at most {most_bytes} are "
-            "inflated. Write x, y and z alone."
+            f"The decompressed points have {size} bytes; the limit is {most_bytes}. "
+            "Write only x, y and z."
         )
     everything = inflate(np.frombuffer(data, np.uint8, packed, start + 8), size)
-    begins, found = 0, dict[str, np.ndarray[tuple[int], np.dtype[np.number]]]()
+    begins, columns = 0, dict[str, np.ndarray[tuple[int], np.dtype[np.number]]]()
     for field in fields:
         if field.name in _XYZ:
-            found[field.name] = everything[begins : begins + count * field.size].view(field.kind)
+            columns[field.name] = everything[begins : begins + count * field.size].view(field.kind)
         begins += count * field.size
-    return (np.stack([found[k][i : i + n] for k in _XYZ], axis=1, dtype=np.float64)
+    return (np.stack([columns[k][i : i + n] for k in _XYZ], axis=1, dtype=np.float64)
             for i, n in steps(count))  # fmt: skip
 
 
 def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
-    """Return the entries by name, and the offset of the points."""
+    """Return the entries of the header by name, and the offset of the points."""
     head = data[:_MAXIMUM_HEADER]
     if format_of(head[:HEAD]) != "pcd":
-        raise UnreadableCloud("This is no PCD file: it does not begin with VERSION or FIELDS.")
+        raise UnreadableCloud(
+            "This is not a PCD file: it does not start with VERSION or FIELDS. Write it as PCD."
+        )
     entries, start = dict[str, list[str]](), 0
     while "DATA" not in entries:
         end = head.find(b"\n", start)
         if end < 0:
             raise UnreadableCloud(
-                f"The PCD header has no line DATA in its first {_MAXIMUM_HEADER} bytes. {_AGAIN}"
+                f"The PCD header has no DATA line in its first {_MAXIMUM_HEADER} bytes. {_AGAIN}"
             )
         line = head[start:end].decode("latin-1").strip()
         start = end + 1
@@ -229,7 +233,7 @@ def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
             continue
         name, *words = line.split()
         if name not in _ENTRIES or name in entries:
-            raise UnreadableCloud(f"The PCD header has a line {line!r:.60}. {_AGAIN}")
+            raise UnreadableCloud(f"The PCD header has the invalid line {line!r:.60}. {_AGAIN}")
         entries[name] = words
     return entries, start
 
@@ -243,44 +247,44 @@ def _fields(entries: dict[str, list[str]]) -> list[Field]:
     ):
         raise UnreadableCloud(
             f"The PCD header has {len(names)} FIELDS, {len(sizes)} SIZE, {len(kinds)} TYPE and "
-            f"{len(counts)} COUNT, which must be as many. {_AGAIN}"
+            f"{len(counts)} COUNT; these numbers must be equal. {_AGAIN}"
         )
     fields = []
     for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True):
-        known, values = _TYPES.get(f"{kind}{size}"), _whole("COUNT", count)
-        if known is None or values > _MAXIMUM_COUNT:
+        dtype, values = _TYPES.get(f"{kind}{size}"), _whole("COUNT", count)
+        if dtype is None or values > _MAXIMUM_COUNT:
             raise UnreadableCloud(
-                f"The PCD field {name!r:.40} is {count} of TYPE {kind!r:.20} and SIZE {size!r:.20},"
-                f" and known are F of 4 and 8 bytes, I and U of 1 to 8. {_AGAIN}"
+                f"The PCD field {name!r:.40} has COUNT {count}, TYPE {kind!r:.20} and SIZE "
+                f"{size!r:.20}; F of 4 and 8 bytes and I and U of 1 to 8 are supported. {_AGAIN}"
             )
-        fields.append(Field(name, known, values))
+        fields.append(Field(name, dtype, values))
     return fields
 
 
 def _points(entries: dict[str, list[str]]) -> int:
-    """Return the number of points, which POINTS and WIDTH with HEIGHT state."""
-    told = []
+    """Return the number of points according to POINTS, or to WIDTH and HEIGHT."""
+    counts = []
     if "POINTS" in entries:
-        told.append(_whole("POINTS", " ".join(entries["POINTS"])))
+        counts.append(_whole("POINTS", " ".join(entries["POINTS"])))
     if "WIDTH" in entries:
         rows = _whole("HEIGHT", " ".join(entries.get("HEIGHT", ["1"])))
-        told.append(_whole("WIDTH", " ".join(entries["WIDTH"])) * rows)
-    if not told or told[0] != told[-1]:
+        counts.append(_whole("WIDTH", " ".join(entries["WIDTH"])) * rows)
+    if not counts or counts[0] != counts[-1]:
         raise UnreadableCloud(
-            f"The PCD header must say in POINTS, or in WIDTH and HEIGHT, how many points there "
-            f"are, and says {' and '.join(map(str, told)) or 'nothing'}. {_AGAIN}"
+            "The PCD header must state the number of points in POINTS or in WIDTH and HEIGHT, but "
+            f"it states {' and '.join(map(str, counts)) or 'nothing'}. {_AGAIN}"
         )
-    return told[0]
+    return counts[0]
 
 
 def _whole(name: str, word: str) -> int:
     if not (word.isascii() and word.isdigit() and len(word) <= 18):
-        raise UnreadableCloud(f"The PCD header has {name} {word!r:.40}. {_AGAIN}")
+        raise UnreadableCloud(f"The PCD header has the invalid {name} {word!r:.40}. {_AGAIN}")
     return int(word)
 
 
 def _viewpoint(words: list[str] | None) -> Position | None:
-    """Return the translation of VIEWPOINT; the rotation is not needed."""
+    """Return the translation of VIEWPOINT."""
     if words is None:
         return None
     try:
@@ -290,7 +294,7 @@ def _viewpoint(words: list[str] | None) -> Position | None:
         rotation = []
     if len(rotation) not in (0, 4) or not all(map(math.isfinite, (x, y, z))):
         raise UnreadableCloud(
-            f"The PCD header has VIEWPOINT {' '.join(words)!r:.80}, which is no x y z and "
+            f"The PCD header has VIEWPOINT {' '.join(words)!r:.80}, which is not x y z and a "
             f"quaternion. {_AGAIN}"
         )
     return (x, y, z) if (x, y, z) != (0.0, 0.0, 0.0) else None

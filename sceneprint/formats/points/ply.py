@@ -1,8 +1,9 @@
-"""Read PLY files: their elements, and the points among them.
+"""Read the elements of PLY files, and the points among them.
 
 bytes  --read_ply-->  FilePoints
 
-Memory is allocated only for elements that fit into the rest of the file, whatever the header says.
+Memory is allocated only for elements that fit into the rest of the file, since headers are not
+trusted.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> 
 
     Raises
     ------
-    UnreadableCloud : The file ends before.
+    UnreadableCloud : If the file ends before the last row.
     """
     end = start
-    for _, behind in walked(view, start, count, kinds, (0, 0, 0), order):
+    for _, behind in value_offsets(view, start, count, kinds, (0, 0, 0), order):
         end = behind
     return end
 
@@ -56,8 +57,8 @@ def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> 
 def list_blocks(
     view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
 ) -> Iterator[Floats]:
-    """Yield three of the values of each row, (n, 3) each; raises as `skip_rows`."""
-    for places, _ in walked(view, start, count, kinds, picked, order):
+    """Yield three values of each row in blocks (n, 3); raise the errors of `skip_rows`."""
+    for places, _ in value_offsets(view, start, count, kinds, picked, order):
         block = np.empty((len(places), 3))
         for k, value in enumerate(picked):
             kind = np.dtype(order + kinds[value][0])
@@ -66,24 +67,24 @@ def list_blocks(
         yield block
 
 
-def walked(
+def value_offsets(
     view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
 ) -> Iterator[tuple[Places, int]]:
-    """Yield the offsets of the picked values of each row, and the offset after each block.
+    """Yield the offsets (n, 3) of the `picked` values of a block of rows, and the offset after it.
 
-    It raises as `skip_rows`.
+    Errors are those of `skip_rows`.
     """
     sizes = np.array([np.dtype(kind).itemsize for kind, _ in kinds])
     lengths = np.array([np.dtype(length).itemsize if length else 0 for _, length in kinds])
     signed = np.array([length is not None and length[0] == "i" for _, length in kinds])
-    wanted = np.array(picked)
+    values = np.array(picked)
     for first, n in steps(count):
         places = np.zeros((n, 3), np.int64)
-        start, rows = _walk(view, start, places, sizes, lengths, signed, wanted, order == "<")
+        start, rows = _walk(view, start, places, sizes, lengths, signed, values, order == "<")
         if rows < n:
             raise UnreadableCloud(
-                f"The file ends in row {first + rows + 1} of {count}, whose lists have more in "
-                "them than is left. Copy or write the file again."
+                f"The file ends in row {first + rows + 1} of {count}, whose lists announce more "
+                "bytes than remain. Copy or write the file again."
             )
         yield places, start
 
@@ -91,14 +92,14 @@ def walked(
 @kernel
 def _walk(
     view: Bytes, start: int, places: Places, sizes: Places, lengths: Places,
-    signed: NDArray[np.bool_], wanted: Places, little: bool,
+    signed: NDArray[np.bool_], values: Places, little: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Fill `places`; return the offset after the last whole row, and the number of rows."""
+    """Fill `places`, and return the offset after the last complete row and the number of rows."""
     at, end = start, len(view)
     for row in range(len(places)):
         for p in range(len(sizes)):
             for k in range(3):
-                if wanted[k] == p:
+                if values[k] == p:
                     places[row, k] = at
             repeats = 1
             if lengths[p] > 0:
@@ -107,7 +108,7 @@ def _walk(
                 repeats = 0
                 for b in range(lengths[p]):
                     byte = int(view[at + (lengths[p] - 1 - b if little else b)])
-                    if b == 0 and signed[p] and byte > 127:  # a negative length
+                    if b == 0 and signed[p] and byte > 127:  # the length is negative
                         return at, row
                     repeats = 256 * repeats + byte
                 at += lengths[p]
@@ -131,16 +132,16 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class Property:
-    """A property of an element: a value, or a list of values with its length before it."""
+    """Property of an element: a value, or a list of values after its length."""
 
     name: str
-    kind: str  #: type in numpy, without byte order
-    length: str | None = None  #: type of a list's length
+    kind: str  #: numpy type without byte order
+    length: str | None = None  #: numpy type of a list's length
 
 
 @dataclass(frozen=True)
 class Element:
-    """An element of a file: a number of rows with the same properties."""
+    """Element of a file: a number of rows with the same properties."""
 
     name: str
     count: int
@@ -148,12 +149,12 @@ class Element:
 
     @property
     def least(self) -> int:
-        """Minimum size of a binary row, bytes; the exact size without lists."""
+        """Minimum size of a binary row, bytes; the exact size if it has no lists."""
         return sum(np.dtype(p.length or p.kind).itemsize for p in self.properties)
 
     @property
     def has_lists(self) -> bool:
-        """Whether rows have lists, so that their lengths vary."""
+        """Whether rows have lists, so that their sizes vary."""
         return any(p.length for p in self.properties)
 
 
@@ -162,15 +163,15 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 
     Raises
     ------
-    UnreadableCloud : The file is not PLY, its vertices lack x, y or z, there are more than `most`,
-        or the header does not fit the rest.
+    UnreadableCloud : If the file is not PLY, its vertices lack x, y or z, there are more than
+        `most`, or the header contradicts the rest of the file.
     """
     order, elements, start = ply_header(data)
     names = [element.name for element in elements]
     if names.count("vertex") != 1:
         raise UnreadableCloud(
-            f"The PLY file has {names.count('vertex')} elements called vertex, and points are in "
-            "one. Write them as one element vertex with properties x, y, z."
+            f"The PLY file has {names.count('vertex')} elements called vertex. Write the points as "
+            "one element vertex with the properties x, y, z."
         )
     at = names.index("vertex")
     vertex = elements[at]
@@ -178,12 +179,12 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     wrong = [name for name in _XYZ if own.count(name) != 1]
     if wrong or any(p.name in _XYZ and p.length for p in vertex.properties):
         raise UnreadableCloud(
-            f"The vertices of the PLY file have no single {' or '.join(wrong or _XYZ)}. "
-            "Write each point's x, y and z."
+            "The vertices of the PLY file do not have exactly one property "
+            f"{' or '.join(wrong or _XYZ)}. Write x, y and z of each point."
         )
     check_count(vertex.count, most)
     if order == "":
-        return FilePoints(vertex.count, _written_out(data, start, elements[: at + 1]))
+        return FilePoints(vertex.count, _ascii_blocks(data, start, elements[: at + 1]))
     view, begins = np.frombuffer(data, np.uint8), 0
     for i, element in enumerate(elements):
         begins = start if i == at else begins
@@ -191,8 +192,8 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     rest = len(data) - start
     if rest > _MAXIMUM_HEADER or data[start:].strip(
         b"\r\n"
-    ):  # otherwise the header states a wrong type or count
-        raise UnreadableCloud(f"{rest} bytes follow what the PLY header announces. {_AGAIN}")
+    ):  # the header states a wrong type or count
+        raise UnreadableCloud(f"{rest} bytes follow after the elements of the PLY header. {_AGAIN}")
     if vertex.has_lists:
         kinds = [(p.kind, p.length) for p in vertex.properties]
         picked = (own.index("x"), own.index("y"), own.index("z"))
@@ -209,7 +210,7 @@ def element_end(data: FileBytes, start: int, element: Element, order: str) -> in
     if element.count * element.least > left:
         raise UnreadableCloud(
             f"The PLY header announces {element.count} rows of {element.name}, at least "
-            f"{element.count * element.least} bytes, and {left} are left. {_AGAIN}"
+            f"{element.count * element.least} bytes, but {left} bytes remain. {_AGAIN}"
         )
     if not element.has_lists:
         return start + element.count * element.least
@@ -217,24 +218,24 @@ def element_end(data: FileBytes, start: int, element: Element, order: str) -> in
     return skip_rows(np.frombuffer(data, np.uint8), start, element.count, kinds, order)
 
 
-def _written_out(data: FileBytes, start: int, elements: list[Element]) -> Iterator[Floats]:
-    """Return the blocks of the last of `elements` in an ascii file."""
+def _ascii_blocks(data: FileBytes, start: int, elements: list[Element]) -> Iterator[Floats]:
+    """Return the blocks of the last element of `elements` in an ascii file."""
     *before, vertex = elements
     text = np.frombuffer(data, np.uint8)
     for element in before:
         start = skip_lines(text, start, element.count)
     check_room(text, start, vertex.count, len(vertex.properties))
-    wanted = np.array(
+    axes = np.array(
         [_XYZ.index(p.name) if p.name in _XYZ else -1 for p in vertex.properties], np.int8
     )
     lists = np.array([p.length is not None for p in vertex.properties])
-    return parse_blocks(text, start, vertex.count, wanted, lists)
+    return parse_blocks(text, start, vertex.count, axes, lists)
 
 
 def ply_header(data: FileBytes) -> tuple[str, list[Element], int]:
-    """Return byte order ("" for ascii), elements, and offset of the rows."""
+    """Return the byte order ("" for ascii), the elements, and the offset of the rows."""
     head = data[:_MAXIMUM_HEADER]
-    old = head[3:4] == b"\r" and head[4:5] != b"\n"  # line ends of old Macintoshes
+    old = head[3:4] == b"\r" and head[4:5] != b"\n"  # line endings of classic Mac OS
     ending = b"\r" if old else b"\n"
     lines, start = [], 0
     while True:
@@ -249,11 +250,11 @@ def ply_header(data: FileBytes) -> tuple[str, list[Element], int]:
             break
         lines.append(line)
     if not lines or lines[0] != "ply":
-        raise UnreadableCloud("This is no PLY file: it does not begin with a line ply.")
-    return *_described(lines[1:]), start
+        raise UnreadableCloud("This is not a PLY file: its first line is not ply. Write it as PLY.")
+    return *_parse_header(lines[1:]), start
 
 
-def _described(lines: list[str]) -> tuple[str, list[Element]]:
+def _parse_header(lines: list[str]) -> tuple[str, list[Element]]:
     order, elements = None, list[Element]()
     for line in lines:
         word, *rest = line.split() or ["comment"]
@@ -271,14 +272,14 @@ def _described(lines: list[str]) -> tuple[str, list[Element]]:
                 )
             elements[-1] = Element(last.name, last.count, (*last.properties, _property(rest)))
         else:
-            raise UnreadableCloud(f"The PLY header has a line {line!r:.60}. {_AGAIN}")
+            raise UnreadableCloud(f"The PLY header has the invalid line {line!r:.60}. {_AGAIN}")
     if order is None:
-        raise UnreadableCloud(f"The PLY header does not say which format follows. {_AGAIN}")
+        raise UnreadableCloud(f"The PLY header does not state the format. {_AGAIN}")
     for element in elements:
         if element.count and not element.properties:
             raise UnreadableCloud(
-                f"The PLY header announces {element.count} rows of {element.name!r:.40} with "
-                f"nothing in them. {_AGAIN}"
+                f"The PLY header announces {element.count} rows of {element.name!r:.40} without "
+                f"properties. {_AGAIN}"
             )
     return order, [_with_axis_names(element) for element in elements]
 
@@ -297,12 +298,12 @@ def _property(words: list[str]) -> Property:
         if length[0] != "f":
             return Property(words[3], _TYPES[words[2]], length)
     raise UnreadableCloud(
-        f"The PLY header has a property {' '.join(words)!r:.60}, and known are numbers of the "
-        f"types {', '.join(list(_TYPES)[:8])}, and lists of them. {_AGAIN}"
+        f"The PLY header has the property {' '.join(words)!r:.60}; supported are the types "
+        f"{', '.join(list(_TYPES)[:8])}, and lists of them. {_AGAIN}"
     )
 
 
 def _count(word: str) -> int:
     if not (word.isascii() and word.isdigit() and len(word) <= 18):
-        raise UnreadableCloud(f"The PLY header has a count {word!r:.40}. {_AGAIN}")
+        raise UnreadableCloud(f"The PLY header has the invalid count {word!r:.40}. {_AGAIN}")
     return int(word)

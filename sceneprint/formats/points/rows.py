@@ -1,9 +1,9 @@
-"""Rows of points: the result of every reader, its limits, and the parser of rows of text.
+"""Points in the form that all readers return, their limits, and a parser for rows of text.
 
-text, start  --parse_rows-->  coordinates (n, 3), offset after them, status
+text, start  --parse_rows-->  coordinates (n, 3), offset after the rows, status
 
-Each line of text is a point, of which three columns are read. Python's `float` would take a minute
-for the largest file.
+Each line of text is a point; the parser reads three of its columns. Python's `float` would take a
+minute for the largest file.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.sidecars import Position
 
-#: Maximum number of points of a file; a larger one is refused by its header.
+#: Maximum number of points of a file. Larger files are refused according to their header.
 MAXIMUM_POINTS = 20_000_000
 
-#: Maximum size that a compressed file is decompressed to at once, bytes: 20 million points of four
-#: values, and a size that several uploads may take at a time.
+#: Maximum size of data that is decompressed at once, bytes. It suffices for 20 million points of
+#: four values, and several uploads may need it at the same time.
 MAXIMUM_INFLATED = 400 << 20
 
-#: Number of points that are parsed at a time, so that they stay in the processor's cache.
+#: Number of points in a block, which fits into the processor's cache.
 BLOCK = 1 << 16
 
 
-#: The bytes of a file, in memory or mapped from the disk.
+#: Bytes of a file, in memory or mapped from the disk.
 FileBytes = bytes | mmap.mmap
 
 
@@ -41,9 +41,9 @@ class FilePoints:
 
     Parameters
     ----------
-    count : number of points, checked against the length of the file
-    blocks : coordinates in order, (n, 3) float64 each; missing ones are NaN or infinite, and may
-        cause warnings of numpy
+    count : number of points, which has been compared with the length of the file
+    blocks : coordinates in order, in blocks (n, 3) of float64; missing points are NaN or infinite,
+        and may cause numpy warnings
     viewpoint : viewpoint that the file states, or None
     """
 
@@ -56,18 +56,18 @@ def check_count(count: int, most: int) -> None:
     """Raise UnreadableCloud if a header announces more than `most` points."""
     if count > most:
         raise UnreadableCloud(
-            f"The file announces {count} points, and at most {most} are read. "
-            "Thin the cloud out, to a voxel grid of a few centimetres, or send it in parts."
+            f"The file announces {count} points; the limit is {most}. "
+            "Thin the cloud to a voxel grid of a few centimetres, or send it in parts."
         )
 
 
 def steps(count: int) -> Iterator[tuple[int, int]]:
-    """Yield first index and length of each block of `count` rows."""
+    """Yield the first index and the length of each block of `count` rows."""
     return ((first, min(BLOCK, count - first)) for first in range(0, count, BLOCK))
 
 
 def axis_names(names: list[str]) -> list[str]:
-    """Return the names of fields with x, y, z in place of X, Y, Z, which PDAL writes."""
+    """Return the names of fields with X, Y, Z, which PDAL writes, replaced by x, y, z."""
     if {"x", "y", "z"}.isdisjoint(names):
         return [name.lower() if name in ("X", "Y", "Z") else name for name in names]
     return names
@@ -76,12 +76,12 @@ def axis_names(names: list[str]) -> list[str]:
 def record_blocks(
     data: FileBytes, start: int, count: int, fields: Iterable[tuple[str, str, int]]
 ) -> Iterator[Floats]:
-    """Yield x, y and z of packed records, a block at a time.
+    """Yield x, y and z of packed records in blocks (n, 3).
 
     Parameters
     ----------
-    data, start, count : the file, and offset and number of its records, which fit into it
-    fields : name, type in numpy and number of values of each field; x, y and z are among them
+    data, start, count : the file, and offset and number of its records, which must fit into it
+    fields : name, numpy type and number of values of each field, including x, y and z
     """
     packed = [(name if name in ("x", "y", "z") else f"{place}", kind, (n,) * (n != 1))
               for place, (name, kind, n) in enumerate(fields)]  # fmt: skip
@@ -91,35 +91,35 @@ def record_blocks(
         yield np.stack([rows[name] for name in "xyz"], axis=1, dtype=np.float64)
 
 
-# Rows of text, one on each line.
+# Rows of text, one per line.
 
-#: Status of a row: readable, or the reason why not.
+#: Status of a row: readable, or the reason why it is unreadable.
 GOOD, ENDS, FEW, MANY, NO_NUMBER, CORNERS = 0, 1, 2, 3, 4, 5
 
 ROW_ERRORS = {
     ENDS: "the file ends before it",
     FEW: "it has fewer values than the header announces",
     MANY: "it has more values than the header announces",
-    NO_NUMBER: "one of its values is no number",
+    NO_NUMBER: "one of its values is not a number",
     CORNERS: "its polygon has fewer than 3 corners, or more than 1024",
 }
 
-#: Powers of ten that float64 holds exactly.
+#: Powers of ten that float64 represents exactly.
 _TENS = np.array([float(f"1e{k}") for k in range(23)])
 
 
 def parse_blocks(
-    text: Bytes, start: int, count: int, wanted: NDArray[np.int8], lists: NDArray[np.bool_]
+    text: Bytes, start: int, count: int, axes: NDArray[np.int8], lists: NDArray[np.bool_]
 ) -> Iterator[Floats]:
-    """Yield the coordinates of `count` rows, (n, 3) each; see `parse_rows`.
+    """Yield the coordinates of `count` rows in blocks (n, 3); see `parse_rows`.
 
     Raises
     ------
-    UnreadableCloud : A row is missing or malformed; the message names it.
+    UnreadableCloud : If a row is missing or malformed. The message states its number.
     """
     for first, n in steps(count):
         block = np.full((n, 3), np.nan)
-        start, rows, state = parse_rows(text, start, block, wanted, lists)
+        start, rows, state = parse_rows(text, start, block, axes, lists)
         if state != GOOD:
             raise UnreadableCloud(
                 f"Row {first + rows + 1} of {count} cannot be read: {ROW_ERRORS[state]}. "
@@ -133,12 +133,12 @@ def skip_lines(text: Bytes, start: int, count: int) -> int:
 
     Raises
     ------
-    UnreadableCloud : There are fewer lines.
+    UnreadableCloud : If there are fewer lines.
     """
     place, lines = _skip(text, start, count)
     if lines < count:
         raise UnreadableCloud(
-            f"The file ends after {lines} of {count} rows before its points. "
+            f"The file ends after {lines} of the {count} rows that precede its points. "
             "Copy or write the file again."
         )
     return place
@@ -146,16 +146,16 @@ def skip_lines(text: Bytes, start: int, count: int) -> int:
 
 def check_room(text: Bytes, start: int, count: int, columns: int) -> None:
     """Raise UnreadableCloud if a header announces more rows than fit into the rest of the file."""
-    if count * columns * 2 - 1 > len(text) - start:  # a digit and a space for each value
+    if count * columns * 2 - 1 > len(text) - start:  # each value has at least a digit and a space
         raise UnreadableCloud(
-            f"The header announces {count} rows of {columns} values, and {len(text) - start} "
-            "bytes follow. Copy or write the file again."
+            f"The header announces {count} rows of {columns} values, but only "
+            f"{len(text) - start} bytes follow. Copy or write the file again."
         )
 
 
 @kernel
 def parse_rows(
-    text: Bytes, start: int, out: Floats, wanted: NDArray[np.int8], lists: NDArray[np.bool_]
+    text: Bytes, start: int, out: Floats, axes: NDArray[np.int8], lists: NDArray[np.bool_]
 ) -> tuple[int, int, int]:
     """Parse rows of text until `out` is full; empty lines are skipped.
 
@@ -164,12 +164,12 @@ def parse_rows(
     text : (N,) bytes
     start : offset of the first row
     out : (n, 3) output
-    wanted : (c,) column of `out` for each value, or -1
+    axes : (c,) column of `out` for each value, or -1
     lists : (c,) whether a value is the length of a list that follows on the same line
 
     Returns
     -------
-    offset after the last row, number of rows, and status
+    end, rows, status : offset after the last row, number of rows, and status of the next row
     """
     i, size = start, len(text)
     for row in range(len(out)):
@@ -177,9 +177,9 @@ def parse_rows(
             i += 1
         if i >= size:
             return i, row, ENDS
-        for c in range(len(wanted)):
+        for c in range(len(axes)):
             first, i = word(text, i)
-            if first == i:  # the end of a line, or a character that does not belong in text
+            if first == i:  # the end of the line, or an unexpected character
                 return i, row, FEW
             if lists[c]:
                 value, good = number(text, first, i)
@@ -189,11 +189,11 @@ def parse_rows(
                     first, i = word(text, i)
                     if first == i:
                         return i, row, FEW
-            elif wanted[c] >= 0:
+            elif axes[c] >= 0:
                 value, good = number(text, first, i)
                 if not good:
                     return i, row, NO_NUMBER
-                out[row, wanted[c]] = value
+                out[row, axes[c]] = value
         first, i = word(text, i)
         if first != i:
             return i, row, MANY
@@ -217,7 +217,7 @@ def _skip(text: Bytes, start: int, count: int) -> tuple[int, int]:
 
 @kernel
 def word(text: Bytes, start: int) -> tuple[int, int]:
-    """Return start and end of the next word on this line; equal if there is none."""
+    """Return the start and end of the next word on this line, which are equal if there is none."""
     first = start
     while first < len(text) and (text[first] == 32 or text[first] == 9):
         first += 1
@@ -229,8 +229,9 @@ def word(text: Bytes, start: int) -> tuple[int, int]:
 
 @kernel
 def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
-    """Return the number of a word, exact to the last bit but one, and whether it is a number; NaN
-    for every spelling of NaN and infinity by printf.
+    """Return the value of a word, exact except for the last bit, and whether it is a number.
+
+    All spellings of NaN and infinity by printf give NaN.
     """
     i = start
     negative = i < end and text[i] == 45
@@ -240,22 +241,22 @@ def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
         a, b, c = text[i] | 32, text[i + 1] | 32, text[i + 2] | 32
         if (a == 110 and b == 97 and c == 110) or (a == 105 and b == 110 and c == 102):
             return np.nan, True
-    mantissa, taken, digits, exponent, point = 0, 0, 0, 0, False
+    mantissa, significant, digits, exponent, point = 0, 0, 0, 0, False
     while i < end:
         sign = text[i]
         if 48 <= sign <= 57:
             digits += 1
-            if taken < 18:  # more digits than a float64 distinguishes
+            if significant < 18:  # further digits do not affect a float64
                 mantissa = 10 * mantissa + (int(sign) - 48)
                 if mantissa > 0:
-                    taken += 1
+                    significant += 1
                 if point:
                     exponent -= 1
             elif not point:
                 exponent += 1
         elif sign == 46 and not point:
             point = True
-        elif sign == 35 and point:  # 1.#QNAN, on Windows
+        elif sign == 35 and point:  # Windows writes 1.#QNAN
             return np.nan, True
         else:
             break

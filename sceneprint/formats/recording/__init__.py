@@ -1,4 +1,4 @@
-"""Recordings of ROS: bags with depth or points, cameras and transforms, as sequences of frames.
+"""Readers for ROS recordings: bags with depth or points, cameras and transforms.
 
 path  --recording_sequences-->  FrameSequence, ...
 

@@ -1,9 +1,9 @@
-"""The files of ROS: MCAP, rosbag2 folders and databases, ROS 1 bags. The boundary to rosbags.
+"""Read ROS files through rosbags: MCAP, rosbag2 folders and databases, ROS 1 bags.
 
 path  --Bag-->  topics, raw messages; raw message  --Bag.decode-->  its fields
 
-rosbags raises whatever its parsers meet in a damaged file, so every call into it is made within
-`_stated`, and what it decompresses is limited.
+rosbags raises arbitrary exceptions for damaged files, so each call is made within
+`_dataset_errors`, and decompression is limited.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader as Ros2Reader
     from rosbags.typesys.store import Typestore
 
-#: What a rosbag2 folder has beside its databases.
+#: File of a rosbag2 folder with its metadata.
 _METADATA = "metadata.yaml"
-#: Most bytes of one chunk once it is decompressed; recorders write 1 to 4 MB.
+#: Maximum size of a decompressed chunk, bytes; recorders write 1 to 4 MB.
 MAXIMUM_CHUNK_BYTES = 256 << 20
-#: Most bytes of one message.
+#: Maximum size of a message, bytes.
 MAXIMUM_MESSAGE_BYTES = 256 << 20
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -43,15 +43,15 @@ CAMERA = "sensor_msgs/msg/CameraInfo"
 IMU = "sensor_msgs/msg/Imu"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-#: Transforms that ROS 1 wrote before tf2; the fields are the same.
+#: Type of transforms in ROS 1 before tf2, with the same fields.
 OLD_TRANSFORMS = "tf/msg/tfMessage"
 _TRANSFORMS_FIELDS = "geometry_msgs/TransformStamped[] transforms"
-#: Types of messages that are decoded, and no others.
+#: Types of messages that `Bag.decode` supports.
 TYPES = (IMAGE, COMPRESSED, POINTS, CAMERA, IMU, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is a recording of ROS by its name, or a folder with a rosbag2's metadata."""
+    """Return whether a path is a ROS recording by its suffix, or a folder with rosbag2 metadata."""
     if path.is_dir():
         return (path / _METADATA).is_file() and not (path / "intrinsics.json").is_file()
     return format_named(path.name, "recording") is not None
@@ -59,13 +59,13 @@ def is_recording(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic of a bag.
+    """Topic of a bag.
 
     Parameters
     ----------
-    name : such as "/camera/depth/image_raw"
-    type : of its messages, such as "sensor_msgs/msg/Image"
-    count : of its messages
+    name : name such as "/camera/depth/image_raw"
+    type : type of the messages, such as "sensor_msgs/msg/Image"
+    count : number of messages
     """
 
     name: str
@@ -75,13 +75,13 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class RawMessage:
-    """A message as it was recorded.
+    """Serialised message of a bag.
 
     Parameters
     ----------
-    topic : its name
-    log_ns : when it was recorded, nanoseconds
-    data : its bytes, as ROS serialised them
+    topic : name of the topic
+    log_ns : time of recording, nanoseconds
+    data : bytes that ROS serialised
     """
 
     topic: str
@@ -90,16 +90,16 @@ class RawMessage:
 
 
 class Bag:
-    """A recording of ROS, open until it is closed or nobody refers to it; safe among threads.
+    """Open ROS recording, which threads may share.
 
     Parameters
     ----------
-    path : an .mcap, .db3 or .bag file, or a rosbag2 folder
+    path : .mcap, .db3 or .bag file, or rosbag2 folder
 
     Raises
     ------
-    DatasetError : there is no such file, or it is damaged or of a kind that is not read.
-    MissingDependency : rosbags is not installed.
+    DatasetError : If the file does not exist, is damaged, or has an unsupported format.
+    MissingDependency : If rosbags is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -107,12 +107,12 @@ class Bag:
         is_bag = path.suffix.lower() == ".bag" and not path.is_dir()
         self._lock = threading.RLock()
         if not path.exists():
-            raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
-        _types(ros1=is_bag)  # limits rosbags before it opens anything
-        with _stated(path):
+            raise DatasetError(f"{path}: The file or folder does not exist. Check the path.")
+        _types(ros1=is_bag)  # this limits rosbags before it opens the file
+        with _dataset_errors(path):
             self._reader = _open_reader(path, ros1=is_bag)
         self._closes = weakref.finalize(self, _close, self._reader)
-        with _stated(path):
+        with _dataset_errors(path):
             self._connections: list[Connection] = [
                 one for one in self._reader.connections if _serialization(one) in ("cdr", "ros1")
             ]
@@ -126,37 +126,37 @@ class Bag:
         self._closes()
 
     def of_type(self, *types: str) -> list[BagTopic]:
-        """Topics of these types that have messages, by name."""
+        """Return the topics of these types that have messages, sorted by name."""
         return [one for one in self.topics if one.type in types and one.count]
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """Messages of topics in the order in which they were recorded.
+        """Yield the messages of topics in the order of recording.
 
         Parameters
         ----------
-        topics : their names
-        start_ns, stop_ns : recorded from the first on, and before the second
+        topics : names of the topics
+        start_ns, stop_ns : first time of recording, and time after the last, nanoseconds
 
         Raises
         ------
-        DatasetError : the file is damaged where they are.
+        DatasetError : If the file is damaged.
         """
-        wanted = [one for one in self._connections if one.topic in topics]
-        if not wanted:
+        connections = [one for one in self._connections if one.topic in topics]
+        if not connections:
             return
-        with self._lock, _stated(self.path):
-            for connection, log_ns, data in self._reader.messages(wanted, start_ns, stop_ns):
+        with self._lock, _dataset_errors(self.path):
+            for connection, log_ns, data in self._reader.messages(connections, start_ns, stop_ns):
                 if len(data) > MAXIMUM_MESSAGE_BYTES:
                     raise DatasetError(
-                        f"{self.path}: A message of {connection.topic} has {len(data)} bytes; at "
-                        f"most {MAXIMUM_MESSAGE_BYTES} are read. Leave the topic out."
+                        f"{self.path}: A message of {connection.topic} has {len(data)} bytes; the "
+                        f"limit is {MAXIMUM_MESSAGE_BYTES}. Exclude the topic."
                     )
                 yield RawMessage(connection.topic, log_ns, bytes(data))
 
     def first(self, topic: str) -> RawMessage | None:
-        """Return the first message of a topic; None where it has none."""
+        """Return the first message of a topic; None if it has no messages."""
         with self._lock:
             messages = self.messages([topic])
             try:
@@ -165,42 +165,47 @@ class Bag:
                 messages.close()  # type: ignore[attr-defined]  # a generator, which holds the lock
 
     def at(self, topic: str, log_ns: int, occurrence: int) -> RawMessage:
-        """Return the message of a topic with this time of recording; of several, by number from 0.
+        """Return the message of a topic with this time of recording.
+
+        Parameters
+        ----------
+        occurrence : index among the messages with the same time
 
         Raises
         ------
-        DatasetError : there is none any more, or the file is damaged.
+        DatasetError : If the message no longer exists, or the file is damaged.
         """
         with self._lock:
-            found = list(self.messages([topic], log_ns, log_ns + 1))
-        if occurrence >= len(found):
+            messages = list(self.messages([topic], log_ns, log_ns + 1))
+        if occurrence >= len(messages):
             raise DatasetError(
-                f"{self.path}: The message of {topic} at {log_ns} ns is no longer there. Read the "
+                f"{self.path}: The message of {topic} at {log_ns} ns no longer exists. Read the "
                 "recording again."
             )
-        return found[occurrence]
+        return messages[occurrence]
 
     def decode(self, message: RawMessage, kind: str) -> Any:
         """Return the fields of a message, as attributes.
 
         Parameters
         ----------
-        message : of this bag
-        kind : one of TYPES
+        message : message of this bag
+        kind : type of the message, one of TYPES
 
         Raises
         ------
-        DatasetError : its bytes are not of this type.
+        DatasetError : If the bytes are not a message of this type.
         """
-        known = TRANSFORMS if kind == OLD_TRANSFORMS else kind
-        with _stated(self.path, f"a message of {message.topic} does not decode"):
+        type_name = TRANSFORMS if kind == OLD_TRANSFORMS else kind
+        with _dataset_errors(self.path, f"a message of {message.topic} does not decode"):
             if self.is_ros1:
-                return self._types.deserialize_ros1(message.data, known)
-            return self._types.deserialize_cdr(message.data, known)
+                return self._types.deserialize_ros1(message.data, type_name)
+            return self._types.deserialize_cdr(message.data, type_name)
 
     def stamp_ns(self, message: RawMessage) -> int:
-        """When a message with a header was measured, nanoseconds; of one that says nothing, when
-        it was recorded. Only the beginning is decoded.
+        """Return the time of measurement of a message with a header, nanoseconds.
+
+        If the header has no time, return the time of recording. Only the header is decoded.
         """
         head = message.data[:12]
         if len(head) < 12:
@@ -217,20 +222,20 @@ class Bag:
 
 @lru_cache(maxsize=4)
 def shared_bag(path: Path) -> Bag:
-    """A bag that all frames of this process share whose references came from another process."""
+    """Return a bag that this process shares among the frame references from other processes."""
     return Bag(path)
 
 
 def _serialization(connection: Connection) -> str:
-    """Return how the messages of a topic are serialised; those of a ROS 1 bag do not say it."""
+    """Return the serialisation format of a topic; ROS 1 bags do not state it."""
     return str(getattr(connection.ext, "serialization_format", "ros1"))
 
 
 def _topics(connections: list[Connection]) -> tuple[BagTopic, ...]:
-    """Topics by name; one with messages of several types is there with each."""
+    """Return the topics sorted by name; a topic with several types has an entry for each type."""
     counts: dict[tuple[str, str], int] = {}
     for one in connections:
-        package, _, name = one.msgtype.partition("/")  # of ROS 1 in MCAP: sensor_msgs/Image
+        package, _, name = one.msgtype.partition("/")  # ROS 1 in MCAP has sensor_msgs/Image
         key = (str(one.topic), f"{package}/msg/{name.removeprefix('msg/')}")
         counts[key] = counts.get(key, 0) + int(one.msgcount)
     return tuple(BagTopic(name, kind, n) for (name, kind), n in sorted(counts.items()))
@@ -255,8 +260,8 @@ def _close(reader: Ros1Reader | Ros2Reader) -> None:
 
 
 @contextmanager
-def _stated(path: Path, what: str = "The recording cannot be read") -> Iterator[None]:
-    """Turn whatever rosbags raises into an error of ours."""
+def _dataset_errors(path: Path, what: str = "The recording cannot be read") -> Iterator[None]:
+    """Raise DatasetError for any exception of rosbags."""
     try:
         yield
     except (SceneprintError, GeneratorExit):
@@ -264,35 +269,35 @@ def _stated(path: Path, what: str = "The recording cannot be read") -> Iterator[
     except Exception as cause:
         reason = " ".join(str(cause).split()) or type(cause).__name__
         what = what[0].upper() + what[1:]
-        told = printable(f"{what} ({reason:.200}). {_advice(path)}")
-        raise DatasetError(f"{path}: {told}") from cause
+        text = printable(f"{what} ({reason:.200}). {_advice(path)}")
+        raise DatasetError(f"{path}: {text}") from cause
 
 
 def _advice(path: Path) -> str:
-    """What mends a recording that was cut off."""
+    """Return the advice for a recording that may be truncated."""
     suffix = path.suffix.lower()
     tool = {".mcap": "mcap recover", ".bag": "rosbag reindex"}.get(suffix, "ros2 bag reindex")
     return (
-        f"If the recorder was stopped before it closed the file, run `{tool}`; else copy it again."
+        f"If the recorder was killed before it closed the file, run `{tool}`; else copy it again."
     )
 
 
-# rosbags itself, and how much it may decompress.
+# Message types and decompression limits of rosbags.
 
 
 @lru_cache(maxsize=2)
 def _types(*, ros1: bool) -> Typestore:
-    """Definitions of the messages of ROS; those in the bag are not needed, and may be of anything.
+    """Return the standard message definitions. Those in the bag are not trusted.
 
     Raises
     ------
-    MissingDependency : rosbags is not installed.
+    MissingDependency : If rosbags is not installed.
     """
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as cause:
         raise MissingDependency(
-            "Recordings of ROS are read with rosbags, which is not installed. "
+            "ROS recordings require rosbags, which is not installed. "
             "Run: pip install 'sceneprint[ros]'"
         ) from cause
     _limit_decompression()
@@ -304,10 +309,10 @@ def _types(*, ros1: bool) -> Typestore:
 
 
 def _limit_decompression() -> None:
-    """Let chunks become no larger than they announce or than we take.
+    """Limit decompressed chunks to their announced size and to MAXIMUM_CHUNK_BYTES.
 
-    rosbags inflates a chunk whole before it compares the size, so that a damaged or hostile one
-    would fill the memory. Its tables of decompressors are the place where it can be limited.
+    rosbags decompresses a chunk completely before it checks the size, so a damaged or hostile chunk
+    could fill the memory. Its tables of decompressors are replaced by limited functions.
     """
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import storage_mcap as mcap
@@ -321,16 +326,16 @@ def _limit_decompression() -> None:
 
 
 def _read_any_profile() -> None:
-    """Let MCAP files be read whose header names another profile than ROS 2, such as none or ROS 1.
+    """Make rosbags accept MCAP files with another profile than ROS 2, such as none or ROS 1.
 
-    Their channels say how messages are serialised, and the definitions in the file are not needed.
+    Their channels state the serialisation, and the message definitions in the file are not needed.
     """
     from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
     from rosbags.rosbag2 import reader
     from rosbags.rosbag2 import storage_mcap as mcap
 
     class ProfiledReader(mcap.McapReader):
-        """An MCAP file whose profile reads as "ros2"."""
+        """MCAP file whose profile reads as "ros2"."""
 
         def _open(self) -> None:
             opened, self.bio = self.bio, _Profiled(self.bio)  # type: ignore[assignment]
@@ -349,7 +354,7 @@ _PROFILE = struct.pack("<I4s", 4, b"ros2")
 
 
 class _Profiled:
-    """A file of MCAP whose header, after its length at byte 9, begins with the profile of ROS 2."""
+    """MCAP file whose header, after its length at byte 9, starts with the profile of ROS 2."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -358,7 +363,7 @@ class _Profiled:
         return getattr(self._file, name)
 
     def read(self, size: int = -1) -> bytes:
-        """Return the content from here on."""
+        """Return the next bytes, with the profile replaced."""
         place = self._file.tell()
         if place == 17:
             return _PROFILE + bytes(self._file.read(size - len(_PROFILE)))
@@ -385,10 +390,10 @@ def _lz4() -> Any:
 
 
 def _inflate(stream: Any, data: bytes, most: int) -> bytes:
-    """Content of one compressed chunk of at most so many bytes."""
+    """Decompress a chunk of at most `most` bytes."""
     if most > MAXIMUM_CHUNK_BYTES:
         raise ValueError(f"a chunk announces {most} bytes, more than {MAXIMUM_CHUNK_BYTES}")
-    found: bytes = stream.decompress(data, most + 1)
-    if len(found) > most or not stream.eof:
+    content: bytes = stream.decompress(data, most + 1)
+    if len(content) > most or not stream.eof:
         raise ValueError(f"a chunk does not end within {most} bytes")
-    return found
+    return content

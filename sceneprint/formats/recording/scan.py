@@ -1,7 +1,7 @@
-"""One pass over a bag: what moves, the camera, and the times of the frames.
+"""Read transforms, odometry, cameras and time stamps of a bag in one pass.
 
 Bag, topics  --scan_bag-->  BagScan
-stamps in the order of recording  -->  BagPart, ...: between them the clock was set back
+stamps in the order of recording  -->  BagPart, ...: a new part starts when the clock was set back
 """
 
 from __future__ import annotations
@@ -41,34 +41,36 @@ from sceneprint_client.transforms import (
     motion,
 )
 
-#: What to call when so many of all messages have been read.
+#: Function that takes the number of messages that have been read, and the number of all messages.
 Progress = Callable[[int, int], None]
-#: Most messages of one topic of frames.
+#: Maximum number of messages of a topic of frames.
 MOST_FRAMES = 2_000_000
 
 
-#: Seconds that stamps of one source may be out of order; farther back, the clock was set back.
+#: Maximum decrease of the stamps of a source, seconds. A larger decrease means a clock that was set
+#: back.
 _OUT_OF_ORDER_S = 0.1
-#: Times that a source goes back and at once forward again before its clock is not believed: it is
-#: several publishers, each with a delay of its own.
+#: Number of decreases, each followed by an increase, after which the stamps of a source are
+#: ignored: it has several publishers with different delays.
 _MOST_FLIPS = 8
-#: Most parts of one recording, and most contents of its CameraInfo.
+#: Maximum number of parts of a recording, and of different contents of its CameraInfo.
 MOST_PARTS, MOST_INFOS = 1000, 100_000
-#: Metres and radians by which what is fixed may differ from itself, and how many values are kept.
+#: Maximum difference between values of a fixed transform, metres and radians, and maximum number of
+#: stored values.
 _FIXED, _MOST_FIXED = 0.1, 100
 
 
 @dataclass(eq=False)
 class BagPart:
-    """What was recorded while no stamps went back.
+    """Part of a recording in which stamps do not go back.
 
     Parameters
     ----------
-    first : number of its first frame
-    tree : transforms, and odometry where no transform says the same
-    imus : measurements by the frame of the IMU
-    odometry : by topic
-    info_stamps_ns, infos : when each calibrated CameraInfo was measured, and its number in the scan
+    first : number of the first frame
+    tree : transforms, and odometry that no transform duplicates
+    imus : measurements by frame of the IMU
+    odometry : odometry by topic
+    info_stamps_ns, infos : time of each calibrated CameraInfo, and its index in the scan
     """
 
     first: int
@@ -79,33 +81,35 @@ class BagPart:
     infos: array[int] = field(default_factory=lambda: array("q"))
 
     def info_at(self, stamps_ns: Sequence[int]) -> list[int]:
-        """Return the number of the CameraInfo of each stamp: that of the same stamp, else the
-        nearest within 20 ms, else the last one before it, else the first.
+        """Return the index of the CameraInfo for each stamp.
+
+        The order of preference is: the same stamp, the nearest within 20 ms, the last before the
+        stamp, the first.
         """
         times = np.frombuffer(self.info_stamps_ns, np.int64)
         order = np.argsort(times, kind="stable")
         times, infos = times[order], np.frombuffer(self.infos, np.int64)[order]
-        asked = np.asarray(stamps_ns, np.int64)
-        before = np.maximum(np.searchsorted(times, asked, "right") - 1, 0)
+        stamps = np.asarray(stamps_ns, np.int64)
+        before = np.maximum(np.searchsorted(times, stamps, "right") - 1, 0)
         after = np.minimum(before + 1, len(times) - 1)
-        ahead = times[after] - asked
-        is_after = (ahead < np.abs(asked - times[before])) & (ahead <= TOLERANCE_S * 1e9)
-        found: list[int] = infos[np.where(is_after & (ahead >= 0), after, before)].tolist()
-        return found
+        ahead = times[after] - stamps
+        is_after = (ahead < np.abs(stamps - times[before])) & (ahead <= TOLERANCE_S * 1e9)
+        numbers: list[int] = infos[np.where(is_after & (ahead >= 0), after, before)].tolist()
+        return numbers
 
 
 @dataclass(eq=False)
 class BagScan:
-    """What one pass over a bag gives.
+    """Result of one pass over a bag.
 
     Parameters
     ----------
-    parts : at least one, in order
-    infos : the calibrated CameraInfo, each content once
-    stamps_ns : when each frame was measured, in the order in which they were recorded
-    places : when each was recorded, and which of those with that time it is
-    damaged : messages that did not decode, and were passed over
-    fixed : values of the transforms that hold at all times; the last one counts
+    parts : at least one part, in order
+    infos : calibrated CameraInfo messages with different contents
+    stamps_ns : time of measurement of each frame, in the order of recording
+    places : time of recording of each frame, and its index among messages with the same time
+    damaged : number of messages that were skipped because they do not decode
+    fixed : values of the static transforms; the last value counts
     """
 
     parts: list[BagPart] = field(default_factory=lambda: [BagPart(0)])
@@ -117,13 +121,13 @@ class BagScan:
 
     @property
     def ends(self) -> list[int]:
-        """Return the number of the frame after the last one of each part."""
+        """Return the number after that of the last frame of each part."""
         return [*(part.first for part in self.parts[1:]), len(self.stamps_ns)]
 
 
 @dataclass(frozen=True)
 class _Odometry:
-    """A pose of a robot in the frame of its odometry."""
+    """Pose of a robot in its odometry frame."""
 
     parent: str
     child: str
@@ -132,7 +136,7 @@ class _Odometry:
 
 
 class _SeveralClocks(Exception):
-    """A source whose stamps go back and forth."""
+    """Error for a source whose stamps go back and forth."""
 
     def __init__(self, source: str) -> None:
         super().__init__(source)
@@ -141,11 +145,11 @@ class _SeveralClocks(Exception):
 
 @dataclass(eq=False)
 class _Clocks:
-    """The latest stamps of sources within a part: topics, and transforms of tf.
+    """Latest stamps of the sources within a part: topics, and transforms of tf.
 
     Parameters
     ----------
-    ignored : sources that say nothing about the clock
+    ignored : sources whose stamps do not determine the clock
     """
 
     ignored: set[str]
@@ -155,11 +159,11 @@ class _Clocks:
     _flips: dict[str, int] = field(default_factory=dict)
 
     def goes_back(self, source: str, stamp_ns: int) -> bool:
-        """Take a stamp, and return whether it says that the clock was set back.
+        """Record a stamp, and return whether it shows that the clock was set back.
 
         Raises
         ------
-        _SeveralClocks : the source goes back and forth.
+        _SeveralClocks : If the stamps of the source go back and forth.
         """
         if stamp_ns <= 0 or source in self.ignored:
             return False
@@ -182,30 +186,30 @@ class _Clocks:
 def scan_bag(
     bag: Bag, frames: BagTopic | None, camera: BagTopic | None, progress: Progress | None
 ) -> BagScan:
-    """Read what moves, and when the frames were measured; their samples are not decoded.
+    """Read transforms, odometry, cameras and the times of the frames, without decoding samples.
 
     Parameters
     ----------
-    bag : to read
-    frames : the topic of the frames, or None
-    camera : the topic of their camera, or None
-    progress : what to call now and then
+    bag : open recording
+    frames : topic of the frames, or None
+    camera : topic of the CameraInfo of the frames, or None
+    progress : function that is called from time to time, or None
 
     Raises
     ------
-    DatasetError : the bag is damaged, or too long.
+    DatasetError : If the bag is damaged or too long.
     """
     ignored = set[str]()
     while True:
         scanner = _Scanner(bag, frames, camera, _Clocks(ignored))
         try:
             return scanner.scan(progress)
-        except _SeveralClocks as found:
-            ignored.add(found.source)
+        except _SeveralClocks as error:
+            ignored.add(error.source)
 
 
 class _Scanner:
-    """One pass over a bag; parameters as of `scan_bag`."""
+    """State of one pass over a bag; see `scan_bag` for the parameters."""
 
     def __init__(
         self, bag: Bag, frames: BagTopic | None, camera: BagTopic | None, clocks: _Clocks
@@ -215,10 +219,12 @@ class _Scanner:
             one.name: one.type for one in bag.of_type(TRANSFORMS, OLD_TRANSFORMS, ODOMETRY, IMU)
         } | ({} if camera is None else {camera.name: camera.type})
         self._scan = BagScan()
-        self._info_numbers: dict[bytes, int] = {}  # by the bytes after the stamp; -1: none
+        self._info_numbers: dict[
+            bytes, int
+        ] = {}  # by the bytes after the stamp; -1 if uncalibrated
 
     def scan(self, progress: Progress | None) -> BagScan:
-        """Read all; raises as `scan_bag`, and _SeveralClocks."""
+        """Read all messages. Raise the errors of `scan_bag`, and _SeveralClocks."""
         scan, frames = self._scan, self._frames
         names = [*self._kinds, *([] if frames is None else [frames.name])]
         total = sum(one.count for one in self._bag.topics if one.name in names)
@@ -238,13 +244,13 @@ class _Scanner:
         return scan
 
     def _part_at(self, source: str, stamp_ns: int) -> BagPart:
-        """Return the part to which a stamp belongs: a new one where the source goes back."""
+        """Return the part of a stamp, which is a new one if the clock was set back."""
         parts = self._scan.parts
         if self._clocks.goes_back(source, stamp_ns):
             if len(parts) == MOST_PARTS:
                 raise DatasetError(
-                    f"The stamps go back more than {MOST_PARTS} times, last in {source}. Cut the "
-                    "bag into parts."
+                    f"The stamps go back more than {MOST_PARTS} times, last in {source}. Split the "
+                    "bag."
                 )
             parts.append(BagPart(len(self._scan.stamps_ns)))
         return parts[-1]
@@ -257,10 +263,10 @@ class _Scanner:
         scan.places.append((message.log_ns, scan.places[-1][1] + 1 if same else 0))
         scan.stamps_ns.append(stamp)
         if len(scan.places) > MOST_FRAMES:
-            raise DatasetError(f"There are more than {MOST_FRAMES} frames. Cut the bag into parts.")
+            raise DatasetError(f"There are more than {MOST_FRAMES} frames. Split the bag.")
 
     def _take(self, message: RawMessage, kind: str) -> None:
-        """Keep what a message says that is not of a frame."""
+        """Record the content of a message that is not a frame."""
         scan, bag = self._scan, self._bag
         if kind == CAMERA and message.data[12:] in self._info_numbers:
             self._take_info(message, self._info_numbers[message.data[12:]])
@@ -273,14 +279,14 @@ class _Scanner:
         if kind == CAMERA:
             if len(scan.infos) == MOST_INFOS:
                 raise DatasetError(
-                    f"{message.topic} has more than {MOST_INFOS} contents. Cut the bag into parts."
+                    f"{message.topic} has more than {MOST_INFOS} different contents. Split the bag."
                 )
             number = len(scan.infos) if is_calibrated(fields) else -1
             scan.infos.extend([] if number < 0 else [fields])
             self._info_numbers[message.data[12:]] = number
             self._take_info(message, number)
         elif kind == IMU:
-            if float(fields.linear_acceleration_covariance[0]) < 0:  # it has no accelerometer
+            if float(fields.linear_acceleration_covariance[0]) < 0:  # the IMU has no accelerometer
                 return
             imus = scan.parts[-1].imus
             imus.setdefault(frame_name(fields.header.frame_id), Accelerations()).add(
@@ -319,7 +325,7 @@ class _Scanner:
 
 
 def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float]]]) -> None:
-    """Add transforms that hold at all times, but for those that contradict themselves or tf."""
+    """Add static transforms, except those that contradict themselves or tf."""
     for (parent, child), rows in fixed.items():
         moving = tree.samples(parent, child)
         accepted = [
@@ -332,14 +338,12 @@ def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float
         apart = motion(np.vstack([moving, *accepted]), accepted[-1])
         if apart.max() > _FIXED:
             tree.remove(parent, child)
-            reason = f"it is fixed, and has values that differ by {apart.max():.2g} m or rad"
+            reason = f"it is static, but has values that differ by {apart.max():.2g} m or rad"
             tree.pass_over(parent, child, reason)
 
 
 def _add_odometry(tree: TransformTree, odometry: dict[str, list[_Odometry]]) -> None:
-    """Add odometry where tf does not say the same; of several topics of one edge that with the most
-    messages.
-    """
+    """Add odometry that tf does not duplicate, from the topic of each edge with most messages."""
     edges: dict[tuple[str, str], list[_Odometry]] = {}
     for topic in sorted(odometry, key=lambda name: len(odometry[name])):
         for one in odometry[topic][:1]:

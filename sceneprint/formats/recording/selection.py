@@ -1,8 +1,8 @@
-"""What of a bag becomes frames: which of the messages, at which poses.
+"""Select the frames of a bag, and compute their poses.
 
-path, RecordingOptions  --recording_sequences-->  FrameSequence of each part
-Bag  --bag_outline-->  BagOutline: what would be taken, for `sceneprint bag`
-stamps, poses  --keyframes-->  places of those far enough from the last, or long enough after it
+path, RecordingOptions  --recording_sequences-->  FrameSequence of each part Bag  --bag_outline-->
+BagOutline for `sceneprint bag` stamps, poses  --keyframes-->  indices of frames far enough from the
+previous keyframe in space or time
 """
 
 from __future__ import annotations
@@ -45,39 +45,38 @@ from sceneprint_client.transforms import (
     frame_name,
 )
 
-# Which frames are taken: far enough from the last one, or long enough after it.
+# Keyframes.
 
 
 def keyframes(
     stamps_ns: Sequence[int], poses: Sequence[Floats] | None, metres: float, radians: float,
     seconds: float,
 ) -> list[int]:  # fmt: skip
-    """Return the places of the frames to take; the first is always one.
+    """Return the indices of the keyframes; the first frame is always a keyframe.
 
     Parameters
     ----------
-    stamps_ns : N times, in order
-    poses : N times T_parent_sensor (4, 4); None where they are not known
-    metres, radians : a frame is taken that lies as far from the last one taken, or is turned by
-        as much; 0 takes every frame
-    seconds : without poses a frame is taken that came as long after the last one taken
+    stamps_ns : time of each frame in order, nanoseconds
+    poses : T_parent_sensor (4, 4) of each frame; None if unknown
+    metres, radians : minimum distance or angle from the previous keyframe; 0 selects every frame
+    seconds : minimum time after the previous keyframe, if there are no poses
     """
-    taken: list[int] = []
+    places: list[int] = []
     for place, stamp in enumerate(stamps_ns):
-        if not taken:
-            taken.append(place)
+        if not places:
+            places.append(place)
         elif poses is None:
-            if stamp - stamps_ns[taken[-1]] >= round(seconds * 1e9):
-                taken.append(place)
+            if stamp - stamps_ns[places[-1]] >= round(seconds * 1e9):
+                places.append(place)
         else:
-            distance, angle = _relative_motion(poses[taken[-1]], poses[place])
+            distance, angle = _relative_motion(poses[places[-1]], poses[place])
             if distance >= metres or angle >= radians:
-                taken.append(place)
-    return taken
+                places.append(place)
+    return places
 
 
 def _relative_motion(a: Floats, b: Floats) -> tuple[float, float]:
-    """Return the metres and radians between two poses."""
+    """Return the distance and the angle between two poses, metres and radians."""
     turn = a[:3, :3].T @ b[:3, :3]
     cosine = (float(np.trace(turn)) - 1.0) / 2.0
     sine = math.hypot(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]) / 2
@@ -89,19 +88,20 @@ def _relative_motion(a: Floats, b: Floats) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How frames are taken from a bag; what is None is found in it.
+    """Options for the frames of a bag; None selects a value from the content of the bag.
 
     Parameters
     ----------
-    topic : of depth images or points
-    camera_info : topic of the depth images' camera
-    pose_frame : what poses lead to, such as "map" or "odom"
-    keyframe_m, keyframe_deg : a frame is taken this far from the last one, or turned by this much;
-        0 takes every frame
-    keyframe_s : without poses, a frame is taken this long after the last one
-    sensor_frame : where the sensor is, of points in another frame
-    depth_scale : stored units per metre of 16-bit depth; None: 1000, or as an intrinsics.json says
-    progress : what to call while the bag is read
+    topic : topic of depth images or points
+    camera_info : topic of the CameraInfo of the depth images
+    pose_frame : parent frame of the poses, such as "map" or "odom"
+    keyframe_m, keyframe_deg : minimum distance or angle from the previous keyframe; 0 selects every
+        frame
+    keyframe_s : minimum time after the previous keyframe, if there are no poses
+    sensor_frame : frame of the sensor, if points are in another frame
+    depth_scale : stored units per metre of 16-bit depth; default: that of an intrinsics.json, or
+        1000
+    progress : function that is called while the bag is read
     """
 
     topic: str | None = None
@@ -121,25 +121,24 @@ class RecordingOptions:
 def recording_sequences(
     path: Path, options: RecordingOptions, name: str | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the frames of a recording that are taken; their samples are read when asked for.
+    """Return the keyframes of a recording, whose samples are read on demand.
 
     Parameters
     ----------
-    path : an .mcap, .db3 or .bag file, or a rosbag2 folder
-    options : what to take
-    name : of the sequence; default: that of the file
+    path : .mcap, .db3 or .bag file, or rosbag2 folder
+    options : topics and keyframes to select
+    name : name of the sequence; default: name of the file
 
     Returns
     -------
-    sequences : one, or one for each part with frames where stamps go back; the `note` of the first
-        says what was taken and left out of all, and why
+    sequences : one sequence, or several if stamps go back; the `note` of the first one lists the
+        selected and the omitted frames, with reasons
 
     Raises
     ------
-    DatasetError : the recording cannot be read, or nothing in it can be taken, or several topics
-        can be.
-    InvalidIntrinsics : its camera is none, or has a lens that is not supported.
-    MissingDependency : rosbags is not installed.
+    DatasetError : If the recording cannot be read, has no suitable topic, or has several.
+    InvalidIntrinsics : If the camera is invalid, or its lens is not supported.
+    MissingDependency : If rosbags is not installed.
     """
     bag = Bag(path)
     frames = choose_topic(bag, options.topic)
@@ -150,11 +149,11 @@ def recording_sequences(
 def _sequences_of(
     bag: Bag, frames: FrameTopic, options: RecordingOptions, name: str
 ) -> list[FrameSequence]:
-    """Return the frames of a topic that are taken; see `recording_sequences`."""
+    """Return the keyframes of a topic; see `recording_sequences`."""
     if options.depth_scale is not None and frames.encoding in (None, "32FC1"):
         raise DatasetError(
-            f"{bag.path}: {frames.topic.name} is {frames.encoding or 'points'} in metres, and has "
-            "no depth scale. Leave --depth-scale out."
+            f"{bag.path}: {frames.topic.name} has {frames.encoding or 'points'} in metres, so a "
+            "depth scale does not apply. Omit --depth-scale."
         )
     info = None if frames.encoding is None else camera_topic(bag, frames, options.camera_info)
     scan = scan_bag(bag, frames.topic, info, options.progress)
@@ -165,23 +164,24 @@ def _sequences_of(
     motions = _motions(bag, scan, frames, sensor, options)
     note = _note(frames, scan, motions)
     if sensor != frames.frame:
-        note += f"; points are taken from {frames.frame} to their sensor, {sensor}"
+        note += f"; points are transformed from {frames.frame} to their sensor, {sensor}"
     lenses = {camera.intrinsics for camera in cameras.values()}
     if len(lenses) > 1:
         note += (
-            f"; {len(lenses)} cameras, as the camera info changes: each frame has that of its time"
+            f"; {len(lenses)} cameras, because the camera info changes: each frame has that of its "
+            "time"
         )
-    if not any(motion.taken for motion in motions):
+    if not any(motion.keyframes for motion in motions):
         raise DatasetError(
-            f"{bag.path}: {note}. Record transforms of one publisher, or choose another frame with "
-            "--pose-frame."
+            f"{bag.path}: {note}. Record transforms of a single publisher, or select another frame "
+            "with --pose-frame."
         )
     sequences: list[FrameSequence] = []
     for number, motion in enumerate(motions, 1):
         part = name if len(motions) == 1 else f"{name}.part{number}"
         references = [
             _reference(bag, frames, scan, cameras.get(place), motion, part, place)
-            for place in motion.taken
+            for place in motion.keyframes
         ]
         if references:
             parent = f"{part}/{motion.world}" if motion.world else part
@@ -195,22 +195,22 @@ def _sequences_of(
     return sequences
 
 
-#: Frames of a recording that are read for its range.
+#: Number of frames of a recording that are read to determine its range.
 _SAMPLED = 9
 
 
 def sampled_range(
     sequences: Sequence[FrameSequence],
 ) -> tuple[SampleRange | None, SceneprintError | None]:
-    """Return the range of some frames from the first to the last, and why none could be read."""
+    """Return the range of a sample of the frames, and the error if none can be read."""
     frames = [one for sequence in sequences for one in sequence.frames]
-    found, error = list[SampleRange](), None
+    ranges, error = list[SampleRange](), None
     for place in sorted(set(np.linspace(0, len(frames) - 1, _SAMPLED).round().astype(int))):
         try:
-            found.append(sample_range(frames[place].read()))
+            ranges.append(sample_range(frames[place].read()))
         except SceneprintError as cause:
             error = cause
-    return pooled_range(found), None if found else error
+    return pooled_range(ranges), None if ranges else error
 
 
 def recording_name(path: Path) -> str:
@@ -219,36 +219,37 @@ def recording_name(path: Path) -> str:
 
 
 def _sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions) -> str:
-    """Return the frame of the sensor: that of the messages, unless it is named, or points are in
-    the frame of the world, as those that FAST-LIO has registered.
+    """Return the frame of the sensor.
+
+    It is the frame of the messages, unless the user specifies another frame or the points are in a
+    world frame, such as the registered points of FAST-LIO.
 
     Raises
     ------
-    DatasetError : points are in the frame of the world, and transforms do not tell their sensor.
+    DatasetError : If points are in a world frame and the transforms do not determine their sensor.
     """
     frame, trees = frames.frame, [part.tree for part in scan.parts]
-    wanted = options.sensor_frame
-    if frames.encoding is not None or (wanted is None and not _is_world(frame, trees)):
+    stated = options.sensor_frame
+    if frames.encoding is not None or (stated is None and not _is_world(frame, trees)):
         return frame
     leaves = sorted({leaf for tree in trees for leaf in tree.leaves(frame)})
-    if wanted is None and len(leaves) == 1:
+    if stated is None and len(leaves) == 1:
         return leaves[0]
-    if wanted is not None and any(tree.path(frame, wanted) is not None for tree in trees):
-        return str(frame_name(wanted))
+    if stated is not None and any(tree.path(frame, stated) is not None for tree in trees):
+        return str(frame_name(stated))
     below = ", ".join(leaves[:20])
-    what = (
-        "where its sensor was is not known" if wanted is None else f"{wanted!r:.100} is not below"
-    )
-    remedy = f"Choose one of {below} with --sensor-frame" if below else "Record /tf or odometry"
+    what = "its sensor is unknown" if stated is None else f"{stated!r:.100} is not below it"
+    remedy = f"Select one of {below} with --sensor-frame" if below else "Record /tf or odometry"
     raise DatasetError(
         f"{bag.path}: The points of {frames.topic.name} are in {frame or 'no frame'}, and {what}. "
-        f"{remedy}, or take the topic of the raw scans."
+        f"{remedy}, or use the topic of the raw scans."
     )
 
 
 def _is_world(frame: str, trees: Sequence[TransformTree]) -> bool:
-    """Return whether points in a frame have been taken out of the axes of their sensor: it is
-    called like a world, or sensors move in it and it moves in none.
+    """Return whether a frame is a world frame, so that points in it are not in sensor axes.
+
+    A world frame has a usual name, or sensors move in it while it moves in no other frame.
     """
     name = frame.rpartition("/")[2]
     if name in WORLDS or name == _WORLD_OF_LOAM:
@@ -258,25 +259,25 @@ def _is_world(frame: str, trees: Sequence[TransformTree]) -> bool:
     )
 
 
-#: What LOAM and FAST-LIO call the frame in which they started.
+#: Name of the world frame of LOAM and FAST-LIO.
 _WORLD_OF_LOAM = "camera_init"
 
 
 @dataclass(eq=False)
 class _Motion:
-    """Where the sensor was in one part of a recording, by the place of each frame.
+    """Motion of the sensor in one part of a recording, by the index of each frame.
 
     Parameters
     ----------
-    world : what poses lead to; None where they are not known
-    base : frame of the robot; None where nothing tells
-    poses, mountings : T_world_sensor and T_base_sensor of each frame, where known
-    ups : up in the sensor's axes of each frame, where known
-    cloud_poses : T_cloud_sensor of each frame whose points are not in the axes of the sensor
-    taken : places of the keyframes
-    unknown : of the frames without a pose, why
-    remarks : what else is to be said of transforms above the sensor
-    is_broken : whether one of these is passed over
+    world : parent frame of the poses; None if unknown
+    base : frame of the robot; None if unknown
+    poses, mountings : known T_world_sensor and T_base_sensor
+    ups : known up directions in the sensor's axes
+    cloud_poses : T_cloud_sensor of frames whose points are not in the axes of the sensor
+    keyframes : indices of the keyframes
+    unknown : reasons why frames have no pose
+    remarks : remarks for users on the transforms above the sensor
+    is_broken : whether one of these transforms is ignored
     """
 
     world: str | None
@@ -285,7 +286,7 @@ class _Motion:
     mountings: dict[int, Floats] = field(default_factory=dict)
     ups: dict[int, Floats] = field(default_factory=dict)
     cloud_poses: dict[int, Floats] = field(default_factory=dict)
-    taken: list[int] = field(default_factory=list)
+    keyframes: list[int] = field(default_factory=list)
     unknown: dict[int, UnknownTransform] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     is_broken: bool = False
@@ -299,57 +300,55 @@ class _Motion:
 def _motions(
     bag: Bag, scan: BagScan, frames: FrameTopic, sensor: str, options: RecordingOptions
 ) -> list[_Motion]:
-    """Return the motion in each part that has frames."""
+    """Return the motion in each part with frames."""
     parts = [
         (part, range(part.first, end))
         for part, end in zip(scan.parts, scan.ends, strict=True)
         if end > part.first
     ]
-    wanted = options.pose_frame
+    world = options.pose_frame
     trees = [part.tree for part, _ in parts]
-    if wanted is not None and all(tree.path(wanted, sensor) is None for tree in trees):
+    if world is not None and all(tree.path(world, sensor) is None for tree in trees):
         above = dict.fromkeys(one for tree in trees for one in tree.ancestors(sensor)[1:])
         raise DatasetError(
-            f"{bag.path}: No transforms lead from {sensor or 'the sensor'} to "
-            f"{wanted!r:.100}. Frames above it are {', '.join(above) or 'none'}."
+            f"{bag.path}: There are no transforms from {sensor or 'the sensor'} to "
+            f"{world!r:.100}. Frames above it are {', '.join(above) or 'none'}."
         )
-    motions = [
-        _motion(part, places, scan, (sensor, frames.frame), wanted) for part, places in parts
-    ]
+    motions = [_motion(part, places, scan, (sensor, frames.frame), world) for part, places in parts]
     with_poses = any(motion.poses for motion in motions)
     is_elsewhere = sensor != frames.frame
     if not with_poses and (is_elsewhere or any(motion.is_disputed for motion in motions)):
-        return motions  # frames without poses would hide that the transforms are wrong
+        return motions  # the caller reports the contradictory transforms
     for (part, places), motion in zip(parts, motions, strict=True):
         _choose(motion, part, places, scan, sensor, options, with_poses=with_poses)
     return motions
 
 
 def _motion(
-    part: BagPart, places: range, scan: BagScan, names: tuple[str, str], wanted: str | None
+    part: BagPart, places: range, scan: BagScan, names: tuple[str, str], pose_frame: str | None
 ) -> _Motion:
-    """Return the poses and mountings of a sensor in one part, before keyframes are chosen."""
+    """Return the poses and mountings of a sensor in one part, without keyframes."""
     tree, (sensor, frame) = part.tree, names
     stamps = [scan.stamps_ns[place] for place in places]
-    world = frame_name(wanted or "") or tree.world_of(sensor)
+    world = frame_name(pose_frame or "") or tree.world_of(sensor)
     motion = _Motion(world, tree.base_of(sensor, world))
     above = set(tree.ancestors(sensor))
     for (parent, child), (reason, count) in sorted(tree.passed_over.items()):
         if child in above:
             times = "" if count == 1 else f"{count} times "
-            motion.remarks.append(f"{parent} -> {child} is passed over {times}as {reason}")
+            motion.remarks.append(f"{parent} -> {child} is ignored {times}because {reason}")
             motion.is_broken = True
     for (parent, child), length in sorted(tree.normalised.items()):
         if child in above:
             motion.remarks.append(
-                f"{parent} -> {child} is normalised, as its quaternion has the length {length:.3g}"
+                f"{parent} -> {child} is normalised: its quaternion has the length {length:.3g}"
             )
     if world is not None:
-        for place, found in zip(places, tree.lookup(world, sensor, stamps), strict=True):
-            if isinstance(found, UnknownTransform):
-                motion.unknown[place] = found
+        for place, pose in zip(places, tree.lookup(world, sensor, stamps), strict=True):
+            if isinstance(pose, UnknownTransform):
+                motion.unknown[place] = pose
             else:
-                motion.poses[place] = found
+                motion.poses[place] = pose
     if sensor != frame:
         within = tree.poses(frame, sensor, stamps)
         motion.cloud_poses = {
@@ -370,9 +369,7 @@ def _choose(
     motion: _Motion, part: BagPart, places: range, scan: BagScan, sensor: str,
     options: RecordingOptions, *, with_poses: bool,
 ) -> None:  # fmt: skip
-    """Choose the keyframes of one part: among frames with poses where the recording has any, else
-    by time.
-    """
+    """Select the keyframes of one part by pose if the recording has poses, else by time."""
     stamps, poses = scan.stamps_ns, motion.poses
     if not with_poses:
         motion.world = None
@@ -384,24 +381,25 @@ def _choose(
         math.radians(options.keyframe_deg),
         options.keyframe_s,
     )
-    motion.taken = [order[place] for place in chosen]
-    motion.ups = _ups(part, sensor, motion.taken, stamps)
+    motion.keyframes = [order[place] for place in chosen]
+    motion.ups = _ups(part, sensor, motion.keyframes, stamps)
 
 
 def _ups(
-    part: BagPart, sensor: str, taken: list[int], stamps_ns: Sequence[int]
+    part: BagPart, sensor: str, keyframes: list[int], stamps_ns: Sequence[int]
 ) -> dict[int, Floats]:
-    """Return up in the sensor's axes of the frames taken, by the IMU with most measurements that
-    does not move against the sensor.
+    """Return the up direction of keyframes in the sensor's axes.
+
+    The source is the IMU with most measurements among those with a fixed position on the sensor.
     """
     for imu in sorted(part.imus, key=lambda name: (-len(part.imus[name]), name)):
         T_sensor_imu = part.tree.fixed_transform(sensor, imu)
         if T_sensor_imu is None:
             continue
-        found = part.imus[imu].up_at([stamps_ns[place] for place in taken])
+        ups = part.imus[imu].up_at([stamps_ns[place] for place in keyframes])
         return {
             place: T_sensor_imu[:3, :3] @ up
-            for place, up in zip(taken, found, strict=True)
+            for place, up in zip(keyframes, ups, strict=True)
             if up is not None
         }
     return {}
@@ -433,16 +431,14 @@ def _reference(
 
 
 def _seconds(stamp_ns: int) -> str:
-    """Return a stamp in seconds, to the nanosecond, which no float holds."""
+    """Return a stamp in seconds as text, since a float cannot represent nanoseconds."""
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def _cameras(
     bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan, scale: float | None
 ) -> dict[int, Camera]:
-    """Return the camera of each depth image: by the CameraInfo of its time, else of an
-    intrinsics.json beside the bag.
-    """
+    """Return the camera of each depth image from CameraInfo, or from an intrinsics.json."""
     if topic is None or not scan.infos:
         beside = _camera_beside(bag, frames, topic)
         beside = replace(beside, depth_scale=scale or beside.depth_scale)
@@ -452,38 +448,38 @@ def _cameras(
             Camera(camera_intrinsics(info, rectified=frames.is_rectified), scale or DEPTH_SCALE)
             for info in scan.infos
         ]
-    found, last = dict[int, Camera](), 0
+    by_place, last = dict[int, Camera](), 0
     for part, end in zip(scan.parts, scan.ends, strict=True):
         places = range(part.first, end)
         numbers = [last] * len(places)
         if part.infos:
             numbers = part.info_at([scan.stamps_ns[place] for place in places])
             last = part.infos[-1]
-        found.update((place, cameras[one]) for place, one in zip(places, numbers, strict=True))
-    return found
+        by_place.update((place, cameras[one]) for place, one in zip(places, numbers, strict=True))
+    return by_place
 
 
 def _camera_beside(bag: Bag, frames: FrameTopic, topic: BagTopic | None) -> Camera:
     try:
         return find_camera(bag.path.parent)
     except DatasetError as cause:
-        known = listed(bag.of_type(CAMERA))
-        said = "is not calibrated" if topic is not None else "is unknown"
+        topics = listed(bag.of_type(CAMERA))
+        state = "is not calibrated" if topic is not None else "is unknown"
         raise DatasetError(
-            f"{bag.path}: The camera of {frames.topic.name} {said}; topics of CameraInfo are "
-            f"{known}. Choose one with --camera-info, or write an intrinsics.json beside the "
+            f"{bag.path}: The camera of {frames.topic.name} {state}; topics of CameraInfo are "
+            f"{topics}. Select one with --camera-info, or write an intrinsics.json beside the "
             "recording."
         ) from cause
 
 
 def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
-    """Return what was taken and what was left out, for people."""
-    total, taken = len(scan.stamps_ns), sum(len(motion.taken) for motion in motions)
+    """Return a note for users on the selected and the omitted frames."""
+    total, selected = len(scan.stamps_ns), sum(len(motion.keyframes) for motion in motions)
     poses = sum(len(motion.poses) for motion in motions)
     worlds = sorted({motion.world for motion in motions if motion.poses and motion.world})
     text = (
-        f"{taken} of {total} frames of {printable(frames.topic.name)} taken, poses of {poses} of "
-        f"{total} frames{' in ' if worlds else ''}{', '.join(worlds)}"
+        f"{selected} of {total} frames of {printable(frames.topic.name)} taken, poses of {poses} "
+        f"of {total} frames{' in ' if worlds else ''}{', '.join(worlds)}"
     )
     if poses < total:
         text += f"; {total - poses} without: {_reasons(frames, motions)}"
@@ -491,7 +487,7 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
     left = [
         f"{count} {reason}"
         for count, reason in (
-            (total - taken - without, "between keyframes"),
+            (total - selected - without, "between keyframes"),
             (without, "without a pose"),
             (scan.damaged, "damaged messages of other topics"),
         )
@@ -500,13 +496,13 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
     if left:
         text += f"; left out: {', '.join(left)}"
     if len(motions) > 1:
-        text += f"; split into {len(motions)} parts, as stamps go back"
+        text += f"; split into {len(motions)} parts, because stamps go back"
     remarks = dict.fromkeys(one for motion in motions for one in motion.remarks)
     return printable("; ".join([text, *list(remarks)[:5]]))
 
 
 def _lost(scan: BagScan, motions: list[_Motion]) -> int:
-    """Return how many frames or their poses are left out, and damaged messages."""
+    """Return the number of omitted frames, omitted poses and damaged messages."""
     has_poses = any(motion.poses for motion in motions)
     if not has_poses and any(motion.is_broken for motion in motions):
         return len(scan.stamps_ns)
@@ -514,16 +510,16 @@ def _lost(scan: BagScan, motions: list[_Motion]) -> int:
 
 
 def _without_pose(scan: BagScan, motions: list[_Motion]) -> int:
-    """Return how many frames are left out as they have no pose, which others have."""
+    """Return the number of frames that are omitted because only other frames have a pose."""
     poses = sum(len(motion.poses) for motion in motions)
-    is_left_out = poses or not any(motion.taken for motion in motions)
+    is_left_out = poses or not any(motion.keyframes for motion in motions)
     return len(scan.stamps_ns) - poses if is_left_out else 0
 
 
 def _reasons(frames: FrameTopic, motions: list[_Motion]) -> str:
-    """Return why frames have no poses, by transforms, the most frequent first."""
+    """Return the reasons why frames have no poses, the most frequent first."""
     whys = [why for motion in motions for why in motion.unknown.values()]
-    found = []
+    reasons = []
     for (transform, disputed), count in Counter(
         (why.transform, why.nearest_s is None) for why in whys
     ).most_common(3):
@@ -538,31 +534,32 @@ def _reasons(frames: FrameTopic, motions: list[_Motion]) -> str:
             )  # fmt: skip
             within = f"within {TOLERANCE_S * 1e3:g} ms (nearest {nearest:.2g} s)"
             reason = f"no sample of {transform}{f' {within}' if math.isfinite(nearest) else ''}"
-        found.append(reason if len(whys) == count else f"{reason}: {count}")
-    if not found:
+        reasons.append(reason if len(whys) == count else f"{reason}: {count}")
+    if not reasons:
         return (
-            f"no transforms lead from {frames.frame or 'their frame'} to a frame in which it moves"
+            f"there are no transforms from {frames.frame or 'their frame'} to a frame in which it "
+            "moves"
         )
-    return ", ".join(found)
+    return ", ".join(reasons)
 
 
-# What a bag holds, for people.
+# Outline of a bag for users.
 
 
 @dataclass(frozen=True)
 class BagOutline:
-    """What a bag holds, and what would be taken of it.
+    """Content of a bag, and the frames that an upload would select.
 
     Parameters
     ----------
-    kind : of its files
-    start_ns, end_ns : when the first message was recorded, and the last
-    topics : all of them
-    frames : the topics that can be taken
-    chosen : the one that would be taken, or None
-    sequences : the frames that would be taken; none where nothing would be
-    range : of some of these frames
-    problem : why nothing would be taken; empty where something would
+    kind : format of the files
+    start_ns, end_ns : times of recording of the first and the last message, nanoseconds
+    topics : all topics
+    frames : topics with frames
+    chosen : selected topic, or None
+    sequences : sequences of the selected frames; may be empty
+    range : range of a sample of these frames
+    problem : reason why no frames are selected; empty if there are some
     """
 
     kind: str
@@ -578,12 +575,12 @@ class BagOutline:
 
 
 def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
-    """Return what a bag holds, and what would be taken of it with these options.
+    """Return the content of a bag, and the frames that an upload with these options would select.
 
     Raises
     ------
-    DatasetError : it cannot be read at all.
-    MissingDependency : rosbags is not installed.
+    DatasetError : If the bag cannot be read.
+    MissingDependency : If rosbags is not installed.
     """
     bag = Bag(path)
     try:

@@ -1,4 +1,4 @@
-"""Topics of a bag that can be frames, and their messages as the bytes of frames.
+"""Select the topics of a bag with frames, and convert their messages to the bytes of frames.
 
 Bag  --choose_topic-->  FrameTopic  --camera_topic-->  topic of its camera
 Image | CompressedImage  --depth_file-->  bytes of a PNG or NPY file
@@ -41,7 +41,7 @@ from sceneprint_client.ros_messages import (
 )
 from sceneprint_client.transforms import frame_name
 
-# Messages of ROS as the bytes of a frame.
+# Conversion of ROS messages to the bytes of a frame.
 
 
 def depth_file(message: Any, *, compressed: bool) -> bytes:
@@ -50,22 +50,22 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
     Parameters
     ----------
     message : sensor_msgs Image, or CompressedImage of depth
-    compressed : which of them
+    compressed : whether the message is a CompressedImage
 
     Returns
     -------
-    data : a 16-bit PNG of millimetres, or an NPY array of float32 metres
+    data : 16-bit PNG of millimetres, or NPY file of float32 metres
 
     Raises
     ------
-    UnreadableFrame : the message is of another encoding, or its sizes contradict each other.
+    UnreadableFrame : If the message has another encoding, or its sizes contradict each other.
     """
     if compressed:
-        found = compressed_depth(message)
-        if found.inverse is None:
-            return found.png if found.samples is None else encode_png(found.samples)
-        samples = decode_png(found.png) if found.samples is None else found.samples
-        return encode_npy(inverse_depth(samples, *found.inverse))
+        image = compressed_depth(message)
+        if image.inverse is None:
+            return image.png if image.samples is None else encode_png(image.samples)
+        samples = decode_png(image.png) if image.samples is None else image.samples
+        return encode_npy(inverse_depth(samples, *image.inverse))
     samples = depth_samples(message)
     return encode_npy(samples) if samples.dtype.kind == "f" else encode_png(samples)
 
@@ -76,24 +76,25 @@ def cloud_file(message: Any, T_cloud_sensor: Floats | None = None) -> bytes:
     Parameters
     ----------
     message : sensor_msgs PointCloud2
-    T_cloud_sensor : where given, the points are taken into the axes of the sensor
+    T_cloud_sensor : (4, 4) transform with which the points are converted to the sensor's axes, or
+        None
     """
     if T_cloud_sensor is None:
         return encode_npy(cloud_points(message))
-    found = [np.empty((0, 3)), *cloud_blocks(cloud_table(message))]
-    points = (np.concatenate(found) - T_cloud_sensor[:3, 3]) @ T_cloud_sensor[:3, :3]
+    blocks = [np.empty((0, 3)), *cloud_blocks(cloud_table(message))]
+    points = (np.concatenate(blocks) - T_cloud_sensor[:3, 3]) @ T_cloud_sensor[:3, :3]
     return encode_npy(points[np.isfinite(points).all(axis=1)].astype(np.float32))
 
 
 @dataclass(frozen=True)
 class FrameTopic:
-    """A topic whose messages are frames.
+    """Topic whose messages are frames.
 
     Parameters
     ----------
     topic : name, type and number of messages
-    encoding : of a depth image, such as "16UC1"; None of points
-    frame : the sensor's, of its first message
+    encoding : encoding of a depth image, such as "16UC1"; None for points
+    frame : frame of the sensor in the first message
     """
 
     topic: BagTopic
@@ -102,25 +103,25 @@ class FrameTopic:
 
     @property
     def is_compressed(self) -> bool:
-        """Return whether its messages are compressed images."""
+        """Whether the messages are compressed images."""
         return self.topic.type == COMPRESSED
 
     @property
     def is_rectified(self) -> bool:
-        """Return whether its images have been rectified, by the name that ROS gives them."""
+        """Whether the images are rectified according to the ROS naming convention."""
         return is_rectified(self.topic.name)
 
 
 @dataclass(frozen=True, eq=False)
 class BagSource:
-    """One message of a bag: where the bytes of a frame come from.
+    """Source of the bytes of a frame: one message of a bag.
 
     Parameters
     ----------
-    bag : where it is
-    topic : of it
-    log_ns, occurrence : when it was recorded, and which of those with that time it is
-    T_cloud_sensor : (4, 4) where points are not in the axes of the sensor, and become so
+    bag : bag with the message
+    topic : topic of the message
+    log_ns, occurrence : time of recording, and index among the messages with the same time
+    T_cloud_sensor : (4, 4) transform with which points are converted to the sensor's axes, or None
     """
 
     bag: Bag
@@ -134,15 +135,15 @@ class BagSource:
 
         Raises
         ------
-        UnreadableFrame, UnreadableCloud : it holds no depth, or is damaged.
-        DatasetError : the bag is damaged there.
+        UnreadableFrame, UnreadableCloud : If the message has no depth, or is damaged.
+        DatasetError : If the bag is damaged.
         """
         message = self.bag.at(self.topic.name, self.log_ns, self.occurrence)
         is_cloud = self.topic.type == POINTS
         with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
             try:
                 fields = self.bag.decode(message, self.topic.type)
-            except DatasetError as cause:  # of this message alone
+            except DatasetError as cause:  # only this message is damaged
                 error: type[FrameError] = UnreadableCloud if is_cloud else UnreadableFrame
                 raise error("The message is damaged. Record it again.") from cause
             if is_cloud:
@@ -155,37 +156,37 @@ class BagSource:
 
 
 def _source_in(path: Path, topic: BagTopic, *place: Any) -> BagSource:
-    """Return a source that came from another process: its bag is opened here."""
+    """Return a source from another process; its bag is opened in this process."""
     return BagSource(shared_bag(path), topic, *place)
 
 
-# The topics that are taken.
+# Selection of topics.
 
 
 def frame_topics(bag: Bag) -> list[FrameTopic]:
-    """Return the topics of depth images and of points, each judged by its first message.
+    """Return the topics of depth images and points, according to their first messages.
 
-    Of an image that is there raw and compressed, the raw one is given.
+    If an image topic exists both raw and compressed, the raw one is returned.
     """
-    found = []
+    topics = []
     for topic in bag.of_type(IMAGE, COMPRESSED, POINTS):
         one = _frame_topic(bag, topic)
         if one is not None:
-            found.append(one)
-    raw = {one.topic.name for one in found if not one.is_compressed}
+            topics.append(one)
+    raw = {one.topic.name for one in topics if not one.is_compressed}
     return [
         one
-        for one in found
+        for one in topics
         if not (one.is_compressed and topic_without_transport(one.topic.name) in raw)
     ]
 
 
 def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
-    """Return a topic as its first message describes it; None where it has no depth."""
+    """Return the description of a topic from its first message; None if it has no depth."""
     try:
         message = bag.first(topic.name)
         fields = None if message is None else bag.decode(message, topic.type)
-    except DatasetError:  # a damaged one is no candidate; whoever names it learns why
+    except DatasetError:  # a damaged topic is not selected automatically
         return None
     if fields is None:
         return None
@@ -197,51 +198,55 @@ def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
     return FrameTopic(topic, encoding, frame_name(str(fields.header.frame_id)))
 
 
-def choose_topic(bag: Bag, wanted: str | None) -> FrameTopic:
-    """Return the topic whose messages are the frames.
+def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
+    """Return the topic of the frames.
+
+    Parameters
+    ----------
+    name : name that the user specifies, or None
 
     Raises
     ------
-    DatasetError : there is none, or several and none is named.
+    DatasetError : If no topic fits, or several topics fit and `name` is None.
     """
     candidates = frame_topics(bag)
-    if wanted is not None:
-        named = [one for one in bag.topics if one.name == wanted]
+    if name is not None:
+        named = [one for one in bag.topics if one.name == name]
         if not named:
             raise DatasetError(
-                f"{bag.path}: There is no topic {wanted!r:.100}. Choose one of "
-                f"{listed(one.topic for one in candidates)}; `sceneprint bag` lists all."
+                f"{bag.path}: There is no topic {name!r:.100}. Select one of "
+                f"{listed(one.topic for one in candidates)}; `sceneprint bag` lists all topics."
             )
-        found = next((one for one in candidates if one.topic.name == wanted), None)
-        if found is None and named[0].type in (IMAGE, COMPRESSED, POINTS):
-            found = _frame_topic(bag, named[0])
-        if found is None:
+        frames = next((one for one in candidates if one.topic.name == name), None)
+        if frames is None and named[0].type in (IMAGE, COMPRESSED, POINTS):
+            frames = _frame_topic(bag, named[0])
+        if frames is None:
             raise DatasetError(
-                f"{bag.path}: The topic {printable(wanted)} ({printable(named[0].type)}, "
-                f"{named[0].count} messages) has no depth images ({_READ}) and no points. Choose "
-                f"one of {listed(one.topic for one in candidates)}."
+                f"{bag.path}: The topic {printable(name)} ({printable(named[0].type)}, "
+                f"{named[0].count} messages) has no depth images ({_SUPPORTED}) and no points. "
+                f"Select one of {listed(one.topic for one in candidates)}."
             )
-        return found
+        return frames
     if not candidates:
         raise DatasetError(
-            f"{bag.path}: There is no topic of depth images ({_READ}) or of points (PointCloud2). "
-            f"Images are {_encodings(bag)}. `sceneprint bag` lists all topics."
+            f"{bag.path}: There is no topic of depth images ({_SUPPORTED}) or of points "
+            f"(PointCloud2). Images are {_encodings(bag)}. `sceneprint bag` lists all topics."
         )
     if len(candidates) > 1:
         raise DatasetError(
-            f"{bag.path}: {len(candidates)} topics can be taken: "
-            f"{listed(one.topic for one in candidates)}. Choose one with --topic."
+            f"{bag.path}: {len(candidates)} topics have frames: "
+            f"{listed(one.topic for one in candidates)}. Select one with --topic."
         )
     return candidates[0]
 
 
-#: What is read of images, for people.
-_READ = "16UC1, mono16, 32FC1, compressedDepth, or PNG of 16 bits"
+#: Supported encodings of images, for messages.
+_SUPPORTED = "16UC1, mono16, 32FC1, compressedDepth, or 16-bit PNG"
 
 
 def _encodings(bag: Bag) -> str:
-    """Return the encodings of the images of a bag, for people."""
-    found = []
+    """Return the encodings of the images of a bag, for messages."""
+    encodings = []
     for topic in bag.of_type(IMAGE, COMPRESSED)[:20]:
         try:
             message = bag.first(topic.name)
@@ -249,36 +254,39 @@ def _encodings(bag: Bag) -> str:
         except DatasetError:
             fields = None
         encoding = getattr(fields, "encoding", None) or getattr(fields, "format", "damaged")
-        found.append(f"{topic.name} ({encoding!r:.40})")
-    return printable(", ".join(found)) or "not there"
+        encodings.append(f"{topic.name} ({encoding!r:.40})")
+    return printable(", ".join(encodings)) or "missing"
 
 
-def camera_topic(bag: Bag, frames: FrameTopic, wanted: str | None) -> BagTopic | None:
-    """Return the topic of the camera of depth images: beside theirs, else the only one of their
-    frame.
+def camera_topic(bag: Bag, frames: FrameTopic, name: str | None) -> BagTopic | None:
+    """Return the CameraInfo topic of depth images: that of their namespace, or of their frame.
+
+    Parameters
+    ----------
+    name : name that the user specifies, or None
 
     Raises
     ------
-    DatasetError : the one that is named is none, or several fit.
+    DatasetError : If `name` is not a topic of CameraInfo, or several topics fit.
     """
-    known = bag.of_type(CAMERA)
-    if wanted is not None:
-        found = next((one for one in known if one.name == wanted), None)
-        if found is None:
+    topics = bag.of_type(CAMERA)
+    if name is not None:
+        topic = next((one for one in topics if one.name == name), None)
+        if topic is None:
             raise DatasetError(
-                f"{bag.path}: There is no topic {wanted!r:.100} of CameraInfo. Choose one of "
-                f"{listed(known)} with --camera-info."
+                f"{bag.path}: There is no topic {name!r:.100} of CameraInfo. Select one of "
+                f"{listed(topics)} with --camera-info."
             )
-        return found
+        return topic
     beside = topic_without_transport(frames.topic.name).rpartition("/")[0] + "/camera_info"
-    for one in known:
+    for one in topics:
         if one.name == beside:
             return one
-    fitting = [one for one in known if _frame_of(bag, one) == frames.frame]
+    fitting = [one for one in topics if _frame_of(bag, one) == frames.frame]
     if len(fitting) > 1:
         raise DatasetError(
-            f"{bag.path}: The camera of {frames.topic.name} may be that of {listed(fitting)}. "
-            "Choose one with --camera-info."
+            f"{bag.path}: Several cameras fit {frames.topic.name}: {listed(fitting)}. "
+            "Select one with --camera-info."
         )
     return fitting[0] if fitting else None
 
@@ -294,6 +302,6 @@ def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
 
 
 def listed(topics: Iterable[BagTopic]) -> str:
-    """Return the names of topics, for people."""
+    """Return names, types and message counts of topics, for messages."""
     names = [f"{one.name} ({one.type.rpartition('/')[2]}, {one.count} messages)" for one in topics]
     return printable(", ".join(names[:20])) or "none"

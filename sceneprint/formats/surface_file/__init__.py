@@ -1,4 +1,4 @@
-"""Files that are one surface, such as the map of a SLAM system or the mesh of a scanner.
+"""Readers for files of a whole map, such as the cloud of a SLAM system or the mesh of a scanner.
 
 bytes, name, options  --read_surface-->  ReadSurface: points, triangles, units, up, offset
 """

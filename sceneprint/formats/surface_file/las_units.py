@@ -1,4 +1,4 @@
-"""What a LAS file says of the units of its coordinates.
+"""Determine the units of the coordinates of a LAS file from its header.
 
 bytes  --las_units_per_metre-->  1 for metres, 3.28 for feet, or None
 """
@@ -14,29 +14,29 @@ from sceneprint.formats.points.rows import FileBytes
 
 _GEO_KEYS, _WKT = 34735, 2112
 _MODEL, _LINEAR_UNIT, _GEOGRAPHIC = 1024, 3076, 2
-#: Codes of EPSG: metre, international foot, US survey foot.
+#: Units per metre by EPSG code: metre, international foot, US survey foot.
 _UNITS = {9001: 1.0, 9002: 1 / 0.3048, 9003: 3937 / 1200}
 _WKT_UNIT = re.compile(r'UNIT\s*\[\s*"([^"]{1,60})"\s*,\s*([0-9.eE+-]{1,30})')
 
 
 def las_units_per_metre(data: FileBytes) -> float | None:
-    """Return how many units of the file's coordinates are a metre; None where it does not say.
+    """Return the units per metre of the file's coordinates; None if the file does not state them.
 
     Raises
     ------
-    UnreadableCloud : the coordinates are degrees.
+    UnreadableCloud : If the coordinates are degrees.
     """
     for user, number, content in las_records(data):
         if user == b"LASF_Projection" and number in (_GEO_KEYS, _WKT):
             is_wkt = number == _WKT
-            found = _of_wkt(content.decode("latin-1")) if is_wkt else _of_keys(content)
-            if found is not None:
-                return found
+            units = _of_wkt(content.decode("latin-1")) if is_wkt else _of_keys(content)
+            if units is not None:
+                return units
     return None
 
 
 def _of_keys(body: bytes) -> float | None:
-    """Units of a directory of GeoTIFF keys."""
+    """Return the units per metre from a directory of GeoTIFF keys."""
     numbers = struct.unpack_from(f"<{len(body) // 2}H", body)
     keys = {
         key: value
@@ -49,7 +49,7 @@ def _of_keys(body: bytes) -> float | None:
 
 
 def _of_wkt(text: str) -> float | None:
-    """Units of a coordinate system in well-known text: the first length in it."""
+    """Return the units per metre from the first length unit in well-known text."""
     head = text.lstrip()[:8].upper()
     if head.startswith(("GEOGCS", "GEOGCRS")):
         raise _degrees()
@@ -65,7 +65,7 @@ def _of_wkt(text: str) -> float | None:
 
 def _degrees() -> UnreadableCloud:
     return UnreadableCloud(
-        "The coordinates of the LAS file are degrees of longitude and latitude. Project them to "
-        "metres (UTM, for example with `pdal translate` and filters.reprojection), and upload "
-        "that file."
+        "The coordinates of the LAS file are longitude and latitude in degrees. Convert them to "
+        "metres, for example to UTM with `pdal translate` and filters.reprojection, and upload "
+        "the new file."
     )

@@ -1,9 +1,9 @@
-"""OBJ, STL and glTF files, read by trimesh, which this file alone loads.
+"""Read OBJ, STL and glTF files with trimesh, which no other module imports.
 
 bytes, format  --read_mesh-->  vertices, triangles
 
-Nothing but the bytes is read: a file that names other files for its geometry is refused, and
-materials and textures are passed over.
+The reader uses only the bytes: it refuses files whose geometry is in other files, and ignores
+materials and textures.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ MeshFormat = Literal["obj", "stl", "glb", "gltf"]
 
 _AGAIN = "Copy or write the file again."
 _GLB_HEADER, _JSON_CHUNK = 20, 0x4E4F534A
-#: Bytes of the JSON of a glTF file without its embedded buffers, at most.
+#: Maximum size of the JSON of a glTF file without its embedded buffers, bytes.
 _MOST_JSON = 64 << 20
-#: Extensions that a reader must know and that leave positions as they are.
+#: Prefixes of required extensions that do not affect positions.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "EXT_lights_")
 
 
 @dataclass(frozen=True, eq=False)
 class FileMesh:
-    """The geometry of a file in the axes of its scene.
+    """Geometry of a file in the axes of its scene.
 
     Parameters
     ----------
-    vertices : (N, 3) float64, unit of the file
-    triangles : (M, 3) int32 indices, -1 beyond int32; None where nothing has a face
-    notes : sentences on what was left out
+    vertices : (N, 3) float64, units of the file
+    triangles : (M, 3) int32 indices, -1 if beyond int32; None if the file has no triangles
+    notes : sentences for users on omitted parts
     """
 
     vertices: Floats
@@ -52,19 +52,19 @@ class FileMesh:
     notes: tuple[str, ...] = ()
 
     def blocks(self) -> Iterator[Floats]:
-        """Yield the vertices, some at a time."""
+        """Yield the vertices in blocks."""
         for first in range(0, len(self.vertices), BLOCK):
             yield self.vertices[first : first + BLOCK]
 
 
 def read_mesh(data: FileBytes, file_format: MeshFormat) -> FileMesh:
-    """Return vertices and triangles of a file, all its parts in one.
+    """Return the vertices and triangles of all parts of a file.
 
     Raises
     ------
-    UnreadableCloud : it is damaged, has no geometry or too much of it, or needs other files or
-        extensions.
-    MissingDependency : trimesh is not installed.
+    UnreadableCloud : If the file is damaged, has no geometry or too much, or needs other files or
+        unsupported extensions.
+    MissingDependency : If trimesh is not installed.
     """
     trimesh = _trimesh()
     name = {"glb": "glTF", "gltf": "glTF"}.get(file_format, file_format.upper())
@@ -73,7 +73,7 @@ def read_mesh(data: FileBytes, file_format: MeshFormat) -> FileMesh:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # numpy only warns of text that ends in the middle of its numbers
+            # numpy only issues a warning if text ends within its numbers
             warnings.simplefilter("error", DeprecationWarning)
             scene = trimesh.load_scene(
                 io.BytesIO(data), file_type=file_format, process=False, validate=False,
@@ -82,7 +82,7 @@ def read_mesh(data: FileBytes, file_format: MeshFormat) -> FileMesh:
             return _joined(trimesh, scene, name)
     except (MemoryError, UnreadableCloud):
         raise
-    except Exception as cause:  # a library for which any byte may be wrong in any way
+    except Exception as cause:  # trimesh raises arbitrary exceptions for damaged files
         raise UnreadableCloud(
             f"The {name} file cannot be read ({type(cause).__name__}: {str(cause)[:120]}). {_AGAIN}"
         ) from cause
@@ -93,16 +93,16 @@ def _trimesh() -> ModuleType:
         import trimesh
     except ImportError as cause:
         raise MissingDependency(
-            "OBJ, STL and glTF need the package trimesh, which is not installed. Install it "
+            "OBJ, STL and glTF require the package trimesh, which is not installed. Install it "
             "(pip install trimesh), or write the surface as PLY."
         ) from cause
-    logging.getLogger("trimesh").disabled = True  # of each broken file it writes a page
+    logging.getLogger("trimesh").disabled = True  # it logs long messages for damaged files
     module: ModuleType = trimesh
     return module
 
 
 def _joined(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
-    """Return all triangles of a scene; all its points where it has none."""
+    """Return all triangles of a scene, or all points if it has no triangles."""
     parts = []
     for node in scene.graph.nodes_geometry:
         T, key = scene.graph[node]
@@ -115,31 +115,31 @@ def _joined(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
     if not count:
         raise UnreadableCloud(
             f"The {name} file has neither triangles nor points. Export the geometry again, and "
-            "look at it in another program."
+            "check it in another program."
         )
     most = MOST_VERTICES if meshes else MOST_FILE_POINTS
     if count > most:
         raise UnreadableCloud(
-            f"The {name} file has {count} vertices, and at most {most} are read. Simplify the "
-            "mesh, or write its vertices alone as a cloud."
+            f"The {name} file has {count} vertices; the limit is {most}. Simplify the mesh, or "
+            "write only its vertices, as a cloud."
         )
     check_triangles(sum(len(one.faces) for one, _ in meshes))
     vertices = np.concatenate(
         [np.asarray(one.vertices, np.float64) @ T[:3, :3].T + T[:3, 3] for one, T in chosen]
     )
-    left = len(parts) - len(chosen)
-    notes = (f"{left} parts without triangles were left out.",) if left else ()
+    omitted = len(parts) - len(chosen)
+    notes = (f"{omitted} parts without triangles were left out.",) if omitted else ()
     if not meshes:
         return FileMesh(vertices, None, notes)
-    found, first = list[Ints32](), 0
+    triangles, first = list[Ints32](), 0
     for one, T in meshes:
         faces = np.asarray(one.faces, np.int64)
         n = len(one.vertices)
-        if np.linalg.det(T[:3, :3]) < 0:  # a mirrored part shows its back
+        if np.linalg.det(T[:3, :3]) < 0:  # a reflection reverses the orientation of triangles
             faces = faces[:, ::-1]
-        found.append(np.where((faces < 0) | (faces >= n), -1, faces + first).astype(np.int32))
+        triangles.append(np.where((faces < 0) | (faces >= n), -1, faces + first).astype(np.int32))
         first += n
-    return FileMesh(vertices, np.concatenate(found), notes)
+    return FileMesh(vertices, np.concatenate(triangles), notes)
 
 
 def _gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
@@ -151,47 +151,47 @@ def _gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
         if version != 2 or kind != _JSON_CHUNK or not 0 < length <= _MOST_JSON:
             raise UnreadableCloud(
                 f"The glTF file has version {version} and a description of {length} bytes, or "
-                "begins with something else than a description. Write it as glTF 2.0."
+                "does not start with a description. Write it as glTF 2.0."
             )
         if total > len(data):
             raise UnreadableCloud(
-                f"The glTF header announces {total} bytes, and {len(data)} are there. {_AGAIN}"
+                f"The glTF header announces {total} bytes, but the file has {len(data)}. {_AGAIN}"
             )
     try:
         fields = json.loads(data[_GLB_HEADER : _GLB_HEADER + length] if length else data[:])
     except (ValueError, RecursionError) as cause:
-        raise UnreadableCloud(f"The glTF file is no JSON ({str(cause)[:80]}). {_AGAIN}") from cause
+        raise UnreadableCloud(f"The glTF file is not JSON ({str(cause)[:80]}). {_AGAIN}") from cause
     if not isinstance(fields, dict):
-        raise UnreadableCloud(f"The glTF file is no JSON object. {_AGAIN}")
+        raise UnreadableCloud(f"The glTF file is not a JSON object. {_AGAIN}")
     return fields
 
 
 def _check_gltf(fields: dict[str, Any]) -> None:
-    """Refuse geometry in other files, compressed geometry, and arrays without bytes."""
+    """Raise UnreadableCloud for geometry in other files, compression, and arrays without bytes."""
     for buffer in _objects(fields, "buffers"):
         uri = buffer.get("uri")
         if uri is not None and not str(uri)[:100].startswith("data:"):
             raise UnreadableCloud(
-                f"The glTF file keeps its geometry in another file, {str(uri)!r:.80}. Export it as "
-                "one file, GLB."
+                f"The geometry of the glTF file is in another file, {str(uri)!r:.80}. Export a "
+                "single GLB file."
             )
     required = fields.get("extensionsRequired", [])
     unknown = [str(one) for one in required if not str(one).startswith(_HARMLESS)]
     if unknown:
         raise UnreadableCloud(
-            f"The glTF file needs the extension {unknown[0]!r:.60}, which is not read. Export it "
-            "without compression or quantisation."
+            f"The glTF file needs the extension {unknown[0]!r:.60}, which is not supported. Export "
+            "it without compression or quantisation."
         )
     for accessor in _objects(fields, "accessors"):
         if "sparse" in accessor or "bufferView" not in accessor:
             raise UnreadableCloud(
-                "The glTF file has sparse arrays, or arrays without bytes, which are not read. "
-                "Export it again without them."
+                "The glTF file has sparse arrays, or arrays without bytes, which are not "
+                "supported. Export it again without them."
             )
 
 
 def _objects(fields: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    found = fields.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+    objects = fields.get(key, [])
+    if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
         raise UnreadableCloud(f"The glTF file has no list of objects as its {key}. {_AGAIN}")
-    return found
+    return objects

@@ -1,4 +1,4 @@
-"""The triangles of a PLY file; polygons become fans.
+"""Read the triangles of a PLY file, and convert polygons to fans of triangles.
 
 bytes  --read_faces-->  triangles (M, 3)
 """
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud
-from sceneprint.formats.points.ply import Element, element_end, ply_header, walked
+from sceneprint.formats.points.ply import Element, element_end, ply_header, value_offsets
 from sceneprint.formats.points.rows import (
     CORNERS,
     ENDS,
@@ -33,20 +33,20 @@ from sceneprint.types import Bytes, Ints32
 Indices = NDArray[np.int64]
 
 _NAMES = ("vertex_indices", "vertex_index")
-#: Most corners of a polygon.
+#: Maximum number of corners of a polygon.
 _MOST_CORNERS = 1024
 _AGAIN = "Copy or write the file again."
 
 
 def read_faces(data: FileBytes) -> Ints32 | None:
-    """Return the triangles of the element `face`, (M, 3); None without one.
+    """Return the triangles (M, 3) of the element `face`; None if the file has no such element.
 
-    Indices are not compared with the number of vertices; those beyond int32 are -1.
+    Indices are not compared with the number of vertices. Indices beyond int32 are -1.
 
     Raises
     ------
-    UnreadableCloud : the faces have no list of vertices, or fewer or more bytes than announced;
-        a polygon has fewer than 3 or more than 1024 corners; there are too many triangles.
+    UnreadableCloud : If the faces have no list of vertices, or fewer or more bytes than announced,
+        a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.
     """
     order, elements, start = ply_header(data)
     names = [element.name for element in elements]
@@ -56,40 +56,40 @@ def read_faces(data: FileBytes) -> Ints32 | None:
     lists = [k for k, one in enumerate(face.properties) if one.name in _NAMES and one.length]
     if len(lists) != 1 or face.properties[lists[0]].kind[0] == "f":
         raise UnreadableCloud(
-            "The faces of the PLY file have no single list of whole numbers called "
+            "The faces of the PLY file do not have exactly one list of integers called "
             f"{' or '.join(_NAMES)}. Write each face as a list of its vertices."
         )
     check_triangles(face.count)
     if order == "":
-        blocks = _written_out(data, start, before, face, lists[0])
+        blocks = _ascii_triangles(data, start, before, face, lists[0])
     else:
         for element in before:
             start = element_end(data, start, element, order)
         blocks = _binary(data, start, face, lists[0], order)
-    found, count = list[Ints32](), 0
+    triangles, count = list[Ints32](), 0
     for block in blocks:
         count += len(block)
         check_triangles(count)
-        found.append(np.where((block < 0) | (block >= 1 << 31), -1, block).astype(np.int32))
-    return np.concatenate(found) if found else None
+        triangles.append(np.where((block < 0) | (block >= 1 << 31), -1, block).astype(np.int32))
+    return np.concatenate(triangles) if triangles else None
 
 
 def check_triangles(count: int) -> None:
-    """Refuse a mesh of more triangles than are read."""
+    """Raise UnreadableCloud if a mesh has too many triangles."""
     if count > MOST_TRIANGLES:
         raise UnreadableCloud(
-            f"The file has {count} triangles or more, and at most {MOST_TRIANGLES} are read. "
-            "Simplify the mesh, or write its vertices alone as a cloud."
+            f"The file has at least {count} triangles; the limit is {MOST_TRIANGLES}. "
+            "Simplify the mesh, or write only its vertices, as a cloud."
         )
 
 
 def _binary(data: FileBytes, start: int, face: Element, at: int, order: str) -> Iterator[Indices]:
-    element_end(data, start, face, order)  # whether the rows fit into the file
+    element_end(data, start, face, order)  # checks that the rows fit into the file
     view = np.frombuffer(data, np.uint8)
     kinds = [(one.kind, one.length) for one in face.properties]
     chosen = face.properties[at]
     index, length = np.dtype(order + chosen.kind), np.dtype(order + (chosen.length or ""))
-    for places, _ in walked(view, start, face.count, kinds, (at, at, at), order):
+    for places, _ in value_offsets(view, start, face.count, kinds, (at, at, at), order):
         begins = places[:, 0]
         sizes = _gathered(view, begins, length, 1)[:, 0]
         _check_corners(int(sizes.min()), int(sizes.max()))
@@ -99,13 +99,13 @@ def _binary(data: FileBytes, start: int, face: Element, at: int, order: str) -> 
 
 
 def _gathered(view: Bytes, begins: Indices, kind: np.dtype[np.integer], count: int) -> Indices:
-    """So many numbers from each place (n,): (n, count)."""
+    """Return `count` numbers from each offset (n,), as (n, count)."""
     picked = view[begins[:, None] + np.arange(count * kind.itemsize)]
     return np.ascontiguousarray(picked).view(kind).astype(np.int64)
 
 
 def _fans(polygons: Indices) -> Indices:
-    """Triangles (n (c - 2), 3) of polygons (n, c)."""
+    """Return the triangles (n (c - 2), 3) of polygons (n, c)."""
     c = polygons.shape[1]
     fan = np.array([(0, k, k + 1) for k in range(1, c - 1)])
     return polygons[:, fan].reshape(-1, 3)
@@ -114,12 +114,12 @@ def _fans(polygons: Indices) -> Indices:
 def _check_corners(fewest: int, most: int) -> None:
     if fewest < 3 or most > _MOST_CORNERS:
         raise UnreadableCloud(
-            f"A face of the PLY file has {fewest if fewest < 3 else most} corners, and 3 to "
-            f"{_MOST_CORNERS} are read. {_AGAIN}"
+            f"A face of the PLY file has {fewest if fewest < 3 else most} corners; it must have 3 "
+            f"to {_MOST_CORNERS}. {_AGAIN}"
         )
 
 
-def _written_out(
+def _ascii_triangles(
     data: FileBytes, start: int, before: list[Element], face: Element, at: int
 ) -> Iterator[Indices]:
     text = np.frombuffer(data, np.uint8)
@@ -144,11 +144,12 @@ def _written_out(
 def _fill(
     text: Bytes, start: int, most: int, lists: NDArray[np.bool_], at: int, out: Indices
 ) -> tuple[int, int, int, int]:
-    """Fill triangles while there is room for any polygon.
+    """Fill `out` with triangles while it has space for the largest polygon.
 
     Returns
     -------
-    place after the last row, rows that were read, triangles, and why there are no more
+    end, rows, triangles, status : offset after the last row, numbers of rows and of triangles, and
+        status of the next row
     """
     i, size, n, row = start, len(text), 0, 0
     while row < most and n + _MOST_CORNERS <= len(out):

@@ -1,9 +1,9 @@
-"""A surface in the units and axes of its file, as every reader hands it over.
+"""Surface in the units and axes of its file, which all readers return.
 
 blocks of points  --gather-->  RawSurface
 
-Points are kept in float32 relative to an origin in float64, so coordinates of a country (UTM) keep
-their millimetres. Clouds of more points than are kept are thinned while they are read.
+Points are float32 relative to a float64 origin, so map coordinates (UTM) keep a precision of
+millimetres. Large clouds are thinned while they are read.
 """
 
 from __future__ import annotations
@@ -17,36 +17,37 @@ from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.cloud import thinned
 from sceneprint.types import Floats, Floats32, Ints32
 
-#: Most points of a file, most that are kept of a cloud, and most vertices and triangles of a mesh.
+#: Maximum number of points of a file, of points of a thinned cloud, and of vertices and triangles
+#: of a mesh.
 MOST_FILE_POINTS, MOST_POINTS = 60_000_000, 10_000_000
 MOST_VERTICES, MOST_TRIANGLES = 15_000_000, 20_000_000
-#: Edge of the finest voxels that a cloud is thinned to, metres.
+#: Smallest edge of the voxels of a thinned cloud, metres.
 FINEST_M = 0.01
-#: Coordinates beyond which an origin is subtracted while reading, units of the file.
+#: Largest coordinate without subtraction of an origin, units of the file.
 _NEAR_UNITS = 1000.0
 TOO_LARGE = (
-    "A coordinate is larger than any on Earth. Remove points that lie far from the "
-    "others, and write the file again."
+    "A coordinate is larger than any coordinate on Earth. Remove isolated distant points, and "
+    "write the file again."
 )
-#: Voxels along an axis, at most, from the origin.
+#: Maximum number of voxels along an axis from the origin.
 _MOST_VOXELS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class RawSurface:
-    """A surface in the units and axes of its file.
+    """Surface in the units and axes of its file.
 
     Parameters
     ----------
-    points : (N, 3) float32, relative to `origin`; rows that are not finite only in a mesh
+    points : (N, 3) float32, relative to `origin`; only those of a mesh may be NaN or infinite
     origin : (3,) float64
-    triangles : (M, 3) int64 or int32 indices, not checked yet; None for a cloud
-    file_points : points of the file, missing ones too
-    voxel : edge of the voxels that a cloud was thinned to, units of the file; None if it was not
-    units_per_metre : that the file states, or None
-    up : (3,) that the file states, or None
-    usual_up : (3,) that is up in most files of this format
-    notes : sentences on what was left out
+    triangles : (M, 3) int64 or int32 indices that have not been checked; None for a cloud
+    file_points : number of points of the file, including missing points
+    voxel : edge of the voxels of a thinned cloud, units of the file; None if it is not thinned
+    units_per_metre : units that the file states, or None
+    up : (3,) up direction that the file states, or None
+    usual_up : (3,) up direction of most files of this format
+    notes : sentences for users on omitted parts
     """
 
     points: Floats32
@@ -66,25 +67,26 @@ def gather(
     units_of: Callable[[Floats32], float] | None,
     most: int = MOST_POINTS,
 ) -> tuple[Floats32, Floats, float | None]:
-    """Return the points of blocks.
+    """Return the points of all blocks, and thin a large cloud.
 
     Parameters
     ----------
-    blocks : (n, 3) float64 each
-    count : of all points
-    units_of : of a cloud: how many units are a metre, by the points so far; None for the vertices
-        of a mesh, which are all kept, missing ones too
-    most : points of a cloud that are kept
+    blocks : coordinates in blocks (n, 3) of float64
+    count : announced number of points
+    units_of : function that estimates the units per metre of a cloud from its first points; None
+        for the vertices of a mesh, which are returned completely, including missing vertices
+    most : maximum number of points of the thinned cloud
 
     Returns
     -------
     points : (N, 3) float32, relative to the origin
-    origin : (3,) float64, whole units; zero unless the points are far from that of the file
-    voxel : edge that a cloud was thinned to, units; None where it was not
+    origin : (3,) float64 with integer values; zero unless the points are far from the file's origin
+    voxel : edge of the voxels of the thinned cloud, units; None if it is not thinned
 
     Raises
     ------
-    UnreadableCloud : there are more points than announced, or a point is too far from the others.
+    UnreadableCloud : If there are more points than announced, or a point is too far from the
+        others.
     """
     cloud = _Cloud(count, units_of, most)
     for block in blocks:
@@ -93,7 +95,7 @@ def gather(
 
 
 class _Cloud:
-    """Points that are added block by block, and thinned when they are too many."""
+    """Points that are added in blocks, and thinned when there are too many."""
 
     def __init__(self, count: int, units_of: Callable[[Floats32], float] | None, most: int) -> None:
         room = count if units_of is None else min(count, 2 * most)
@@ -104,7 +106,7 @@ class _Cloud:
         self._voxel: float | None = None
 
     def add(self, block: Floats) -> None:
-        """Add points; those of a cloud that are not finite are left out."""
+        """Add points, except those of a cloud that are not finite."""
         present = np.asarray(np.isfinite(block).all(axis=1))
         if self._units_of is not None and not present.all():
             block, present = block[present], present[present]
@@ -117,14 +119,14 @@ class _Cloud:
             if self._n == len(self._points):
                 self._thin()
             piece = block[first : first + len(self._points) - self._n]
-            with np.errstate(all="ignore"):  # what overflows is not finite, and so missing
+            with np.errstate(all="ignore"):  # points that overflow are missing
                 shifted = piece if self._origin is None else piece - self._origin
                 self._points[self._n : self._n + len(piece)] = shifted
             self._n += len(piece)
             first += len(piece)
 
     def finished(self) -> tuple[Floats32, Floats, float | None]:
-        """Return points, origin and voxel."""
+        """Return points, origin and voxel; see `gather`."""
         if self._units_of is not None and (self._n > self._most or self._voxel is not None):
             self._thin()
         points = self._points[: self._n]
@@ -134,7 +136,7 @@ class _Cloud:
     def _thin(self) -> None:
         if self._units_of is None:
             raise UnreadableCloud(
-                f"More than the {len(self._points)} vertices follow that the file announces. "
+                f"The file announces {len(self._points)} vertices, but more follow. "
                 "Copy or write the file again."
             )
         points = self._points[: self._n]

@@ -1,9 +1,9 @@
-"""The door for surfaces: a file of a whole map in, a `ReferenceSurface` in metres out.
+"""Read a file of a whole map as a `ReferenceSurface` in metres.
 
 bytes, name, options  --read_surface-->  ReadSurface
 
-Where a file does not state its units or its up, and the options do not, they are estimated from the
-surface; the result says which. Axes stay those of the file.
+If neither the file nor the options state the units or the up direction, they are estimated from the
+surface, and the result says so. The axes remain those of the file.
 """
 
 from __future__ import annotations
@@ -39,35 +39,35 @@ from sceneprint_client.files import naming
 from sceneprint_client.formats import HEAD, format_at, format_named, titles_of
 
 SurfaceFormat = Literal["pcd", "ply", "las", "npy", "e57", "obj", "stl", "glb", "gltf"]
-#: Where units or up come from: the options, the file, or the shape of the surface.
+#: Source of the units or the up direction: the options, the file, or the shape of the surface.
 Source = Literal["stated", "file", "estimated"]
 
 AXES: dict[str, Floats] = {
     f"{sign}{name}": value * np.eye(3)[k]
     for k, name in enumerate("xyz") for sign, value in (("", 1.0), ("-", -1.0))
 }  # fmt: skip
-#: Farther than this from the origin of the file, the coordinates get an offset, metres.
+#: Distance from the origin of the file beyond which coordinates get an offset, metres.
 FAR_M = 1000.0
 _STL_HEADER, _STL_TRIANGLE = 84, 50  #: bytes
 _BLOCK = 1 << 18
-#: Beyond every place on Earth in any unit that is read; products of it are still numbers.
+#: Coordinate beyond all places on Earth in any supported unit; its products are finite.
 _MOST_UNITS = 1e15
-#: Extents of a place, metres: what is smaller or larger is worth a note.
+#: Usual range of the extent of a place, metres; other extents cause a note.
 _SMALL_M, _LARGE_M = 1.0, 5000.0
 
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """What the user states of a surface; None: from the file, else estimated.
+    """Properties of a surface that the user states; None uses the file, or an estimate.
 
     Parameters
     ----------
-    units_per_metre : of the file's coordinates, 1000 for millimetres
-    up : the axis of the file that is up
+    units_per_metre : units of the file's coordinates per metre, such as 1000 for millimetres
+    up : axis of the file that points up
 
     Raises
     ------
-    UnreadableCloud : units that are no such number, or no axis.
+    UnreadableCloud : If the units or the axis are invalid.
     """
 
     units_per_metre: float | None = None
@@ -77,28 +77,28 @@ class SurfaceOptions:
         units = self.units_per_metre
         if units is not None and not (math.isfinite(units) and 1e-6 <= units <= 1e9):
             raise UnreadableCloud(
-                f"The units per metre are {units}, no such number. Say 1 for metres, 1000 for "
-                "millimetres."
+                f"The units per metre are {units}, not a valid number. Specify 1 for metres or "
+                "1000 for millimetres."
             )
         if self.up is not None and self.up not in AXES:
             raise UnreadableCloud(
-                f"{self.up!r:.40} is no axis. Say which one is up: {', '.join(AXES)}."
+                f"{self.up!r:.40} is not an axis. Specify the upward axis: {', '.join(AXES)}."
             )
 
 
 @dataclass(frozen=True, eq=False)
 class ReadSurface:
-    """A surface, and how it was read.
+    """Surface with the parameters used to read it.
 
     Parameters
     ----------
-    surface : in metres, in the axes of the file
-    units : where the units come from
-    up_from : where up comes from
-    notes : sentences for the user: what was estimated, left out or thinned
-    units_per_metre : of the file's coordinates
-    file_points : points of the file, missing ones too
-    voxel : edge of the voxels that a cloud was thinned to, metres; None if it was not
+    surface : surface in metres, in the axes of the file
+    units : source of the units
+    up_from : source of the up direction
+    notes : sentences for the user on estimated values, omitted parts and thinning
+    units_per_metre : units of the file's coordinates per metre
+    file_points : number of points of the file, including missing points
+    voxel : edge of the voxels of a thinned cloud, metres; None if it is not thinned
     """
 
     surface: ReferenceSurface
@@ -111,23 +111,23 @@ class ReadSurface:
 
 
 def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
-    """Return the format of a file of a whole map, by its first bytes, else by its name.
+    """Return the format of a file of a whole map, from its first bytes or its name.
 
     Parameters
     ----------
-    head : the first 10,016 bytes, or all of it
-    name : of the file; its suffix tells OBJ and ascii STL
-    size : of the file, bytes
+    head : first 10,016 bytes of the file, or all of a smaller file
+    name : name of the file; its suffix identifies OBJ and ascii STL
+    size : size of the file, bytes
 
     Raises
     ------
-    UnreadableCloud : it is of no known format.
+    UnreadableCloud : If the file is empty or has an unknown format.
     """
     if not size:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
-    found = format_at(head, "map")
-    if found is not None:
-        return cast(SurfaceFormat, found.name)
+    file_format = format_at(head, "map")
+    if file_format is not None:
+        return cast(SurfaceFormat, file_format.name)
     if len(head) >= _STL_HEADER:
         triangles = int.from_bytes(head[80:84], "little")
         if size == _STL_HEADER + _STL_TRIANGLE * triangles:
@@ -138,8 +138,8 @@ def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
     if head.lstrip()[:6].lower() == b"solid " and b"facet" in head:
         return "stl"
     raise UnreadableCloud(
-        f"This is none of {titles_of('map')} by its first bytes and its name. Write the map as "
-        "one of these."
+        f"According to its first bytes and its name, the format is none of {titles_of('map')}. "
+        "Write the map as one of these."
     )
 
 
@@ -152,21 +152,21 @@ def read_surface(
     Parameters
     ----------
     data : the whole file, in memory or mapped
-    name : of the file, for errors, and for formats that only their suffix tells
-    options : what the user states
-    file_format : where it is known already
+    name : name of the file for errors; its suffix identifies formats without a signature
+    options : properties that the user states
+    file_format : format of the file if known
 
     Returns
     -------
-    read : points that are missing, and triangles that have no area or lack a vertex, are left out;
-        a cloud of more than 10 million points is thinned, the first of each voxel stays
+    read : surface without missing points, and without triangles that have no area or lack a vertex;
+        a cloud of more than 10 million points is thinned to the first point of each voxel
 
     Raises
     ------
-    UnreadableCloud : the bytes are of no such format, damaged, of degrees, or of more than is
-        read; a triangle has a vertex that is not there; the surface is larger than 20 km.
-    UselessFrame : fewer than 10 points are there.
-    MissingDependency : lazrs or trimesh is needed and not installed.
+    UnreadableCloud : If the bytes have an unknown format, are damaged, have coordinates in degrees
+        or exceed a limit, a triangle refers to a missing vertex, or the surface exceeds 20 km.
+    UselessFrame : If there are fewer than 10 points.
+    MissingDependency : If lazrs or trimesh is needed and not installed.
     """
     stated = options or SurfaceOptions()
     with naming(name):
@@ -187,20 +187,20 @@ def _raw(data: FileBytes, form: SurfaceFormat, options: SurfaceOptions) -> RawSu
         points = read_ply(data, MOST_FILE_POINTS if faces is None else MOST_VERTICES)
         return _gathered(points, faces, AXES["z"], options)
     if form == "las":
-        points = read_las(data, MOST_FILE_POINTS)  # looks at the header first
+        points = read_las(data, MOST_FILE_POINTS)  # this checks the header
         units = options.units_per_metre or las_units_per_metre(data)
         raw = _gathered(points, None, AXES["z"], replace(options, units_per_metre=units))
         return replace(raw, units_per_metre=units, up=AXES["z"])
     if form == "e57":
-        known = replace(options, units_per_metre=options.units_per_metre or 1.0)
-        raw = _gathered(_of_scans(read_e57(data)), None, AXES["z"], known)
+        in_metres = replace(options, units_per_metre=options.units_per_metre or 1.0)
+        raw = _gathered(_of_scans(read_e57(data)), None, AXES["z"], in_metres)
         return replace(raw, units_per_metre=1.0)
     points = (read_pcd if form == "pcd" else read_npy)(data, MOST_FILE_POINTS)
     return _gathered(points, None, AXES["z"], options)
 
 
 def _of_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
-    """Return the points of all scans in the frame of their file."""
+    """Return the points of all scans in the frame of the file."""
     count = sum(scan.count for scan in scans)
     check_count(count, MOST_FILE_POINTS)
 
@@ -208,7 +208,7 @@ def _of_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
         for scan in scans:
             T = scan.T_world_scan
             for block in scan.points().blocks:
-                with np.errstate(all="ignore"):  # what overflows is not finite, and so missing
+                with np.errstate(all="ignore"):  # points that overflow are missing
                     yield block @ T[:3, :3].T + T[:3, 3]
 
     return FilePoints(count, blocks())
@@ -225,8 +225,8 @@ def _gathered(
         def thin(so_far: Floats32) -> float:
             return options.units_per_metre or _estimated_units(so_far, None, usual_up)
 
-    found, origin, voxel = gather(points.blocks, points.count, thin)
-    return RawSurface(found, origin, triangles, points.count, voxel, None, None, usual_up)
+    gathered, origin, voxel = gather(points.blocks, points.count, thin)
+    return RawSurface(gathered, origin, triangles, points.count, voxel, None, None, usual_up)
 
 
 def _estimated_units(points: Floats32, triangles: Ints32 | None, usual_up: Floats) -> float:
@@ -234,7 +234,7 @@ def _estimated_units(points: Floats32, triangles: Ints32 | None, usual_up: Float
 
 
 def _in_metres(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
-    """Leave out what is missing, and turn units into metres."""
+    """Remove missing points and triangles, and convert the units to metres."""
     notes = list(raw.notes)
     points, triangles = _cleaned(raw, notes)
     if not max(float(points.max()), -float(points.min())) < _MOST_UNITS:
@@ -248,7 +248,7 @@ def _in_metres(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
     voxel = None if raw.voxel is None else raw.voxel / units
     if voxel is not None:
         notes.append(
-            f"The {raw.file_points} points were thinned to {len(points)}, one to a voxel of "
+            f"The {raw.file_points} points were thinned to {len(points)}, one per voxel of "
             f"{100 * voxel:.3g} cm."
         )
     surface = ReferenceSurface(points, triangles, offset, up)
@@ -259,7 +259,7 @@ def _up(
     raw: RawSurface, options: SurfaceOptions, points: Floats32, triangles: Ints32 | None,
     notes: list[str],
 ) -> tuple[Floats, Source]:  # fmt: skip
-    """Up, and where it comes from."""
+    """Return the up direction and its source."""
     if options.up is not None:
         return AXES[options.up], "stated"
     if raw.up is not None:
@@ -269,15 +269,15 @@ def _up(
     axis = f"{'-' if estimate.up[k] < 0 else ''}{'xyz'[k]}"
     degrees = math.degrees(math.acos(min(1.0, abs(float(estimate.up[k])))))
     tilt = f", {degrees:.0f} degrees from it" if degrees > 0.5 else ""
-    doubt = "" if estimate.is_clear else " The surface does not show it clearly."
-    notes.append(f"Up was estimated: {axis}{tilt}.{doubt} State it if this is wrong.")
+    doubt = "" if estimate.is_clear else " The estimate is uncertain."
+    notes.append(f"The up axis was estimated: {axis}{tilt}.{doubt} Specify it if this is wrong.")
     return estimate.up, "estimated"
 
 
 def _units(
     raw: RawSurface, options: SurfaceOptions, points: Floats32, up: Floats, notes: list[str]
 ) -> tuple[float, Source]:
-    """Units per metre, and where they come from."""
+    """Return the units per metre and their source."""
     if options.units_per_metre is not None:
         return options.units_per_metre, "stated"
     if raw.units_per_metre is not None:
@@ -286,45 +286,45 @@ def _units(
     x, y, z = (points.max(axis=0) - points.min(axis=0)).tolist()
     name = {1.0: "metres", 100.0: "centimetres", 1000.0: "millimetres"}[units]
     notes.append(
-        f"Units were estimated: {name}, by the extent of {x:.4g} x {y:.4g} x {z:.4g}. State them "
-        "if this is wrong."
+        f"Units were estimated from the extent of {x:.4g} x {y:.4g} x {z:.4g}: {name}. Specify "
+        "them if this is wrong."
     )
     return units, "estimated"
 
 
 def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
-    """Return points and triangles without what is missing."""
+    """Return the points and triangles without missing points and vertices."""
     if raw.triangles is None:
         missing = raw.file_points - len(raw.points)
         if missing and raw.voxel is None:
             notes.append(f"{missing} missing points were left out.")
         if len(raw.points) < FEWEST_POINTS:
             raise UselessFrame(
-                f"The file has {len(raw.points)} points that are not missing, fewer than "
-                f"{FEWEST_POINTS}. Check that it is the map that you meant."
+                f"The file has {len(raw.points)} valid points, fewer than {FEWEST_POINTS}. Check "
+                "that it is the right file."
             )
         return raw.points, None
     wrong = (raw.triangles < 0) | (raw.triangles >= len(raw.points))
     if wrong.any():
         first = int(np.flatnonzero(wrong.any(axis=1))[0])
         raise UnreadableCloud(
-            f"Triangle {first + 1} of {len(raw.triangles)} has a vertex that is not among the "
-            f"{len(raw.points)} of the file. Copy or write the file again."
+            f"Triangle {first + 1} of {len(raw.triangles)} refers to a vertex that is not among "
+            f"the {len(raw.points)} vertices of the file. Copy or write the file again."
         )
     points, triangles = _proper(raw.points, raw.triangles)
-    left = len(raw.triangles) - len(triangles)
+    omitted = len(raw.triangles) - len(triangles)
     if not len(triangles):
         raise UselessFrame(
-            f"None of the {left} triangles of the file has an area. Check that it is the map that "
-            "you meant, and write it again."
+            f"None of the {omitted} triangles of the file has an area. Check that it is the right "
+            "file, and write it again."
         )
-    if left:
-        notes.append(f"{left} triangles without area or with missing vertices were left out.")
+    if omitted:
+        notes.append(f"{omitted} triangles without area or with missing vertices were left out.")
     return points, triangles
 
 
 def _proper(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
-    """Triangles that have an area, and the vertices that they use."""
+    """Return the vertices of triangles with an area, and these triangles."""
     proper = np.ones(len(triangles), np.bool_)
     present = np.asarray(np.isfinite(points).all(axis=1))
     for first in range(0, len(triangles), _BLOCK):
@@ -344,13 +344,13 @@ def _proper(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
 
 
 def _to_metres(points: Floats32, origin: Floats, units: float) -> Floats:
-    """Make the points metres relative to an offset, in place; return the offset (3,)."""
+    """Convert points to metres relative to an offset, in place, and return the offset (3,)."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     widest = float((high - low).max()) / units
     if not widest <= 2 * FARTHEST_M:
         raise UnreadableCloud(
-            f"The surface is {widest:.6g} m wide, and at most {2 * FARTHEST_M:g} m is read. State "
-            "the units if these are no metres, and remove points that lie far from the others."
+            f"The surface is {widest:.6g} m wide; the limit is {2 * FARTHEST_M:g} m. Specify the "
+            "units if the coordinates are not metres, and remove isolated distant points."
         )
     middle = (origin + (low + high) / 2) / units
     is_far = bool(np.linalg.norm(middle) > FAR_M)
