@@ -241,6 +241,7 @@ def room_at(place: Any) -> bytes:
     return (corners + "".join(f"f {a} {b} {c}\n" for a, b, c in room.faces + 1)).encode()
 
 
+@pytest.mark.thorough
 def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
     """Each would have its own middle as its offset, and views of one would lie in the other."""
 
