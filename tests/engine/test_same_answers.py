@@ -77,6 +77,7 @@ def see_same(served: Answer, evaluated: JudgedAnswer, truth: Floats) -> None:
         assert pose.evidence.model_dump() == pytest.approx(vars(place.evidence), abs=6e-4)
 
 
+@pytest.mark.thorough
 def test_equal_offices_are_answered_alike(
     both: Callable[..., list[Asked]], make_upload: Callable[..., Any]
 ) -> None:
