@@ -48,7 +48,7 @@ def client_page() -> str:
         "# Python client",
         plain("Everything that `sceneprint_client` offers. Bodies and answers are the "
         "records of `sceneprint_client.api`: ") + "[Records](http/records.md). It raises the "
-        "errors of `sceneprint_client.errors`: [Errors](errors.md).",
+        "errors of `sceneprint_client.errors`: [Errors](../reference.md#problems).",
         *(_describe(name, getattr(sceneprint_client, name)) for name in public_names()),
     )  # fmt: skip
 
