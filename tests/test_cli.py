@@ -242,7 +242,7 @@ def test_two_paths_keep_their_names_apart(rooms: Path, model_file: Path, tmp_pat
     [
         (["sign", "/nowhere/at/all"], "does not exist"),
         (["sign", "README.md"], "There is no intrinsics.json here"),
-        (["sign", "{rooms}", "--model", "/nowhere.safetensors"], "Give one of the presets"),
+        (["sign", "{rooms}", "--model", "/nowhere.safetensors"], "Specify one of the presets"),
         (["train", "--out", "{tmp}/m", "--rooms", "1", "--jobs", "1"], "fewer than two places"),
         (["synth", "/dev/null/x"], "/dev/null"),
     ],

@@ -59,7 +59,7 @@ def test_two_matches_guide_the_rest_to_the_truth(walk: Room) -> None:
         assert radians < np.radians(1.0)
         assert v.guided == (v.predicted is not None) == (match.index > 2)
         assert v.reason.startswith("the surfaces agree")
-        assert ("where other matches place the query" in v.reason) == v.guided
+        assert ("at the pose that other matches predict" in v.reason) == v.guided
     # the same bits from what was predicted: an answer is shown again from it
     first = matches[2].validation
     assert first.predicted is not None

@@ -140,6 +140,6 @@ def test_what_the_deadline_leaves_uncompared_is_not_found(
     )
     answer = twins.ask(candidates=FEW, deadline_ms=60_000)
     assert (answer.status, answer.deadline_reached) == ("ambiguous", True)
-    assert "the deadline passed before frames of another place" in answer.reason
+    assert "the deadline passed before similar frames of other places" in answer.reason
     [pose] = answer.alternatives
     assert pose.pose.matrix[0][3] - twins.asked.pose[0, 3] == pytest.approx(APART, abs=0.05)

@@ -102,7 +102,7 @@ def test_baselines_are_rows_of_the_same_table(
     assert set(found["R"]) - {"right_scene"} <= set(row)
     assert row["ratio"] > 0
     assert (
-        "made for frames such as room-000/seq-01/frame-000001"
+        "does not support frames such as room-000/seq-01/frame-000001"
         in (found["baselines"]["rings"]["reason"])
     )
     out = capsys.readouterr().out

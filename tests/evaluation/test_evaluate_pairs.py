@@ -141,9 +141,9 @@ def test_what_cannot_be_done_is_one_line(
     (single / first.path.name).write_bytes(first.path.read_bytes())
     for arguments, said in (
         ([str(tmp_path / "nowhere")], "does not exist"),
-        ([room, room], "Give each path once"),
-        ([room, str(building)], "Give each path once"),
-        ([str(single)], "a pair has two"),
+        ([room, room], "Specify each path once"),
+        ([room, str(building)], "Specify each path once"),
+        ([str(single)], "a pair requires two"),
         ([room, "--apart", "99"], "smaller --apart"),
         ([room, "--json", str(building)], "directory"),
     ):

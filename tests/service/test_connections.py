@@ -290,7 +290,7 @@ def test_a_certificate_that_cannot_be_used_is_said(certificate, tmp_path):
         with pytest.raises(InvalidRequest, match=said):
             connections.tls_context(Settings(**given))
     for half in ({"tls_cert": cert}, {"tls_key": key}):
-        with pytest.raises(ValueError, match="HTTPS needs SCENEPRINT_TLS_CERT"):
+        with pytest.raises(ValueError, match="HTTPS requires both SCENEPRINT_TLS_CERT"):
             Settings(**half)
     locked = tmp_path / "locked.pem"
     found = load_pem_private_key(key.read_bytes(), None)

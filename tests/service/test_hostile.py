@@ -321,7 +321,7 @@ def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):
     assert (done.returncode, done.stdout) == (2, "")
     warning, line = done.stderr.splitlines()
     assert json.loads(warning)["permissions"] == "555"
-    assert "every user of this machine may read the data folder" in warning
+    assert "all users of this machine may read the data folder" in warning
     assert line.startswith("sceneprint work: ")
     assert "is read-only, so nothing can be stored" in line
     done = subprocess.run(
