@@ -245,7 +245,10 @@ def train(
     from threadpoolctl import threadpool_limits
 
     if p.whitening_rooms and max(p.levels) >= (n_levels := model_p.hierarchy.n_levels):
-        raise TrainingError(f"There is no level {max(p.levels)}: the hierarchy has {n_levels}.")
+        raise TrainingError(
+            f"There is no level {max(p.levels)}: the hierarchy has {n_levels} levels. Select from "
+            f"0 to {n_levels - 1}."
+        )
     tell = report or _silent
     n_frames = p.rooms * p.views + len(references)
     drawn = Draw(

@@ -163,11 +163,11 @@ def encode_cells(rows: CellSums, scale: TimeScale | None) -> Cells:
     cells["at"] = place * steps + within
     cells["seen"] = np.minimum(np.rint(SEEN_STEPS * np.log2(1.0 + views)), 255)
     cells["session"] = rows["session"]
-    known = np.isfinite(rows["taken"])
+    has_time = np.isfinite(rows["taken"])
     cells["taken"] = NO_TIME
     if scale is not None:
-        steps_since = np.floor((rows["taken"][known] - scale.start) / scale.step_s)
-        cells["taken"][known] = np.clip(steps_since, 0, NO_TIME - 1)
+        steps_since = np.floor((rows["taken"][has_time] - scale.start) / scale.step_s)
+        cells["taken"][has_time] = np.clip(steps_since, 0, NO_TIME - 1)
     return cells
 
 

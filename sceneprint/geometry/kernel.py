@@ -322,7 +322,7 @@ def run_both(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
     """Return the results of two computations that write no common memory.
 
     They run in parallel within `Cores.shared` if a core is free, otherwise sequentially. If both
-    raise an exception, the first one's is raised.
+    raise an exception, the exception of `first` is raised.
     """
     cores = _cores.get()
     return (first(), second()) if cores is None else cores.run_both(first, second)

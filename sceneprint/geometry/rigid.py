@@ -136,19 +136,19 @@ def _select(
     transforms: Floats, order: Ints64, metres: float, cosine: float, chosen: Ints64
 ) -> int:  # fmt: skip
     """Write the indices of distinct transforms to `chosen`, and return their number."""
-    found = 0
+    count = 0
     for i in order:
-        if found == len(chosen):
+        if count == len(chosen):
             break
         distinct = True
-        for k in range(found):
+        for k in range(count):
             if _is_near(transforms[i], transforms[chosen[k]], metres, cosine):
                 distinct = False
                 break
         if distinct:
-            chosen[found] = i
-            found += 1
-    return found
+            chosen[count] = i
+            count += 1
+    return count
 
 
 def nearest_rotation(M: Floats) -> Floats:

@@ -128,13 +128,13 @@ class CycleParameters:
     """The tolerances within which a loop of two edges closes."""
 
     close_m: float = 0.07  #: maximum residual of a loop of length zero, metres
-    close_rad: float = math.radians(4.0)  #: the same, radians
+    close_rad: float = math.radians(4.0)  #: maximum residual of a loop of length zero, radians
     drift: float = 0.05  #: drift of odometry within a loop, metres per metre, radians per radian
     most_drift: float = 0.2  #: maximum plausible drift between any two frames of a run
     reach_m: float = 1.0  #: maximum path length between the edges of a loop, metres
-    reach_rad: float = math.radians(60.0)  #: the same, radians
+    reach_rad: float = math.radians(60.0)  #: maximum rotation between the edges of a loop, radians
     view_m: float = 0.1  #: maximum distance between two frames of one viewpoint, metres
-    view_rad: float = math.radians(6.0)  #: the same, radians
+    view_rad: float = math.radians(6.0)  #: maximum angle of frames of one viewpoint, radians
     most_loops: int = 4_000_000  #: maximum number of loops; the reach is halved until it holds
 
     def scaled(self, scale: float) -> CycleParameters:
@@ -355,10 +355,10 @@ def _write_loops(
 @kernel
 def _outvote(
     starts: Ints64, others: Ints64, closing: NDArray[np.bool_], weights: Floats,
-    kept: NDArray[np.bool_],
+    accepted: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Reject the worst edge while the votes against it outweigh those for it."""
-    n = len(kept)
+    n = len(accepted)
     against = np.zeros(n)
     for i in range(n):
         for k in range(starts[i], starts[i + 1]):
@@ -366,11 +366,11 @@ def _outvote(
     while True:
         worst, most = -1, 0.0
         for i in range(n):
-            if kept[i] and against[i] > most:
+            if accepted[i] and against[i] > most:
                 worst, most = i, against[i]
         if worst < 0:
             return
-        kept[worst] = False
+        accepted[worst] = False
         for k in range(starts[worst], starts[worst + 1]):
             against[others[k]] -= -weights[worst] if closing[k] else weights[worst]
 
@@ -383,7 +383,7 @@ class JoiningParameters:
     """The tolerances within which votes agree, and the agreement that a join requires."""
 
     agree_m: float = 0.2  #: maximum difference at a vote's position, metres
-    agree_rad: float = math.radians(6.0)  #: the same, radians
+    agree_rad: float = math.radians(6.0)  #: maximum difference in rotation, radians
     sigma_m: float = 0.04  #: standard deviation of a vote's position, metres
     sigma_rad: float = math.radians(1.2)  #: standard deviation of a vote's rotation, radians
     hypotheses: int = 300  #: maximum number of votes that are tested as the transform
@@ -391,7 +391,7 @@ class JoiningParameters:
     least_votes: int = 3  #: minimum number of agreeing votes
     least_frames: int = 2  #: minimum number of frames of the agreeing votes in either run
     view_m: float = 0.1  #: maximum distance between two frames of one viewpoint, metres
-    view_rad: float = math.radians(6.0)  #: the same, radians
+    view_rad: float = math.radians(6.0)  #: maximum angle of frames of one viewpoint, radians
     rival: float = 0.5  #: share of the support at which another transform prevents a join
     strong_votes: int = 10  #: minimum number of agreeing votes of a strong join
     strong_frames: int = 5  #: minimum number of their frames in either run
@@ -531,7 +531,7 @@ def _best(
     votes: Votes, weights: Floats, chosen: NDArray[np.intp], among: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> int:  # fmt: skip
-    """Return the chosen vote with the largest support by the votes `among`; the first if equal."""
+    """Return the vote of `chosen` with the largest support by votes of `among`; ties by order."""
     support = [
         float(weights[_agreeing(votes, votes.transforms[i], p) & among].sum()) for i in chosen
     ]

@@ -129,7 +129,7 @@ class AnswerScene:
 
         Raises
         ------
-        UnknownQuery : If the service does not store the answer (any more).
+        UnknownQuery : If the service does not store the answer.
         """
         named = dict.fromkeys(one.map for one in placed(answer.matches))
         for map_name in answer.maps if len(answer.maps) == 1 else named:

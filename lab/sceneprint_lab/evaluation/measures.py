@@ -56,11 +56,11 @@ def recall(
         FIRST among them; null without such queries
     """
     able = np.flatnonzero((relevant & allowed).any(axis=1)).tolist()
-    found: dict[str, float | int | None] = {"queries": len(able)}
+    figures: dict[str, float | int | None] = {"queries": len(able)}
     for k in FIRST:
         hits = [any(relevant[i, j] for j in rankings[i][:k]) for i in able]
-        found[f"at_{k}"] = sum(hits) / len(hits) if hits else None
-    return found
+        figures[f"at_{k}"] = sum(hits) / len(hits) if hits else None
+    return figures
 
 
 # Confidence bounds of rates, and receiver operating characteristics.
@@ -140,10 +140,12 @@ class Roc:
     def thinned(self, most: int = CURVE) -> list[list[float]]:
         """Return at most `most` points (false, true, threshold), including both ends."""
         n = len(self.true)
-        kept = np.arange(n)
+        selected = np.arange(n)
         if n > most:
-            kept = self._kept(most)
-        columns = zip(self.false[kept], self.true[kept], self.thresholds[kept], strict=True)
+            selected = self._kept(most)
+        columns = zip(
+            self.false[selected], self.true[selected], self.thresholds[selected], strict=True
+        )
         return [[float(one) for one in row] for row in columns]
 
     def _kept(self, most: int) -> NDArray[np.intp]:
@@ -337,7 +339,7 @@ def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
     }
 
 
-def answers(told: Sequence[JudgedAnswer]) -> dict[str, Any]:
+def answers(judged: Sequence[JudgedAnswer]) -> dict[str, Any]:
     """Return the answers of robots as shares of all queries; the first four have the sum 1.
 
     `found_right`: found within 10 cm and 10 degrees, or within the limits of the answers.
@@ -348,31 +350,31 @@ def answers(told: Sequence[JudgedAnswer]) -> dict[str, Any]:
     likely pose and the share of such poses that are right. `reliability`: number, mean confidence
     and share of right poses for each tenth of confidences. Figures are null without queries.
     """
-    found = _calibration(told)
-    wrong = [one.status == "found" and not one.right for one in told]
-    gross = [one.grossly_wrong for one in told]
+    figures = _calibration(judged)
+    wrong = [one.status == "found" and not one.right for one in judged]
+    gross = [one.grossly_wrong for one in judged]
     return {
-        "queries": len(told),
-        "found_right": _share([one.right for one in told]),
+        "queries": len(judged),
+        "found_right": _share([one.right for one in judged]),
         "found_wrong": _share(wrong),
-        "ambiguous": _share([one.status == "ambiguous" for one in told]),
-        "not_found": _share([one.status == "not_found" for one in told]),
+        "ambiguous": _share([one.status == "ambiguous" for one in judged]),
+        "not_found": _share([one.status == "not_found" for one in judged]),
         "grossly_wrong": _share(gross),
-        "grossly_wrong_at_most": upper_bound(sum(gross), len(told)),
+        "grossly_wrong_at_most": upper_bound(sum(gross), len(judged)),
         "found_strong_wrong": _share(
-            [one.strength == "strong" and w for one, w in zip(told, wrong, strict=True)]
+            [one.strength == "strong" and w for one, w in zip(judged, wrong, strict=True)]
         ),
         "wrong_of_found": _share(
-            [w for one, w in zip(told, wrong, strict=True) if one.status == "found"]
+            [w for one, w in zip(judged, wrong, strict=True) if one.status == "found"]
         ),
-        "calibration_error": None if found is None else found.error,
-        "reliability": None if found is None else found.bins,
+        "calibration_error": None if figures is None else figures.error,
+        "reliability": None if figures is None else figures.bins,
     }
 
 
-def _calibration(told: Sequence[JudgedAnswer]) -> Calibration | None:
+def _calibration(judged: Sequence[JudgedAnswer]) -> Calibration | None:
     """Return the calibration of the most likely poses; None without poses."""
-    best = [one.places[0] for one in told if one.places]
+    best = [one.places[0] for one in judged if one.places]
     if not best:
         return None
     return calibration([one.confidence for one in best], [one.right for one in best])
@@ -597,7 +599,7 @@ def points_of(frame: AnyFrame, step: int, farthest: float) -> Floats:
 
 
 def _of_scene(outcome: QueryOutcome, of: str) -> list[ValidatedPair]:
-    """Return those of the first five pairs that are in the query's scene."""
+    """Return the pairs in the query's scene among the first five."""
     return [pair for pair in outcome.views(of)[:VIEWS] if pair.same_scene]
 
 

@@ -68,8 +68,8 @@ def pair_table(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _bins(found: dict[str, Any]) -> list[str]:
-    of = found["bins"]
+def _bins(report: dict[str, Any]) -> list[str]:
+    of = report["bins"]
     rows: list[tuple[str, Callable[[dict[str, Any]], str]]] = [
         ("pairs", lambda one: str(one["pairs"])),
         (_LIMITS, lambda one: _two(one["success"])),
@@ -83,9 +83,9 @@ def _bins(found: dict[str, Any]) -> list[str]:
     lines = [_HEAD]
     for name, cell in rows:
         lines.append(f"{name:24}" + "".join(f"{cell(of[b]):>16}" for b in BINS))
-    v = found["validation"]
-    if "same_scene" in found:
-        same = found["same_scene"]
+    v = report["validation"]
+    if "same_scene" in report:
+        same = report["same_scene"]
         lines.append(
             f"with {same['pairs']} pairs of it that see nothing of each other: precision "
             f"{decimal(v['precision'])}, recall {decimal(v['recall'])}, where overlap is 30 % "
@@ -94,10 +94,11 @@ def _bins(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _baselines(found: dict[str, Any]) -> list[str]:
-    of = found["baselines"]
+def _baselines(report: dict[str, Any]) -> list[str]:
+    of = report["baselines"]
     lines = [f"beside Open3D, {of['pairs']} pairs, {_LIMITS}", _HEAD]
-    lines.append(f"{'ours':24}" + "".join(f"{_two(found['bins'][b]['success']):>16}" for b in BINS))
+    ours = (f"{_two(report['bins'][name]['success']):>16}" for name in BINS)
+    lines.append(f"{'ours':24}" + "".join(ours))
     for method, own in of["methods"].items():
         for step, name in (("start", ""), ("icp", " + ICP"), ("ours", " + ours")):
             cells = [_two(own["bins"][b][step]) for b in BINS]
@@ -113,12 +114,12 @@ def _baselines(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _negatives(found: dict[str, Any]) -> list[str]:
+def _negatives(report: dict[str, Any]) -> list[str]:
     names = {
-        "same scene, no overlap": found["same_scene"],
-        "two scenes": found["cross_scene"],
-        "  a frame planar": found["cross_scene_planar"],
-        **{f"  {name}": own for name, own in found["by_scenes"].items()},
+        "same scene, no overlap": report["same_scene"],
+        "two scenes": report["cross_scene"],
+        "  a frame planar": report["cross_scene_planar"],
+        **{f"  {name}": own for name, own in report["by_scenes"].items()},
     }
     lines = [f"{'negatives':36}{'pairs':>8}{'accepted':>10}{'strong':>8}{'at most':>10}"]
     for name, own in names.items():
@@ -128,14 +129,14 @@ def _negatives(found: dict[str, Any]) -> list[str]:
                 f"{decimal(own['upper'], 5):>10}"
             )
     lines.append(
-        f"(at most: the rate, with {found['confidence']:.0%} confidence, were pairs independent)"
+        f"(at most: the rate, with {report['confidence']:.0%} confidence, were pairs independent)"
     )
     return lines
 
 
-def _statistics(found: dict[str, Any]) -> list[str]:
+def _statistics(report: dict[str, Any]) -> list[str]:
     lines = [f"{'decides alone':16}{'area':>8}{'right at no wrong':>20}{'at 1 %':>8}{'at 5 %':>8}"]
-    for name, own in found.items():
+    for name, own in report.items():
         at = own["right_at"]
         lines.append(
             f"{name:16}{decimal(own['area']):>8}{decimal(at['0']):>20}{decimal(at['0.01']):>8}"
@@ -154,10 +155,8 @@ FALSE_RATES = (0.0, 0.01, 0.05)
 
 def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
     """Return the evidence by which acceptance decides, without the stiffness."""
-    told = Evidence(
-        v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf
-    )
-    return told.total(p)
+    e = Evidence(v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf)
+    return e.total(p)
 
 
 def residual(v: PairValidation, p: AcceptanceParameters) -> float:
@@ -185,16 +184,16 @@ def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str,
     `curve` contains (false rate, true rate, threshold); thresholds of statistics whose small values
     are evidence are negative.
     """
-    found = {}
-    for name, told in STATISTICS.items():
+    report = {}
+    for name, statistic in STATISTICS.items():
         own = [pair for pair in pairs if name != "ambiguity" or _ambiguity_was_tested(pair)]
         values = [
-            told(one.validation, p) if one.validation.T_match_query is not None else None
+            statistic(one.validation, p) if one.validation.T_match_query is not None else None
             for one in own
         ]
         right = np.array([pair.right for pair in own], bool)
         curve = roc(np.array([-math.inf if v is None else v for v in values], float), right)
-        found[name] = {
+        report[name] = {
             "right": int(right.sum()),
             "wrong": int((~right).sum()),
             "area": None if curve is None else curve.area,
@@ -204,7 +203,7 @@ def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str,
             },
             "curve": [] if curve is None else curve.thinned(),
         }
-    return found
+    return report
 
 
 def _ambiguity_was_tested(pair: ValidatedPair) -> bool:
@@ -226,8 +225,8 @@ def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[s
     members, tried = evaluation.members, evaluation.tried
     scenes = list(dict.fromkeys(member.scene for member in members))
     scene_of = [member.scene for member in members]
-    found: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
-    found["counts"] = {
+    report: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
+    report["counts"] = {
         "frames": {scene: scene_of.count(scene) for scene in scenes},
         "planar": {
             scene: sum(
@@ -239,13 +238,13 @@ def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[s
         "left_out": len(evaluation.left_out),
         "pairs": len(tried),
     }
-    found["left_out"] = [{"name": n, "reason": why} for n, why in evaluation.left_out]
+    report["left_out"] = [{"name": n, "reason": why} for n, why in evaluation.left_out]
     limits = evaluation.limits
     seconds = second_pairs(evaluation)
-    found["bins"] = bins(tried, seconds, limits)
-    found["negatives"] = negatives(evaluation)
-    found["validation"] = validation_of([one.pair for one in tried])
-    found["support"] = support(tried, seconds)
+    report["bins"] = bins(tried, seconds, limits)
+    report["negatives"] = negatives(evaluation)
+    report["validation"] = validation_of([one.pair for one in tried])
+    report["support"] = support(tried, seconds)
 
     def within(scene: str) -> list[int]:
         return [
@@ -255,18 +254,18 @@ def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[s
         ]
 
     if len(scenes) > 1:
-        found["scenes"] = {
+        report["scenes"] = {
             scene: _of_scene(within(scene), tried, seconds, limits) for scene in scenes
         }
-    found["roc"] = curves([one.pair for one in tried], evaluation.acceptance)
-    found["milliseconds"] = {
+    report["roc"] = curves([one.pair for one in tried], evaluation.acceptance)
+    report["milliseconds"] = {
         "prepare": evaluation.prepare_ms,
         "validate": _median([one.pair.milliseconds for one in tried]),
     }
     if any(one.others is not None for one in tried):
-        found["baselines"] = baselines(tried, limits)
-    found["failures"] = failures(evaluation)
-    cleaned: dict[str, Any] = without_infinities(found)
+        report["baselines"] = baselines(tried, limits)
+    report["failures"] = failures(evaluation)
+    cleaned: dict[str, Any] = without_infinities(report)
     return cleaned
 
 
@@ -304,7 +303,7 @@ def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
         if one.pair.accepted and T is not None:
             of_query.setdefault(one.drawn.query, []).append(i)
             poses[i] = members[one.drawn.match].pose @ T
-    said: list[Second | None] = [None] * len(evaluation.tried)
+    relations: list[Second | None] = [None] * len(evaluation.tried)
     for own in of_query.values():
         for i in own:
             match = members[evaluation.tried[i].drawn.match]
@@ -316,20 +315,20 @@ def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
                     agree.append(False)
                 elif len(distinct_viewpoints(views, p)) > 1:
                     agree.append(bool(at_place(poses[j][None], poses[i], p)[0]))
-            said[i] = "supported" if any(agree) else "contradicted" if agree else "alone"
-    return said
+            relations[i] = "supported" if any(agree) else "contradicted" if agree else "alone"
+    return relations
 
 
 def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[str, Any]:
     """Return the number of accepted pairs by relation to a second pair, and their precision."""
-    found: dict[str, Any] = {}
+    report: dict[str, Any] = {}
     kinds: tuple[Second, ...] = get_args(Second)
     for kind in kinds:
-        right = [t.pair.right for t, said in zip(tried, seconds, strict=True) if said == kind]
-        found[kind] = len(right)
+        right = [t.pair.right for t, second in zip(tried, seconds, strict=True) if second == kind]
+        report[kind] = len(right)
         name = "precision" if kind == "supported" else f"precision_{kind}"
-        found[name] = sum(right) / len(right) if right else None
-    return found
+        report[name] = sum(right) / len(right) if right else None
+    return report
 
 
 def bins(
@@ -341,18 +340,18 @@ def bins(
     the same for refinement from the reference pose. A pair without a transform is a failure.
     `validation`: see `measures.validation`. `support`: see `support`.
     """
-    found = {}
+    report = {}
     for name in BINS:
         chosen = [i for i, one in enumerate(tried) if one.drawn.bin == name]
         own = [tried[i].pair for i in chosen]
-        found[name] = {
+        report[name] = {
             "pairs": len(own),
             "success": _shares([pair.error for pair in own], limits),
             "bound": _shares([pair.bound or Error() for pair in own], limits),
             "validation": validation_of(own),
             "support": support([tried[i] for i in chosen], [seconds[i] for i in chosen]),
         }
-    return found
+    return report
 
 
 def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
@@ -405,8 +404,8 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
     `time_ratio`: median over pairs of our time divided by theirs, including features.
     """
     beside = [one for one in tried if one.others is not None]
-    found: dict[str, Any] = {"pairs": len(beside), "methods": {}}
-    found["milliseconds"] = _median([one.milliseconds for one in beside if one.milliseconds])
+    report: dict[str, Any] = {"pairs": len(beside), "methods": {}}
+    report["milliseconds"] = _median([one.milliseconds for one in beside if one.milliseconds])
     for method in METHODS:
         by_bin = {}
         for name in BINS:
@@ -421,12 +420,12 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
             for one in beside
             if one.milliseconds and one.others and method in one.others
         ]
-        found["methods"][method] = {
+        report["methods"][method] = {
             "bins": by_bin,
             "milliseconds": _median([theirs for _, theirs in both]),
             "time_ratio": _median([ours / theirs for ours, theirs in both]),
         }
-    return found
+    return report
 
 
 def why(one: Tried) -> str | None:

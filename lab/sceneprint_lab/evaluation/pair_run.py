@@ -406,12 +406,12 @@ def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried
     """Validate a pair; if the frames overlap, compute the bound and run the baselines too."""
     drawn, query, match = task
     candidate = Candidate.of(match, drawn.match, drawn.overlap_mean, drawn.overlap_least)
-    asked = QueryTask(query.number, query.scene, query.pose, [], [], (candidate,))
-    pair = replace(validated(bench.judging, asked, candidate), limits=bench.limits)
+    query_task = QueryTask(query.number, query.scene, query.pose, [], [], (candidate,))
+    pair = replace(validated(bench.judging, query_task, candidate), limits=bench.limits)
     if drawn.kind != "overlapping":
         return Tried(drawn, pair, None, None)
-    T = refined_from_truth(bench.judging, asked, candidate)
-    true = true_transform(asked, candidate)
+    T = refined_from_truth(bench.judging, query_task, candidate)
+    true = true_transform(query_task, candidate)
     pair = replace(pair, bound=_error(T, true))
     if bench.o3d is None:
         return Tried(drawn, pair, None, None)
@@ -556,8 +556,9 @@ def evaluate_pairs(
     drawn = draw(places, truth, planes >= PLANAR, settings.drawing)
     if not drawn:
         raise DatasetError(
-            f"None of the pairs of {len(members)} frames at least {settings.drawing.apart} frames "
-            "apart overlaps by a tenth or not at all. Specify more recordings or a smaller --apart."
+            f"The {len(members)} frames contain no pairs at least {settings.drawing.apart} frames "
+            "apart that overlap by a tenth or more, or not at all. Specify more recordings or a "
+            "smaller --apart."
         )
     tasks = [(one, members[one.query], members[one.match]) for one in drawn]
     opening = partial(

@@ -63,24 +63,24 @@ def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
     outcomes = evaluation.outcomes
     ours = float(np.median([o.milliseconds["rank"] for o in outcomes]))
     here = [i for i, o in enumerate(outcomes) if o.present]
-    found: dict[str, dict[str, Any]] = {}
+    report: dict[str, dict[str, Any]] = {}
     for one in evaluation.compared:
         if one.reason:
-            found[one.name] = {"reason": one.reason}
+            report[one.name] = {"reason": one.reason}
             continue
         firsts = [one.first[i] for i in here]
         five = [
             [outcomes[i].overlap_of(match) for match in one.rankings[i][: FIRST[1]]] for i in here
         ]
         ms = one.milliseconds
-        found[one.name] = {
+        report[one.name] = {
             **accuracy([Error() if pair is None else pair.error for pair in firsts]),
             **overlap_figures(five),
             "recall": recall(evaluation.relevant, evaluation.allowed, one.rankings),
             "milliseconds": ms,
             "ratio": (ms["describe"] + ms["rank"]) / (ms["sign"] + ours),
         }
-    return found
+    return report
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
     """
     rows: dict[str, Figures] = {}
     for row in ("R", "VR", "DR", "VDR", "pose_average"):
-        spreads = [found for one in judged if (found := one.spread.get(row)) is not None]
+        spreads = [spread for one in judged if (spread := one.spread.get(row)) is not None]
         mean = np.mean(spreads, axis=0).tolist() if spreads else (None, None)
         rows[row] = accuracy([one.first[row] for one in judged])
         rows[row] |= {"spread_mean_m": mean[0], "spread_std_m": mean[1]}
@@ -195,26 +195,26 @@ def figures(
     def of(some: Sequence[QueryOutcome]) -> dict[str, Any]:
         return measured(some, poses, database)
 
-    found: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
-    found["counts"] = {
+    report: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "settings": settings}
+    report["counts"] = {
         "queries": len(prepared.queries), "database": len(prepared.database),
         "left_out": len(prepared.left_out),
     }  # fmt: skip
-    found["left_out"] = [{"name": n, "reason": why} for n, why in prepared.left_out]
-    found |= of(outcomes)
-    found["recall"] = recalls(evaluation)
+    report["left_out"] = [{"name": n, "reason": why} for n, why in prepared.left_out]
+    report |= of(outcomes)
+    report["recall"] = recalls(evaluation)
     if evaluation.compared:
-        found["baselines"] = baseline_rows(evaluation)
+        report["baselines"] = baseline_rows(evaluation)
     scenes = list(dict.fromkeys(o.scene for o in outcomes))
     if len(scenes) > 1:
-        found["by_scene"] = {one: of([o for o in outcomes if o.scene == one]) for one in scenes}
+        report["by_scene"] = {one: of([o for o in outcomes if o.scene == one]) for one in scenes}
     if evaluation.alone:
-        found["scenes"] = {scene: of(some) for scene, some in evaluation.alone.items()}
-        found["average"] = average(list(found["scenes"].values()))
-    found["milliseconds"] = {"prepare": prepared.milliseconds, **milliseconds(outcomes)}
-    found["per_query"] = [per_query(outcome, names) for outcome in outcomes]
-    found["mistakes"] = mistakes(outcomes, names)
-    cleaned: dict[str, Any] = without_infinities(found)
+        report["scenes"] = {scene: of(some) for scene, some in evaluation.alone.items()}
+        report["average"] = average(list(report["scenes"].values()))
+    report["milliseconds"] = {"prepare": prepared.milliseconds, **milliseconds(outcomes)}
+    report["per_query"] = [per_query(outcome, names) for outcome in outcomes]
+    report["mistakes"] = mistakes(outcomes, names)
+    cleaned: dict[str, Any] = without_infinities(report)
     return cleaned
 
 
@@ -440,19 +440,19 @@ def _overlap(row: dict[str, Any]) -> str:
     )
 
 
-def _recalls(found: dict[str, Any]) -> list[str]:
+def _recalls(report: dict[str, Any]) -> list[str]:
     """Return lines on the recall of all rankings, and their times relative to the signature."""
-    if "recall" not in found:  # figures of an older version
+    if "recall" not in report:  # figures of an older version
         return []
-    within = found["recall"]["within_m"]
+    within = report["recall"]["within_m"]
     place = "overlap by half" if within is None else f"taken within {within:g} m"
-    able = found["recall"]["R"]["queries"]
+    able = report["recall"]["R"]["queries"]
     lines = [
         f"{f'{able} queries with a frame that is their place ({place}), recall':58}"
         f"{'@1':>10}{'@5':>10}{'@10':>10}{'ms':>10}{'x ours':>8}"
     ]
-    lines += [_recall(name, found["recall"][name]) for name in ("R", "DR", "random")]
-    for name, row in found.get("baselines", {}).items():
+    lines += [_recall(name, report["recall"][name]) for name in ("R", "DR", "random")]
+    for name, row in report.get("baselines", {}).items():
         if "recall" not in row:
             lines.append(f"{name:18}not used: {row['reason']}")
             continue
@@ -478,27 +478,28 @@ _ANSWERS = {
 }
 
 
-def _answers(found: dict[str, Any]) -> list[str]:
+def _answers(report: dict[str, Any]) -> list[str]:
     """Return lines on the answers of robots."""
-    if "answers" not in found:  # figures of an older version
+    if "answers" not in report:  # figures of an older version
         return []
-    told = found["answers"]
+    shares = report["answers"]
     lines = [f"{'answers':18}{'share':>10}"]
-    lines += [f"{name:18}{decimal(told[key]):>10}" for key, name in _ANSWERS.items()]
+    lines += [f"{name:18}{decimal(shares[key]):>10}" for key, name in _ANSWERS.items()]
     lines[2] += (
-        f"   beyond 50 cm or 15 deg {decimal(told['grossly_wrong'])}, at most "
-        f"{decimal(told['grossly_wrong_at_most'])}; called strong "
-        f"{decimal(told['found_strong_wrong'])}; of what is found {decimal(told['wrong_of_found'])}"
+        f"   beyond 50 cm or 15 deg {decimal(shares['grossly_wrong'])}, at most "
+        f"{decimal(shares['grossly_wrong_at_most'])}; called strong "
+        f"{decimal(shares['found_strong_wrong'])}; share of the found answers "
+        f"{decimal(shares['wrong_of_found'])}"
     )
     lines.append(
-        f"confidence    calibration error {decimal(told['calibration_error'])}, of the likeliest "
-        "pose of each query"
+        f"confidence    calibration error {decimal(shares['calibration_error'])}, of the most "
+        "likely pose of each query"
     )
     return lines
 
 
-def _sentences(found: dict[str, Any]) -> list[str]:
-    v, d, a = found["validation"], found["diversity"], found["absent"]
+def _sentences(report: dict[str, Any]) -> list[str]:
+    v, d, a = report["validation"], report["diversity"], report["absent"]
     lines = [
         f"acceptance    precision {decimal(v['precision'])}, recall {decimal(v['recall'])}, where "
         f"overlap is 30 % {decimal(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
@@ -520,7 +521,7 @@ def _sentences(found: dict[str, Any]) -> list[str]:
             f"coverage      VR {c['VR']:.0f}, VDR {c['VDR']:.0f} voxels of 2 cm: x "
             f"{c['ratio_of_means']:.2f} (mean of ratios {c['mean_ratio']:.2f})"
         )
-    lines.append(_lost(found))
+    lines.append(_lost(report))
     if a["queries"]:
         lines.append(
             f"absent        {a['queries']} queries whose scene is not in the database: "
@@ -534,19 +535,19 @@ def _lost(figures: dict[str, Any]) -> str:
     return f"queries       {', '.join(counts)}"
 
 
-def _left_out(found: dict[str, Any]) -> str:
-    first = found["left_out"][0]
-    more = len(found["left_out"]) - 1
+def _left_out(report: dict[str, Any]) -> str:
+    first = report["left_out"][0]
+    more = len(report["left_out"]) - 1
     name = first["name"] if first["name"].isprintable() else ascii(first["name"])
     reason = first["reason"] if first["reason"].isprintable() else ascii(first["reason"])
     rest = f"; and {more} more (--json lists all)" if more else ""
     return f"left out      {name}: {reason}{rest}"
 
 
-def _times(found: dict[str, Any]) -> str:
+def _times(report: dict[str, Any]) -> str:
     times = [
         f"{stage.replace('_', ' ')} {ms:.1f}"
-        for stage, ms in found["milliseconds"].items()
+        for stage, ms in report["milliseconds"].items()
         if ms is not None
     ]
     return f"milliseconds  {', '.join(times)} (medians; validate: of one pair)"

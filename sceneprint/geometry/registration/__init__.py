@@ -1,1 +1,1 @@
-"""Register two frames: correspondences, hypotheses, refinement, overlap."""
+"""Registration of two frames: correspondences, hypotheses, refinement, overlap."""

@@ -118,7 +118,7 @@ _APART, _ALIKE, _UNDECIDED = 0, 1, 2
 @disjoint_kernel
 def _compare(
     p: Floats, n: Floats, q: Floats, m: Floats, i: int,
-    tolerance: float, angle: float, minimum: float, said: Bytes, cosines: Floats,
+    tolerance: float, angle: float, minimum: float, verdicts: Bytes, cosines: Floats,
 ) -> None:  # fmt: skip
     """Compare correspondence i with each later one; all arrays are (3, M), cosines (2, M).
 
@@ -137,8 +137,8 @@ def _compare(
     least, most = 1.0 - math.cos(angle) - 1e-9, angle + 1e-9
     pxi, pyi, pzi, nxi, nyi, nzi = p[0, i], p[1, i], p[2, i], n[0, i], n[1, i], n[2, i]
     qxi, qyi, qzi, mxi, myi, mzi = q[0, i], q[1, i], q[2, i], m[0, i], m[1, i], m[2, i]
-    says = said[later:]
-    for j in range(len(says)):
+    later_verdicts = verdicts[later:]
+    for j in range(len(later_verdicts)):
         ax, ay, az = px[j] - pxi, py[j] - pyi, pz[j] - pzi
         bx, by, bz = qx[j] - qxi, qy[j] - qyi, qz[j] - qzi
         da, db = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
@@ -164,7 +164,7 @@ def _compare(
         in_a[j], in_b[j] = ca, cb
         apart = abs(min(max(ca, -1.0), 1.0) - min(max(cb, -1.0), 1.0))
         angle_says = _ALIKE if apart < least else _UNDECIDED
-        says[j] = angle_says if alike & (apart <= most) else _APART
+        later_verdicts[j] = angle_says if alike & (apart <= most) else _APART
 
 
 @kernel
@@ -174,13 +174,13 @@ def _graph(
 ) -> None:  # fmt: skip
     """Set bit j of row i if correspondences i and j are compatible; all arrays are (3, M)."""
     count = p.shape[1]
-    said, cosines = np.empty(count, np.uint8), np.empty((2, count))
+    verdicts, cosines = np.empty(count, np.uint8), np.empty((2, count))
     for i in range(count):
-        _compare(p, n, q, m, i, tolerance, angle, minimum, said, cosines)
+        _compare(p, n, q, m, i, tolerance, angle, minimum, verdicts, cosines)
         for j in range(i + 1, count):
-            if said[j] == _APART:
+            if verdicts[j] == _APART:
                 continue
-            if said[j] == _ALIKE or _alike_angles(cosines[0, j], cosines[1, j], angle):
+            if verdicts[j] == _ALIKE or _alike_angles(cosines[0, j], cosines[1, j], angle):
                 bits[i, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
                 bits[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)
 
@@ -209,11 +209,11 @@ def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
 @disjoint_kernel
 def _select_weighted(weights: Floats, places: Ints32) -> int:
     """Write the indices of the positive weights; return their number."""
-    found = 0
+    count = 0
     for i in range(len(weights)):
-        places[found] = i
-        found += 1 if weights[i] > 0 else 0
-    return found
+        places[count] = i
+        count += 1 if weights[i] > 0 else 0
+    return count
 
 
 @kernel
@@ -282,16 +282,16 @@ def _weigh_inliers(
 @kernel
 def _largest(row: Ints32, order: Ints32) -> None:
     """Write the indices of the largest values of a row, in descending order; ties by index."""
-    found = 0
+    count = 0
     for j in range(len(row)):
-        if found == len(order) and row[j] <= row[order[found - 1]]:
+        if count == len(order) and row[j] <= row[order[count - 1]]:
             continue
-        place = found if found < len(order) else found - 1
+        place = count if count < len(order) else count - 1
         while place > 0 and row[order[place - 1]] < row[j]:
             order[place] = order[place - 1]
             place -= 1
         order[place] = j
-        found = min(found + 1, len(order))
+        count = min(count + 1, len(order))
 
 
 @kernel
@@ -355,11 +355,11 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
     common = np.zeros((len(pairs), len(pairs)), np.int32)
     _second_order(bits, common)
     T = np.zeros((p.n_seeds, 4, 4))
-    found = _hypotheses(
+    count = _hypotheses(
         a, n, b, m, common, p.n_seeds, p.n_support, p.normal_weight, p.rounds,
         p.inlier_distance, p.inlier_cosine, T,
     )  # fmt: skip
-    return T[:found]
+    return T[:count]
 
 
 def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
@@ -416,7 +416,7 @@ class AlignmentParameters:
     violation_weight: float = 3.0  #: weight of a violation in the score of a hypothesis
     rank_violations: float = 1.0  #: weight of violations in the rank of a refined hypothesis
     same_m: float = 0.1  #: maximum difference of equal hypotheses, metres
-    same_rad: float = math.radians(6.0)  #: the same, radians
+    same_rad: float = math.radians(6.0)  #: maximum difference of equal hypotheses, radians
     coarse: RefinementParameters = COARSE
     fine: RefinementParameters = FINE
     lever: float = 1.0  #: length that counts as one radian in `stiffness`, metres

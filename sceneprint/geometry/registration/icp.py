@@ -54,7 +54,7 @@ class RefinementParameters:
     stride: int  #: stride of the source's pixels
     iterations: int  #: number of Gauss-Newton steps
     first_gate: float  #: maximum distance of a point from the plane in the first step, metres
-    last_gate: float  #: the same in the last step, metres
+    last_gate: float  #: maximum distance from the plane in the last step, metres
     normal_cosine: float = 0.7  #: minimum cosine between corresponding normals
     reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / reference_depth)^growth)
     minimum_points: int = 20  #: minimum number of corresponding points
@@ -123,7 +123,7 @@ def _nearest_in_line(
         first = start + (middle - 1 if middle > 0 else width - 1)
         second = start + middle
         third = start + (middle + 1 if middle < width - 1 else 0)
-        least, found = nearest[i], best[i]
+        least, best_pixel = nearest[i], best[i]
         for place in (first, second, third):
             at = np.uint64(place) * np.uint64(3)
             a, b, c = points[at], points[at + np.uint64(1)], points[at + np.uint64(2)]
@@ -131,8 +131,8 @@ def _nearest_in_line(
             square = ex * ex + ey * ey + ez * ez
             nearer = (square < least) & ((c != 0) | (a != 0) | (b != 0))
             least = square if nearer else least
-            found = np.int32(place) if nearer else found
-        nearest[i], best[i] = least, found
+            best_pixel = np.int32(place) if nearer else best_pixel
+        nearest[i], best[i] = least, best_pixel
 
 
 @disjoint_kernel
@@ -146,7 +146,7 @@ def _nearest_on_rays(
     """
     across, down, cx, cy = 1.0 / camera[2], 1.0 / camera[3], camera[4], camera[5]
     for i in range(count):
-        least, found = 1e9, np.int32(-1)
+        least, best_pixel = 1e9, np.int32(-1)
         middle = line[i] * width + column[i]
         xn, yn = (column[i] - cx) * across, (line[i] - cy) * down
         for v in (-1, 0, 1):
@@ -158,8 +158,8 @@ def _nearest_on_rays(
                 square = ex * ex + ey * ey + ez * ez
                 nearer = (square < least) & (depth != 0)
                 least = square if nearer else least
-                found = np.int32(place) if nearer else found
-        nearest[i], best[i] = least, found
+                best_pixel = np.int32(place) if nearer else best_pixel
+        nearest[i], best[i] = least, best_pixel
 
 
 @disjoint_kernel
@@ -206,11 +206,11 @@ def _weigh_points(
 @disjoint_kernel
 def _select_compatible(weights: Floats, count: int, places: Ints32) -> int:
     """Write the indices of all non-negative weights; return their number."""
-    found = 0
+    n_compatible = 0
     for i in range(count):
-        places[found] = i
-        found += 1 if weights[i] >= 0 else 0
-    return found
+        places[n_compatible] = i
+        n_compatible += 1 if weights[i] >= 0 else 0
+    return n_compatible
 
 
 @disjoint_kernel

@@ -107,7 +107,7 @@ def nearest_alike(
     i0 = int(np.floor(at[0] / cube - 0.5))
     j0 = int(np.floor(at[1] / cube - 0.5))
     k0 = int(np.floor(at[2] / cube - 0.5))
-    found, least = -1, reach * reach
+    best, least = -1, reach * reach
     for i in range(i0, i0 + 2):
         for j in range(j0, j0 + 2):
             for k in range(k0, k0 + 2):
@@ -118,27 +118,27 @@ def nearest_alike(
                     )  # fmt: skip
                     square = ex * ex + ey * ey + ez * ez
                     # the lower index wins a tie, whatever the order in the slot
-                    if square < least or (square == least and found > n):
+                    if square < least or (square == least and best > n):
                         cosine = (
                             facing[0] * normals[0, n, 0]
                             + facing[1] * normals[0, n, 1]
                             + facing[2] * normals[0, n, 2]
                         )
                         if cosine > least_cosine:
-                            found, least = n, square
+                            best, least = n, square
                     n = chain[n]
-    return found, least
+    return best, least
 
 
 @kernel
 def _first_in_cubes(
-    points: Floats32, cube: np.float32, secret: int, table: Ints32, cells: Ints64, kept: Ints32
+    points: Floats32, cube: np.float32, secret: int, table: Ints32, cells: Ints64, firsts: Ints32
 ) -> int:
     """Write the indices of the points that are first in their cubes; return their number.
 
     `table` has slots of -1, in a number that is a power of two; `cells` (N, 3) are the cubes.
     """
-    mask, found = len(table) - 1, 0
+    mask, count = len(table) - 1, 0
     for n in range(len(points)):
         i, j, k = (
             int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
@@ -149,25 +149,25 @@ def _first_in_cubes(
         while True:
             other = table[slot]
             if other < 0:
-                table[slot] = found
-                cells[found, 0], cells[found, 1], cells[found, 2] = i, j, k
-                kept[found] = n
-                found += 1
+                table[slot] = count
+                cells[count, 0], cells[count, 1], cells[count, 2] = i, j, k
+                firsts[count] = n
+                count += 1
                 break
             if cells[other, 0] == i and cells[other, 1] == j and cells[other, 2] == k:
                 break
             slot = (slot + 1) & mask
-    return found
+    return count
 
 
 def first_per_cube(points: Floats32, cube: float) -> Ints32:
     """Return the ascending indices of the first point in each cube of width `cube`, metres."""
     n = len(points)
     table = np.full(1 << max((2 * n - 1).bit_length(), 1), -1, np.int32)
-    cells, kept = np.empty((n, 3), np.int64), np.empty(n, np.int32)
+    cells, firsts = np.empty((n, 3), np.int64), np.empty(n, np.int32)
     secret = secrets.randbits(62)
-    found = _first_in_cubes(points, np.float32(cube), secret, table, cells, kept)
-    return kept[:found].copy()
+    count = _first_in_cubes(points, np.float32(cube), secret, table, cells, firsts)
+    return firsts[:count].copy()
 
 
 @cached_per_frame
@@ -267,14 +267,14 @@ def _copy_valid(
 
     `rows` and `columns` are the first index and the step.
     """
-    found = 0
+    count = 0
     for y in range(rows[0], valid.shape[0], rows[1]):
         for x in range(columns[0], valid.shape[1], columns[1]):
             if valid[y, x]:
                 for k in range(3):
-                    out[found, k], out[found, 3 + k] = points[y, x, k], normals[y, x, k]
-                found += 1
-    return found
+                    out[count, k], out[count, 3 + k] = points[y, x, k], normals[y, x, k]
+                count += 1
+    return count
 
 
 @cached_per_frame
@@ -297,8 +297,8 @@ def sample_points(surface: Surface, stride: int) -> Floats32:
         rows, columns = (0, 1), (0, stride * stride)
     shape = surface.valid[rows[0] :: rows[1], columns[0] :: columns[1]].shape
     both = np.empty((shape[0] * shape[1], 6), np.float32)
-    found = _copy_valid(surface.points, surface.normals, surface.valid, rows, columns, both)
-    return both[:found].copy()
+    count = _copy_valid(surface.points, surface.normals, surface.valid, rows, columns, both)
+    return both[:count].copy()
 
 
 #: Verdicts of a target on a point: unobserved, on its surface, or in its free space.
@@ -310,7 +310,7 @@ _BEFORE = 3
 @disjoint_kernel
 def _compare(
     source: Floats32, start: int, places: Ints32, count: int, points: Floats32, normals: Floats32,
-    camera: Floats, moved: Floats, pixels: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+    camera: Floats, moved: Floats, pixels: Ints32, T: Floats, tolerances: Floats, verdicts: Bytes,
 ) -> None:  # fmt: skip
     """Write the verdict of each point's pixel; `_BEFORE` if the point lies before its surface.
 
@@ -342,8 +342,8 @@ def _compare(
         agrees = (plane < on_surface * grow) & (cosine > least_cosine)
         agrees = agrees & (dx * dx + dy * dy + dz * dz < gate * gate)
         before = (depth - seen < -margin * grow) & (plane > margin * grow)
-        says = AGREES if agrees else (_BEFORE if before else UNKNOWN)
-        said[i] = says if seen > 0 else UNKNOWN
+        verdict = AGREES if agrees else (_BEFORE if before else UNKNOWN)
+        verdicts[i] = verdict if seen > 0 else UNKNOWN
 
 
 @kernel
@@ -373,14 +373,14 @@ def _saw_through(
 @kernel
 def _look_up_seen(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats,
-    tolerances: Floats, said: Bytes,
+    tolerances: Floats, verdicts: Bytes,
 ) -> None:  # fmt: skip
     """Write the verdicts (N,) of a target with a camera on points (6, N) under T."""
     height, width = points.shape[0], points.shape[1]
     moved, seen, inside = np.empty((3, BLOCK)), np.empty((3, BLOCK)), np.empty((4, BLOCK))
     places, pixels = np.empty(BLOCK, np.int32), np.empty((2, BLOCK), np.int32)
     own = np.empty(BLOCK, np.uint8)
-    said[:] = UNKNOWN
+    verdicts[:] = UNKNOWN
     for start in range(0, source.shape[1], BLOCK):
         count = min(BLOCK, source.shape[1] - start)
         move_all(source, T, start, count, moved)
@@ -394,23 +394,23 @@ def _look_up_seen(
             own,
         )  # fmt: skip
         for i in range(count):
-            says = own[i]
-            if says == _BEFORE:
+            verdict = own[i]
+            if verdict == _BEFORE:
                 u, v = pixels[0, i], pixels[1, i]
                 through = _saw_through(points, camera, u, v, inside[3, i], tolerances)
-                says = VIOLATES if through else UNKNOWN
-            said[start + places[i]] = says
+                verdict = VIOLATES if through else UNKNOWN
+            verdicts[start + places[i]] = verdict
 
 
 @kernel
 def _look_up_near(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
-    chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+    chain: Ints32, T: Floats, tolerances: Floats, verdicts: Bytes,
 ) -> None:  # fmt: skip
     """Write the verdicts (N,) of a target with unordered points on points (N, 6) under T."""
     at, facing = np.empty(3), np.empty(3)
     for i in range(len(source)):
-        said[i] = UNKNOWN
+        verdicts[i] = UNKNOWN
         for a in range(3):
             at[a] = T[a, 3]
             facing[a] = 0.0
@@ -424,19 +424,19 @@ def _look_up_near(
         for a in range(3):
             plane += (at[a] - points[0, n, a]) * normals[0, n, a]
         if abs(plane) < tolerances[0]:
-            said[i] = AGREES
+            verdicts[i] = AGREES
 
 
 @kernel
 def _look_up(
     source: Floats32, transposed: Floats32, points: Floats32, normals: Floats32, camera: Floats,
-    heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats, said: Bytes,
+    heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats, verdicts: Bytes,
 ) -> None:  # fmt: skip
     """Write the verdicts (N,) of a target on points (N, 6), also transposed, under T."""
     if camera[0] == 2:
-        _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, said)
+        _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, verdicts)
     else:
-        _look_up_seen(transposed, points, normals, camera, T, tolerances, said)
+        _look_up_seen(transposed, points, normals, camera, T, tolerances, verdicts)
 
 
 @kernel
@@ -459,16 +459,16 @@ def _weigh_all(
     heads: Ints32, chain: Ints32, transforms: Floats, tolerances: Floats, out: Floats,
 ) -> None:  # fmt: skip
     """Write the weights of inliers and of violations (n, 2) under each of n transforms."""
-    transposed, said = transpose_points(source, 1), np.empty(len(source), np.uint8)
+    transposed, verdicts = transpose_points(source, 1), np.empty(len(source), np.uint8)
     for k in range(len(transforms)):
         _look_up(
             source, transposed, points, normals, camera, heads, chain, transforms[k], tolerances,
-            said,
+            verdicts,
         )  # fmt: skip
         inliers, violations = 0.0, 0.0
         for i in range(len(source)):
-            inliers += weights[i] if said[i] == AGREES else 0.0
-            violations += weights[i] if said[i] == VIOLATES else 0.0
+            inliers += weights[i] if verdicts[i] == AGREES else 0.0
+            violations += weights[i] if verdicts[i] == VIOLATES else 0.0
         out[k, 0], out[k, 1] = inliers, violations
 
 
@@ -522,10 +522,10 @@ def look_up(
     target : result of `overlap_target`
     tolerances : result of `tolerances`
     """
-    said = np.empty(len(source), np.uint8)
+    verdicts = np.empty(len(source), np.uint8)
     T = np.ascontiguousarray(T_target_source)
-    _look_up(source, np.ascontiguousarray(source.T), *target, T, tolerances, said)
-    return said
+    _look_up(source, np.ascontiguousarray(source.T), *target, T, tolerances, verdicts)
+    return verdicts
 
 
 @kernel
@@ -534,13 +534,13 @@ def count_verdicts(
     chain: Ints32, T: Floats, tolerances: Floats, agree: Ints32, violate: Ints32,
 ) -> int:  # fmt: skip
     """Count the verdicts of one more target on points (N, 6); return how many points agree."""
-    said, agreeing = np.empty(len(source), np.uint8), 0
+    verdicts, agreeing = np.empty(len(source), np.uint8), 0
     transposed = transpose_points(source, 1)
-    _look_up(source, transposed, points, normals, camera, heads, chain, T, tolerances, said)
+    _look_up(source, transposed, points, normals, camera, heads, chain, T, tolerances, verdicts)
     for i in range(len(source)):
-        agree[i] += said[i] == AGREES
-        violate[i] += said[i] == VIOLATES
-        agreeing += said[i] == AGREES
+        agree[i] += verdicts[i] == AGREES
+        violate[i] += verdicts[i] == VIOLATES
+        agreeing += verdicts[i] == AGREES
     return agreeing
 
 

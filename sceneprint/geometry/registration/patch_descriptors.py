@@ -217,11 +217,11 @@ def _accumulate(
 @disjoint_kernel
 def _occupied_bins(row: Floats32, first: int, last: int, places: Ints32) -> int:
     """Write the indices of the occupied bins; return their number."""
-    found = 0
+    count = 0
     for k in range(first, last):
-        places[found] = k
-        found += 1 if row[k] > 0 else 0
-    return found
+        places[count] = k
+        count += 1 if row[k] > 0 else 0
+    return count
 
 
 @kernel
@@ -235,12 +235,12 @@ def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
         start, row = 0, out[i]
         for s in range(len(scales)):
             end = start + int(scales[s, 1]) * int(scales[s, 2]) * angles * angles
-            found, total = _occupied_bins(row, start, end, places), 0.0
-            for n in range(found):
+            count, total = _occupied_bins(row, start, end, places), 0.0
+            for n in range(count):
                 total += row[places[n]]
-            if found > 0:  # the squared length of the roots is the sum
+            if count > 0:  # the squared length of the roots is the sum
                 factor = 1.0 / np.sqrt(total * len(scales))
-                for n in range(found):
+                for n in range(count):
                     k = places[n]
                     row[k] = np.sqrt(row[k]) * factor
             start = end
@@ -434,8 +434,8 @@ def correspondences(
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)
     if gate is None:
         gate = SlopeGate(np.zeros(len(source)), np.zeros(len(target)), math.inf)
-    found = _nearest(
+    count = _nearest(
         source, target, drawn.astype(np.int32), n_nearest, gate.source, gate.target, gate.most,
         pairs,
     )  # fmt: skip
-    return pairs[:found]
+    return pairs[:count]

@@ -253,7 +253,7 @@ def _nearest(
     most = source.shape[1]
     costs, rows = np.empty((most, most)), np.empty((3, most + 1))
     best, at = np.empty(n_nearest), np.empty(n_nearest, np.int32)
-    found = 0
+    count = 0
     for row in range(len(drawn)):
         i = drawn[row]
         best[:] = 1.0  # sequences that have nothing in common do not correspond
@@ -271,9 +271,9 @@ def _nearest(
                 best[k], at[k] = cost, j
         for k in range(n_nearest):
             if at[k] >= 0:
-                pairs[found, 0], pairs[found, 1] = i, at[k]
-                found += 1
-    return found
+                pairs[count, 0], pairs[count, 1] = i, at[k]
+                count += 1
+    return count
 
 
 def sequence_correspondences(
@@ -295,9 +295,9 @@ def sequence_correspondences(
     of_target = neighbour_sequences(target, coarse_patches(target, p), p)
     n_nearest = min(p.n_nearest, len(target))
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)
-    found = _nearest(
+    count = _nearest(
         of_source.symbols, of_source.lengths, of_target.symbols, of_target.lengths,
         drawn.astype(np.int32), n_nearest, p.length_scale, p.angle_scale, p.gap_cost, p.swap_cost,
         pairs,
     )  # fmt: skip
-    return pairs[:found]
+    return pairs[:count]

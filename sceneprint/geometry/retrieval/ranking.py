@@ -142,7 +142,8 @@ def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None
             raise ValueError(f"rows are {rows.dtype} {rows.shape}. Pass integer indices (r,).")
         if len(rows) and not 0 <= rows.min() <= rows.max() < len(database):
             raise ValueError(
-                f"There are no rows {rows.min()} to {rows.max()}: the database has {len(database)}."
+                f"Rows {rows.min()} to {rows.max()} do not all exist: the database has "
+                f"{len(database)} rows."
             )
     result: Ints64 = _distances(query[None], database, metric, rows)[0]
     return result

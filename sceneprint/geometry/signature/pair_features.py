@@ -357,28 +357,28 @@ def _select_leading(
             for g in range(n_components):
                 difference = x - mu[g]
                 logits[g] -= half * precision[g] * difference * difference
-        found = 0
+        count = 0
         for g in range(n_components):
             value = logits[g]
-            if found == n_leading and value <= logits[components[i, found - 1]]:
+            if count == n_leading and value <= logits[components[i, count - 1]]:
                 continue
-            at = found if found < n_leading else n_leading - 1
+            at = count if count < n_leading else n_leading - 1
             while at > 0 and logits[components[i, at - 1]] < value:
                 components[i, at] = components[i, at - 1]
                 at -= 1
             components[i, at] = g
-            found = min(found + 1, n_leading)
+            count = min(count + 1, n_leading)
         highest, total = logits[components[i, 0]], np.float32(0.0)
-        for k in range(found):
+        for k in range(count):
             posteriors[i, k] = np.exp(logits[components[i, k]] - highest)
             total += posteriors[i, k]
         kept = np.float32(0.0)
-        for k in range(found):
+        for k in range(count):
             posteriors[i, k] /= total
             if posteriors[i, k] < np.float32(LEAST_POSTERIOR):
                 posteriors[i, k] = np.float32(0.0)
             kept += posteriors[i, k]
-        for k in range(found):
+        for k in range(count):
             posteriors[i, k] /= kept
 
 
@@ -435,8 +435,8 @@ def _bin(value: float, edges: Floats, hints: Ints32, origin: float, per_unit: fl
     """Return the index of the first edge above a value; cells of `hints` are narrower than bins."""
     cell = min(max((value - origin) * per_unit, 0.0), len(hints) - 1.0)
     b = hints[np.uint64(np.int32(cell))]
-    found: int = b + 1 if value >= edges[np.uint64(b)] else b
-    return found
+    index: int = b + 1 if value >= edges[np.uint64(b)] else b
+    return index
 
 
 @disjoint_kernel
@@ -469,18 +469,18 @@ def _add(
     there: Ints32, back: Ints32, i: int, weights: Floats32, counts: Floats32, total: float
 ) -> tuple[int, float]:
     """Add the weights of pairs to their bins; return the number of pairs, and the new `total`."""
-    found, own = 0, weights[i]
+    count, own = 0, weights[i]
     for j in range(i + 1, len(there)):
         weight = own * weights[j]
         if there[j] >= 0:
             counts[np.uint64(there[j])] += weight
             total += weight
-            found += 1
+            count += 1
         if back[j] >= 0:
             counts[np.uint64(back[j])] += weight
             total += weight
-            found += 1
-    return found, total
+            count += 1
+    return count, total
 
 
 @kernel
@@ -500,8 +500,8 @@ def _count(
             d, i_u, j_u, turn, i, radius, colinearity, distance, angle, dihedral,
             hints[0], hints[1], hints[2], n_angles, n_dihedrals, there, back,
         )  # fmt: skip
-        found, total = _add(there, back, i, weights, counts, total)
-        n_pairs += found
+        count, total = _add(there, back, i, weights, counts, total)
+        n_pairs += count
     return n_pairs, total
 
 

@@ -1,1 +1,1 @@
-"""Convert depth images and clouds to oriented surfaces."""
+"""Conversion of depth images and clouds to oriented surfaces."""

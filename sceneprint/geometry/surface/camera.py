@@ -109,12 +109,12 @@ def select_inside(
     """Write the indices of the points with column in [left, right) and line in [top, bottom) to
     `places`; return their number.
     """
-    column, line, found = projected[0], projected[1], 0
+    column, line, n_inside = projected[0], projected[1], 0
     for i in range(count):
         inside = (column[i] >= left) & (line[i] >= top) & (column[i] < right) & (line[i] < bottom)
-        places[found] = i
-        found += 1 if inside else 0
-    return found
+        places[n_inside] = i
+        n_inside += 1 if inside else 0
+    return n_inside
 
 
 @disjoint_kernel

@@ -40,7 +40,7 @@ class CloudParameters:
     seed_px: float = 5.2  #: distance between patches, voxels
     validation_seed_px: float = 8.2  #: distance between patches for validation, voxels
     maximum_patches: int = 1200  #: patches grow until at most this many exist
-    maximum_validation_patches: int = 600  #: the same for validation
+    maximum_validation_patches: int = 600  #: maximum number of patches for validation
     maximum_pixels: int = 160 * 120 * 4  #: voxels and pixels grow until at most this many exist
     same_surface: float = 0.03  #: points of a pixel within this share of the range are averaged
     radius_px: int = 3  #: radius of the neighbourhood of a normal, voxels
@@ -160,7 +160,7 @@ def principal_axes(points: Floats32) -> Floats:
 _STEPS = 2.0**38
 #: Maximum number of cells per half axis without a viewpoint: three coordinates must fit one key.
 _REACH = 1 << 20
-#: Number of cells at which they are enlarged, as a multiple of their maximum number.
+#: Number of cells above which cells are enlarged, as a multiple of the maximum number.
 _ROOM = 4
 
 Ints64 = NDArray[np.int64]

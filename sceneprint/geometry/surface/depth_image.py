@@ -29,7 +29,7 @@ class DepthParameters:
     maximum_depth: float = 9.0  #: farther samples count as missing, metres
     same_surface: float = 0.03  #: samples within this share of the nearest depth are averaged
     focal_length_px: float = 146.0  #: the image is halved until f is nearest to this value
-    maximum_pixels: int = 160 * 120 * 4  #: and until it has at most this many pixels
+    maximum_pixels: int = 160 * 120 * 4  #: maximum number of pixels after the halvings
     minimum_valid: int = 64  #: minimum number of valid pixels of a usable frame
     minimum_side: int = 8  #: minimum number of rows and columns of a usable image
 

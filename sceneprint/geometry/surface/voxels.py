@@ -256,7 +256,7 @@ def _link(
     span = 2 * _REACH
     for c in range(n_cells):
         key = cells[order[starts[c]]]
-        found = 0
+        count = 0
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 for dz in range(-1, 2):
@@ -264,15 +264,15 @@ def _link(
                     at = hash_key(wanted, secret) & mask
                     while table[at] >= 0:
                         if cells[order[starts[table[at]]]] == wanted:
-                            around[found] = table[at]
-                            found += 1
+                            around[count] = table[at]
+                            count += 1
                             break
                         at = (at + 1) & mask
         for k in range(starts[c], starts[c + 1]):
             i = order[k]
             x, y, z, h = places[i, 0], places[i, 1], places[i, 2], heights[i]
             begins[i] = total
-            for f in range(found):
+            for f in range(count):
                 a, b = starts[around[f]], starts[around[f] + 1]
                 if total + b - a > len(indices):
                     longer = np.empty(2 * len(indices) + b - a, np.int32)

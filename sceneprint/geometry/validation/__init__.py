@@ -1,1 +1,1 @@
-"""Decide whether a transform is right: acceptance, ambiguity, validation in the map."""
+"""Decision whether a transform is right: acceptance, ambiguity, verification in the map."""

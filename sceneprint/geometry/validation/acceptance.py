@@ -48,7 +48,7 @@ class AcceptanceParameters:
     """
 
     residual_m: float = 0.08  #: maximum residual of the composed directions: epsilon_val, metres
-    residual_rad: float = math.radians(5.0)  #: the same, radians
+    residual_rad: float = math.radians(5.0)  #: maximum residual of both directions, radians
     violation_weight: float = 5.0  #: evidence = overlap - violation_weight * violations
     evidence: float = 0.2  #: minimum evidence
     plane_overlap: float = 0.15  #: minimum plane overlap
@@ -61,7 +61,7 @@ class AcceptanceParameters:
     strong: float = 0.3  #: evidence below which an accepted match is weak
     weak: float = 0.05  #: ambiguity from which an accepted match is weak
     ambiguous: float = 0.14  #: ambiguity from which no match is accepted
-    ambiguous_share: float = 0.5  #: the same as a share of `plane_overlap`
+    ambiguous_share: float = 0.5  #: maximum ambiguity as a share of `plane_overlap`
     stiffness: float = 1e-5  #: minimum ratio of the eigenvalues of the information
     blind_evidence: float = 0.4  #: minimum evidence
     blind_plane_overlap: float = 0.3  #: minimum plane overlap
@@ -69,12 +69,12 @@ class AcceptanceParameters:
     sparse_evidence: float = 0.1  #: minimum evidence
     sparse_plane_overlap: float = 0.1  #: minimum plane overlap
     sparse_planes: float = 5.0  #: minimum number of distinct planes
-    alone_planes: float = 6.0  #: the same if only one search found the transform
+    alone_planes: float = 6.0  #: `sparse_planes` if only one search found the transform
     sparse_plane_violations: float = 0.06  #: maximum `plane_violations`
     sparse_worst_violations: float = 0.03  #: maximum `worst_violations`
     sparse_deviation_m: float = 0.045  #: maximum deviation of the translation, metres
     apart_m: float = 0.2  #: maximum residual of the two refinements, metres
-    apart_rad: float = math.radians(4.0)  #: the same, radians
+    apart_rad: float = math.radians(4.0)  #: maximum residual of the two refinements, radians
     apart_planes: float = 12.0  #: minimum number of distinct planes
     apart_plane_overlap: float = 0.2  #: minimum plane overlap
 
@@ -246,7 +246,7 @@ class AmbiguityParameters:
     then: RefinementParameters = COARSE  #: refinement of the remaining rivals
     refuted: float = 0.02  #: violations that refute a rival if the transform has fewer
     rival_m: float = 0.25  #: minimum difference of a rival from the transform, metres
-    rival_rad: float = math.radians(15.0)  #: the same, radians; one of the two is enough
+    rival_rad: float = math.radians(15.0)  #: alternative minimum rotation of a rival, radians
 
 
 @cached_per_frame

@@ -42,7 +42,7 @@ class MapParameters:
     n_views: int = 10  #: maximum number of views that score a pose
     look_ahead: float = 1.5  #: distance from a camera to the centre of its view, metres
     reach: float = 3.5  #: maximum distance of the centres of overlapping views, metres
-    around_reach: float = 4.0  #: the same if a sensor may look in any direction, metres
+    around_reach: float = 4.0  #: `reach` if a sensor may look in any direction, metres
     same_surfaces: float = 8.0  #: maximum distance between sensors with common surfaces, metres
     near: float = 2.0  #: radius of the first search for frames of the map, metres
     cell: float = 1.0  #: maximum distance between poses that share a search, metres
@@ -57,9 +57,9 @@ class MapParameters:
     n_noise: int = 4  #: number of map frames whose violations measure the noise
     least_noise: float = 0.02  #: violations of a pose above which noise is measured
     same_m: float = 0.1  #: maximum difference of equal poses, metres
-    same_rad: float = math.radians(6.0)  #: the same, radians
+    same_rad: float = math.radians(6.0)  #: maximum difference of equal poses, radians
     place_m: float = 0.25  #: maximum difference of poses at one place, metres
-    place_rad: float = math.radians(15.0)  #: the same, radians
+    place_rad: float = math.radians(15.0)  #: maximum difference of poses at one place, radians
     refinement: RefinementParameters = COARSE
     planes: PlaneParameters = field(default_factory=PlaneParameters)
 

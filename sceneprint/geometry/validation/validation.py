@@ -95,7 +95,7 @@ class ValidationParameters:
     minimum_patches: int = 10  #: minimum number of patches of either frame
     n_hypotheses: int = 4  #: number of further hypotheses per direction, for verification in a map
     guided_m: float = 0.15  #: maximum distance of a guided transform from its prediction, metres
-    guided_rad: float = math.radians(6.0)  #: the same, radians
+    guided_rad: float = math.radians(6.0)  #: maximum angle from its prediction, radians
     acceptance: AcceptanceParameters = field(default_factory=AcceptanceParameters)
     rivals: AmbiguityParameters = field(default_factory=AmbiguityParameters)
     alignment: AlignmentParameters = field(default_factory=AlignmentParameters)

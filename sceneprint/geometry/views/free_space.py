@@ -135,7 +135,7 @@ def _sum_neighbours(values: Floats) -> Floats:
 def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing: float) -> Floats:
     """Return places at the heights of the sensor above the floors, (C, 3) in level axes.
 
-    In a cloud, a place requires a floor below it. In a mesh, places beside an observed floor are
+    In a cloud, a place requires a floor below it. In a mesh, places over an unobserved floor are
     included too, since the front of a mesh shows free space. If there is no floor, places are
     distributed over all heights.
 

@@ -66,7 +66,7 @@ def _see(
     """Write the elements that are visible on a face of the cube, and their views; return their
     number.
     """
-    found = 0
+    count = 0
     half = size / 2.0
     for block in range(len(starts)):
         for i in range(starts[block], ends[block]):
@@ -102,10 +102,10 @@ def _see(
             side = int((np.arctan2(-y, -x) + np.pi) / (2.0 * np.pi) * SIDES) % SIDES
             octave = int(np.floor(np.log2(reach / max(distance, 1e-9))))
             octave = min(max(octave, 0), OCTAVES - 1)
-            elements[found] = (i * SIDES + side) * OCTAVES + octave
-            masks[found] = mask
-            found += 1
-    return found
+            elements[count] = (i * SIDES + side) * OCTAVES + octave
+            masks[count] = mask
+            count += 1
+    return count
 
 
 @kernel
