@@ -64,9 +64,13 @@ _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
 _PATIENCE = 8
 #: Maximum size of the shared memory that is erased after a task, bytes. Larger memory is freed.
 _ERASED_BYTES = 8 << 20
-#: Variables of glibc that set the maximum size of freed memory that a process keeps. Otherwise half
-#: of a decoder's time is spent on pages that it frees after each image and allocates for the next.
-_MALLOC = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
+#: Settings of glibc. A process keeps freed memory up to a maximum size: otherwise half of a decoder's
+#: time is spent on pages that it frees after each image and allocates for the next. It overwrites
+#: that memory, since the next image may be of another tenant.
+_MALLOC = {
+    "MALLOC_TRIM_THRESHOLD_": f"{_ERASED_BYTES}", "MALLOC_MMAP_THRESHOLD_": f"{_ERASED_BYTES}",
+    "MALLOC_PERTURB_": "85",
+}  # fmt: skip
 #: Environment variables that a decoder needs to find its code. Others may contain secrets.
 _ENVIRONMENT = (
     "PATH", "LANG", "LC_ALL", "HOME", "USER", "TMPDIR", "XDG_CACHE_HOME", "PYTHONPATH",
@@ -117,7 +121,7 @@ class DecoderProcess:
                  *more],
                 env={name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
                 | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-                | dict.fromkeys(_MALLOC, str(_ERASED_BYTES)),
+                | _MALLOC,
                 pass_fds=(*arguments[:2], *files), stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip

@@ -58,6 +58,16 @@ def _hoard(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]
     return {"sum": float(np.ones(request["numbers"]).sum())}, None
 
 
+def _leave(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    """Free an array of one value."""
+    return {"sum": int(np.full(request["numbers"], 77, np.uint8).sum())}, None
+
+
+def _look(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+    """Count the bytes of that value in new memory of the same size."""
+    return {"seen": int((np.empty(request["numbers"], np.uint8) == 77).sum())}, None
+
+
 def _fail(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
     raise ZeroDivisionError("a bug of ours")
 
@@ -65,5 +75,5 @@ def _fail(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]
 if __name__ == "__main__":
     serve(TASKS | {
         "escape": _escape, "crash": _crash, "hang": _hang, "sleep": _sleep, "hoard": _hoard,
-        "fail": _fail,
+        "fail": _fail, "leave": _leave, "look": _look,
     })  # fmt: skip

@@ -132,6 +132,12 @@ def test_nothing_of_an_upload_stays_in_the_shared_memory(pool: DecoderPool) -> N
         assert not np.frombuffer(slot.process._shared, np.uint8, 1 << 20).any()
 
 
+def test_freed_memory_holds_nothing_of_an_upload(pool: DecoderPool) -> None:
+    size = 1 << 20  # which the process keeps
+    assert do(pool, "leave", numbers=size)["sum"] == 77 * size
+    assert do(pool, "look", numbers=size)["seen"] < 1000
+
+
 def test_a_bug_is_not_an_error_of_the_upload(pool: DecoderPool) -> None:
     with pytest.raises(RuntimeError, match="ZeroDivisionError: a bug of ours"):
         do(pool, "fail")
