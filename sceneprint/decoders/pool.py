@@ -64,9 +64,9 @@ _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
 _PATIENCE = 8
 #: Maximum size of the shared memory that is erased after a task, bytes. Larger memory is freed.
 _ERASED_BYTES = 8 << 20
-#: Settings of glibc. A process keeps freed memory up to a maximum size: otherwise half of a decoder's
-#: time is spent on pages that it frees after each image and allocates for the next. It overwrites
-#: that memory, since the next image may be of another tenant.
+#: Settings of glibc. A process keeps freed memory up to a maximum size: otherwise half of a
+#: decoder's time is spent on pages that it frees after each image and allocates for the next. It
+#: overwrites that memory, since the next image may be of another tenant.
 _MALLOC = {
     "MALLOC_TRIM_THRESHOLD_": f"{_ERASED_BYTES}", "MALLOC_MMAP_THRESHOLD_": f"{_ERASED_BYTES}",
     "MALLOC_PERTURB_": "85",
