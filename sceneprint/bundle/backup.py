@@ -123,7 +123,7 @@ def take_backup(
     with _open(settings.database) as database, inspect_blobs(settings.blobs, database) as blobs:
         target = BundlePlace.open(place, create=True)
         target.claim(OpaqueIds(database).owner)
-        with target.turn(), blobs.kept():  # referenced blobs must remain
+        with target.turn(), blobs.block_removals():  # referenced blobs must remain
             backup = _Backup(target, progress or (lambda _done, _total: None))
             bundle = backup.write(database, blobs)
             if keep is not None:

@@ -379,7 +379,7 @@ def restore_to_server(
                 connection.exec_driver_sql("DELETE FROM secrets")
                 write_rows(connection, secrets, iter(names))
             blobs = open_blobs(settings.blobs, database, make=True)
-            with closing(blobs), blobs.kept():
+            with closing(blobs), blobs.block_removals():
                 lost = reading.blobs(blobs)
                 with database.write() as connection:
                     reading.rows(connection, keep_keys=keep_keys)

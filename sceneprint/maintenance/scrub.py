@@ -27,7 +27,7 @@ from sceneprint.store.scrub_rows import (
     SLICE_S,
     ScrubRow,
     claim_slice,
-    frames_behind,
+    next_frames,
     read_scrub,
     record_slice,
 )
@@ -89,7 +89,7 @@ class Scrub:
         damaged, finished, over = 0, False, False
         while not over:  # each slice checks at least one block, so every pass ends
             with self._store.database.read() as connection:
-                numbers = frames_behind(connection, row.position, AT_ONCE)
+                numbers = next_frames(connection, row.position, AT_ONCE)
             if not numbers:
                 finished = True
                 break

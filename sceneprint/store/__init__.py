@@ -1,8 +1,8 @@
-"""The store: one database with maps, frames, signatures and jobs, and the blobs it refers to.
+"""The store: a database of maps, frames, signatures and jobs, and the blobs that it refers to.
 
-Everything else on disk is a cache. Functions take the connection of a transaction, so that related
-changes are committed together. `Store` opens both parts, and caches geometry artifacts: the ten to
-twenty frames that a robot's query is aligned with are mostly those of its previous query.
+All other data on disk is a cache. Functions take the connection of a transaction, so that related
+changes are committed together. `Store` combines both parts and a cache of geometry artifacts: a
+robot's query is mostly aligned with the same ten to twenty frames as its previous query.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-#: Ratio of a frame's memory to that of its arrays: cached samples, plane weights and symmetries
-#: take up to another 0.2.
+#: Ratio of a frame's memory to that of its arrays. Cached samples, plane weights and symmetries add
+#: up to 0.2.
 _OVERHEAD = 1.25
 
 
@@ -60,7 +60,7 @@ class _Entry:
 
 
 class GeometryCache:
-    """Cache geometry artifacts in memory, bounded in bytes; safe to share between threads.
+    """Cache of geometry artifacts in memory, which threads may share.
 
     The least recently used entries are removed first. Keys are hashes of the content, so entries
     are never stale.
@@ -68,7 +68,7 @@ class GeometryCache:
     Parameters
     ----------
     blobs : source of the artifacts
-    most_bytes : maximum size of all entries together; 0 disables the cache
+    most_bytes : maximum total size of the entries; 0 disables the cache
     """
 
     def __init__(self, blobs: Blobs, most_bytes: int) -> None:
@@ -78,12 +78,12 @@ class GeometryCache:
         self._bytes = 0
 
     def read(self, digest: str) -> Geometry:
-        """Return the artifact of a digest; callers must not change it.
+        """Return the artifact with a digest. Callers must not change it.
 
         Raises
         ------
-        DamagedBlob : the blob is missing or damaged.
-        UnreadableGeometry : the blob is not an artifact of this version.
+        DamagedBlob : If the blob is missing or damaged.
+        UnreadableGeometry : If the blob is not an artifact of this version.
         """
         with self._lock:
             entry = self._entries.get(digest)
@@ -107,7 +107,7 @@ class GeometryCache:
                 self._remove(digest)
 
     def forget_older(self, seconds: float) -> None:
-        """Remove entries older than `seconds`, as another process may have deleted their frames."""
+        """Remove entries older than `seconds`: another process may have deleted their frames."""
         until = time.monotonic() - seconds
         with self._lock:
             for digest in [d for d, entry in self._entries.items() if entry.read_at <= until]:
@@ -115,7 +115,7 @@ class GeometryCache:
 
     @property
     def bytes_held(self) -> int:
-        """Estimated memory of all entries."""
+        """Estimated memory of all entries, bytes."""
         return self._bytes
 
     def _remove(self, digest: str) -> None:
@@ -132,11 +132,11 @@ def _array_bytes(geometry: Geometry) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Store:
-    """An open database with its blobs.
+    """Open database with its blobs.
 
     Parameters
     ----------
-    geometry_bytes : maximum size of the cache of geometry artifacts
+    geometry_bytes : maximum size of the cache of geometry artifacts, bytes
     decoders : decoders of uploads
     """
 
@@ -147,17 +147,17 @@ class Store:
 
     @property
     def read_only(self) -> bool:
-        """Whether the store was opened read-only, or its disk was remounted read-only since."""
+        """Whether the store was opened read-only, or its disk was later remounted read-only."""
         return self.database.read_only or self.database.turned_read_only or self.blobs.read_only
 
     @cached_property
     def geometries(self) -> GeometryCache:
-        """The cache of geometry artifacts."""
+        """Cache of geometry artifacts."""
         return GeometryCache(self.blobs, self.geometry_bytes)
 
     @cached_property
     def seals(self) -> OpaqueIds:
-        """The cipher of the row numbers that leave the service."""
+        """Cipher for row numbers that clients see."""
         return OpaqueIds(self.database)
 
     def close(self) -> None:
@@ -170,10 +170,10 @@ class Store:
 def open_store(
     url: str, blobs: Path | str, geometry_bytes: int = 0, decoders: Decoders | None = None
 ) -> Store:
-    """Open a store; create database and blobs if both are missing.
+    """Open a store, and create the database and the blobs if both are missing.
 
-    The folder of an existing database is never created: its disk may not be mounted yet, and would
-    later hide what was written in its place.
+    The blob folder of an existing database is never created: its disk may not be mounted yet, and
+    would later hide data that was written to the new folder.
 
     Parameters
     ----------
@@ -182,12 +182,12 @@ def open_store(
 
     Raises
     ------
-    UnusableStore, NewerSchema : see `open_database` and `open_blobs`.
+    UnusableStore, NewerSchema : If `open_database` or `open_blobs` raises the error.
     """
     new = not is_read_only(url) and not database_exists(url)
     if isinstance(blobs, Path):
         FolderBlobs(blobs, make=new)
-    if new:  # the database may lie in another folder than the blobs
+    if new:  # the database and the blobs may be in different folders
         _make_folder_of(url)
     database = open_database(url)
     try:
@@ -204,8 +204,8 @@ def open_blobs(
 ) -> Blobs:
     """Open the blobs of a database.
 
-    If the object store is unreachable, the blobs are opened anyway, and requests fail until the
-    store is back.
+    If the object store is unreachable, this succeeds, and requests fail until the store is
+    reachable again.
 
     Parameters
     ----------
@@ -216,12 +216,12 @@ def open_blobs(
 
     Raises
     ------
-    UnusableStore : the blobs cannot be opened, or belong to another database.
+    UnusableStore : If the blobs cannot be opened, or belong to another database.
     """
     may_mark = claim and not database.read_only
     if isinstance(blobs, Path):
         folder = FolderBlobs(blobs, make=make)
-        # several databases of a server may name one folder by mistake
+        # two databases of a server may be configured with the same folder by mistake
         if not database.is_sqlite and blobs.is_dir():
             may_mark &= os.access(blobs, os.W_OK)  # readers may mount it read-only
             BucketOwner.of_folder(blobs).claim(OpaqueIds(database).owner, anew=may_mark)
@@ -232,7 +232,8 @@ def open_blobs(
         locks = FileLocks(database.file.with_name(f"{database.file.name}-blobs"), make=True)
     elif database.is_sqlite:
         raise UnusableStore(
-            "Blobs in an object store need a permanent database: name a file, or a server."
+            "Blobs in an object store require a permanent database. Set SCENEPRINT_DATABASE_URL to "
+            "a file or a server."
         )
     else:
         locks = SessionLocks(database)
@@ -245,9 +246,7 @@ def open_blobs(
 
 
 def _make_folder_of(url: str) -> None:
-    """Create the folder of a new SQLite file; opening the database reports what is wrong with other
-    URLs.
-    """
+    """Create the folder of a new SQLite file. Opening the database reports errors of other URLs."""
     with suppress(ArgumentError, ValueError):
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite" and parsed.database:

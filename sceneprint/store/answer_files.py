@@ -1,7 +1,7 @@
-"""Files of stored answers under their query ids: a folder, or objects of a fleet.
+"""Files of stored answers by query id: in a folder, or in an object store of a fleet.
 
-The database says which files are needed (`query_rows`). They are not synced to disk: a lost answer
-cannot be viewed, but no data is lost.
+The database determines which files are needed (`query_rows`). Files are not synced to disk, since
+the loss of an answer loses no data.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sceneprint.store.blobs.object_store import ObjectBlobs
 
 
 class AnswerFiles(ABC):
-    """Stored answers by query id; several processes share them.
+    """Stored answers by query id, which several processes share.
 
     Methods raise OSError or UnusableStore if the folder or the object store cannot be used.
     """
@@ -34,7 +34,7 @@ class AnswerFiles(ABC):
 
     @abstractmethod
     def delete(self, query_ids: Sequence[str]) -> None:
-        """Remove answers; ignore missing ones."""
+        """Remove answers, and ignore missing answers."""
 
     @abstractmethod
     def list(self) -> Iterator[tuple[str, float]]:
@@ -42,7 +42,7 @@ class AnswerFiles(ABC):
 
 
 class AnswerFolder(AnswerFiles):
-    """Answers in a folder, which the first answer creates."""
+    """Answers in a folder, which is created with the first answer."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -65,12 +65,12 @@ class AnswerFolder(AnswerFiles):
         """See AnswerFiles; unfinished files of killed processes are included."""
         with suppress(FileNotFoundError), os.scandir(self._folder) as entries:
             for entry in entries:
-                with suppress(FileNotFoundError):  # another process has removed it
+                with suppress(FileNotFoundError):  # another process has removed the file
                     yield entry.name, entry.stat(follow_symlinks=False).st_mtime
 
 
 class AnswerObjects(AnswerFiles):
-    """Answers in an object store, under `queries/` of its prefix."""
+    """Answers in an object store, below `queries/` of its prefix."""
 
     def __init__(self, objects: Objects) -> None:
         self._objects = objects
@@ -94,12 +94,11 @@ class AnswerObjects(AnswerFiles):
 
 
 def open_answers(blobs: Blobs, folder: Path) -> AnswerFiles:
-    """Return the answer files beside the blobs, so that all processes that share the blobs find
-    them.
+    """Return the answer files at the location of the blobs, which all processes share.
 
     Parameters
     ----------
     blobs : blobs of the store
-    folder : folder for the answers, if the blobs are in a folder as well
+    folder : folder for the answers, if the blobs are in a folder too
     """
     return AnswerObjects(blobs.objects) if isinstance(blobs, ObjectBlobs) else AnswerFolder(folder)

@@ -1,10 +1,10 @@
-"""The audit log: which actor changed what. Each line is written in the transaction of its change.
+"""Audit log: changes and their actors. Each line is written in the transaction of its change.
 
     record_event (see `events`)  -->  a line for the change that the event reports
     record_change                -->  a line for a change without an event
     record_refusal               -->  a line for a refused request
 
-Lines are never edited. Old lines are removed, and the oldest of a tenant that has too many.
+Lines are never edited. Old lines are removed, and the oldest lines of tenants with too many.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from sceneprint.process import NOBODY, Actor
 from sceneprint.store.tables import among, audit, audit_values, tenants
 
 #: Maximum number of lines per tenant, approximately 200 bytes each.
-KEPT_LINES = 1_000_000
+MAXIMUM_LINES = 1_000_000
 #: Action of the line of a refused request.
 REFUSED = "refused"
 
 
 @dataclass(frozen=True)
 class AuditRow:
-    """A line of the audit log; fields as in the table."""
+    """Line of the audit log; see the table for the fields."""
 
     number: int
     at: float
@@ -85,7 +85,7 @@ def record_refusal(
     connection: Connection, actor: Actor, tenant: str, map_name: str | None, target: str | None,
     request_id: str, **data: Any,
 ) -> None:  # fmt: skip
-    """Write a line for a refused request. Its texts are unchecked, so they are cleaned and cut."""
+    """Write a line for a refused request, whose unchecked texts are cleaned and truncated."""
     texts = {"map": map_name, "target": target}
     for name, text in texts.items():
         if text is not None:
@@ -103,7 +103,7 @@ def list_lines(
     connection: Connection, wanted: AuditFilter, limit: int, *, before: int | None = None,
     after: int | None = None,
 ) -> list[AuditRow]:  # fmt: skip
-    """Return lines, the newest first; with `after`, return later lines, the oldest first."""
+    """Return lines, the newest first. With `after`, return later lines, the oldest first."""
     order = audit.c.number.desc() if after is None else audit.c.number
     statement = select(audit).order_by(order).limit(limit)
     if after is not None:
@@ -122,16 +122,16 @@ def list_lines(
 
 
 def surplus_lines(
-    connection: Connection, before: float, limit: int, kept: int = KEPT_LINES
+    connection: Connection, before: float, limit: int, most_lines: int = MAXIMUM_LINES
 ) -> list[int]:
-    """Return the numbers of lines to remove: old ones, and those of a tenant beyond `kept`.
+    """Return the numbers of lines to remove: old lines, and surplus lines of a tenant.
 
     Parameters
     ----------
-    before : lines from before this time (seconds since 1970) are old. If a clock was set back, an
-        old line behind a younger one stays until both are old
-    limit : maximum number of lines
-    kept : maximum number of lines per tenant
+    before : time before which lines are old, seconds since 1970. If a clock was set back, an old
+        line behind a younger one stays until both are old
+    limit : maximum number of returned lines
+    most_lines : maximum number of lines per tenant
     """
     oldest = connection.execute(
         select(audit.c.number, audit.c.at).order_by(audit.c.number).limit(limit)
@@ -142,12 +142,12 @@ def surplus_lines(
             break
         numbers.append(int(number))
     newest = connection.execute(select(func.max(audit.c.number))).scalar()
-    if numbers or not oldest or newest is None or newest - oldest[0].number < kept:
+    if numbers or not oldest or newest is None or newest - oldest[0].number < most_lines:
         return numbers
     for name in (NOBODY, *connection.execute(select(tenants.c.name)).scalars()):
         own = select(audit.c.number).where(audit.c.tenant == name)
         newest_first = own.order_by(audit.c.number.desc())
-        floor = connection.execute(newest_first.offset(kept).limit(1)).scalar()
+        floor = connection.execute(newest_first.offset(most_lines).limit(1)).scalar()
         if floor is not None:
             surplus = own.where(audit.c.number <= floor).order_by(audit.c.number)
             numbers += connection.execute(surplus.limit(limit - len(numbers))).scalars()

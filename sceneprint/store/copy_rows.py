@@ -1,4 +1,4 @@
-"""Rows of a map for a copy elsewhere: read as they are, and written as they were."""
+"""Read the rows of a map for a copy in another store, and write the rows of a copy."""
 
 from __future__ import annotations
 
@@ -29,59 +29,60 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState, JobState
 
-#: Rows that are held at once.
+#: Number of rows that are read at once.
 _BLOCK = 200
-#: Columns of a frame that are copied; the rest is the store's own.
-COPIED = (
+#: Columns of a frame that are copied. The other columns are specific to the store.
+COPIED_COLUMNS = (
     "content_id", "blob", "bytes", "intrinsics", "depth_scale", "depth_along_ray", "robot",
     "session", "captured_at", "tags", "pose_parent", "pose", "sent_parent", "sent_pose",
     "base_frame", "base", "novelty", "received_at", "indexed_at", "cloud", "up", "name", "sequence",
     "samples",
 )  # fmt: skip
-#: Columns of a copied frame: its id, those, and its signature.
+#: Columns of a copied frame: its id, the copied columns, and its signature.
 COLUMNS: tuple[Column[Any], ...] = (
-    frames.c.id, *(frames.c[name] for name in COPIED), signatures.c.vector, signatures.c.geometry,
-    signatures.c.n_patches, signatures.c.n_pairs,
+    frames.c.id, *(frames.c[name] for name in COPIED_COLUMNS), signatures.c.vector,
+    signatures.c.geometry, signatures.c.n_patches, signatures.c.n_pairs,
 )  # fmt: skip
 
 
 def copied_rows(connection: Connection, row: MapRow) -> Iterator[Row[Any]]:
-    """Yield `COLUMNS` of the indexed frames of a map, in the order they came."""
+    """Yield `COLUMNS` of the indexed frames of a map, in the order of upload."""
     statement = _signed(select(*COLUMNS), row).order_by(frames.c.received_at, frames.c.number)
     options = {"stream_results": True}
-    with closing(connection.execute(statement, execution_options=options)) as found:
-        while block := found.fetchmany(_BLOCK):
+    with closing(connection.execute(statement, execution_options=options)) as rows:
+        while block := rows.fetchmany(_BLOCK):
             yield from block
 
 
-def _signed(asked: Any, row: MapRow) -> Any:
-    made = (signatures.c.frame_number == frames.c.number) & (signatures.c.model_id == row.model_id)
+def _signed(statement: Any, row: MapRow) -> Any:
+    c = signatures.c
+    has_model = (c.frame_number == frames.c.number) & (c.model_id == row.model_id)
     own = frames.c.map_number == row.number
-    return asked.join(signatures, made).where(own, frames.c.state == FrameState.INDEXED)
+    return statement.join(signatures, has_model).where(own, frames.c.state == FrameState.INDEXED)
 
 
 def has_artifact(connection: Connection, row: MapRow, digest: str) -> bool:
-    """Whether a blob is the artifact of an indexed frame of a map."""
-    asked = _signed(select(frames.c.number), row).where(signatures.c.geometry == digest)
-    return connection.execute(asked.limit(1)).first() is not None
+    """Return whether a blob is the artifact of an indexed frame of a map."""
+    statement = _signed(select(frames.c.number), row).where(signatures.c.geometry == digest)
+    return connection.execute(statement.limit(1)).first() is not None
 
 
 def model_of(connection: Connection, model_id: str) -> tuple[str, bytes]:
-    """Name and file of a model that a map refers to."""
-    asked = select(models.c.name, models.c.content).where(models.c.id == model_id)
-    name, content = connection.execute(asked).one()
+    """Return the name and the file of a model of a map."""
+    statement = select(models.c.name, models.c.content).where(models.c.id == model_id)
+    name, content = connection.execute(statement).one()
     return name, bytes(content)
 
 
 def living_rows(connection: Connection, row: MapRow) -> dict[str, FrameRow]:
-    """All frames of a map that are not deleted, by their ids."""
+    """Return all frames of a map that are not deleted, by id."""
     own = frames.c.map_number == row.number, frames.c.state != FrameState.DELETED
-    found = connection.execute(select(frames).where(*own)).mappings()
-    return {one["id"]: frame_row(one) for one in found}
+    rows = connection.execute(select(frames).where(*own)).mappings()
+    return {one["id"]: frame_row(one) for one in rows}
 
 
 def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
-    """Let a map be as old as the one that it is a copy of."""
+    """Set the creation time of a copied map to that of the original, and return the map."""
     own = update(maps).where(maps.c.number == row.number)
     connection.execute(own.values(created_at=created_at))
     return find_map(connection, row.name)
@@ -89,52 +90,52 @@ def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
 
 @dataclass(frozen=True, eq=False)
 class CopiedFrame:
-    """A frame as it is elsewhere.
+    """Frame of the original map.
 
     Parameters
     ----------
-    id : of the frame
-    values : by column of COPIED
-    made : its signature
+    id : id of the frame
+    values : values of COPIED_COLUMNS by name
+    signature : signature of the frame
     """
 
     id: str
     values: Mapping[str, Any]
-    made: StoredSignature
+    signature: StoredSignature
 
 
-def add_copied(connection: Connection, row: MapRow, found: Sequence[CopiedFrame]) -> None:
-    """Add frames, found by queries at once: a few statements for some hundred of them.
+def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame]) -> None:
+    """Add a few hundred indexed frames in a few statements; queries find them after the commit.
 
     Parameters
     ----------
-    connection : of a writing transaction
-    found : of which the map has none that is not deleted
+    connection : writing transaction
+    copies : frames, none of which exists in the map unless it is deleted
     """
-    gone = select(frames.c.id).where(
-        frames.c.map_number == row.number, frames.c.id.in_([one.id for one in found])
+    deleted = select(frames.c.id).where(
+        frames.c.map_number == row.number, frames.c.id.in_([one.id for one in copies])
     )
-    for frame_id in connection.execute(gone).scalars().all():
+    for frame_id in connection.execute(deleted).scalars().all():
         free_id(connection, row.number, frame_id)
-    last = next_revision(connection, row.number, len(found))
+    last = next_revision(connection, row.number, len(copies))
     rows = [
         {
             **one.values, **position(one.values["pose"]), "id": one.id, "map_number": row.number,
-            "state": FrameState.INDEXED, "revision": last - len(found) + i,
+            "state": FrameState.INDEXED, "revision": last - len(copies) + i,
         }
-        for i, one in enumerate(found, 1)
+        for i, one in enumerate(copies, 1)
     ]  # fmt: skip
     added = insert(frames).returning(frames.c.number, sort_by_parameter_order=True)
     numbers = connection.execute(added, rows).scalars().all()
-    add_usage(connection, row.number, len(found), sum(one.values["bytes"] for one in found))
+    add_usage(connection, row.number, len(copies), sum(one.values["bytes"] for one in copies))
     tags = [
         {"frame_number": number, "tag": tag}
-        for number, one in zip(numbers, found, strict=True)
+        for number, one in zip(numbers, copies, strict=True)
         for tag in sorted(set(one.values["tags"]))
     ]
     if tags:
         connection.execute(insert(frame_tags), tags)
-    put_signatures(connection, list(zip(numbers, [one.made for one in found], strict=True)))
+    put_signatures(connection, list(zip(numbers, [one.signature for one in copies], strict=True)))
     job, at = job_values(connection, "sign", 0), time.time()
     job |= {"map_number": row.number, "state": JobState.SUCCEEDED, "attempts": 1}
     job |= dict.fromkeys(("created_at", "run_after", "started_at", "finished_at"), at)
@@ -145,12 +146,12 @@ def add_copied(connection: Connection, row: MapRow, found: Sequence[CopiedFrame]
     connection.execute(insert(jobs), done)
 
 
-def edit_copied(connection: Connection, row: MapRow, there: FrameRow, now: CopiedFrame) -> None:
-    """Bring a frame to what it is elsewhere, where its content is the same."""
-    write_frame(connection, row, there, now.values)
-    replace_signature(connection, there, now.made)
+def edit_copied(connection: Connection, row: MapRow, frame: FrameRow, copied: CopiedFrame) -> None:
+    """Replace metadata and signature of a frame by those of a copy with the same content."""
+    write_frame(connection, row, frame, copied.values)
+    replace_signature(connection, frame, copied.signature)
 
 
-def numbers_in_blocks(found: Sequence[FrameRow]) -> list[list[int]]:
-    """Numbers of frames, some hundred at a time."""
-    return [list(some) for some in blocks([one.number for one in found])]
+def numbers_in_blocks(rows: Sequence[FrameRow]) -> list[list[int]]:
+    """Return the numbers of frames in blocks."""
+    return [list(some) for some in blocks([one.number for one in rows])]

@@ -1,4 +1,4 @@
-"""The database: open it, bring it to its schema, and run transactions.
+"""Open the database, migrate it to the schema of this version, and run transactions.
 
 URL  --open_database-->  Database  --read | write-->  Connection
 """
@@ -41,16 +41,16 @@ if TYPE_CHECKING:
 
 
 _FOLDER = Path(migrations.__file__).parent
-#: The lines of a file in `migrations/versions` that name its revision and the one before.
+#: Lines of a file in `migrations/versions` that state its revision and the previous one.
 _REVISIONS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
-#: Option of a connection: whether its transaction writes to single maps, beside writers of others.
+#: Option of a connection: whether its transaction writes to single maps, concurrently with others.
 MAPS_OPTION = "sceneprint_maps"
-#: Maximum number of concurrent writers of single maps in a process: each takes a connection.
+#: Maximum number of concurrent writers of single maps in a process; each needs a connection.
 MAP_WRITERS = 8
 
 
 def migration_config() -> Config:
-    """Return Alembic's configuration, which finds `migrations/`."""
+    """Return the Alembic configuration with the path of `migrations/`."""
     from alembic.config import Config
 
     config = Config()
@@ -81,7 +81,7 @@ def revision_of(connection: Connection) -> str | None:
 
 @dataclass(frozen=True)
 class SchemaRange:
-    """The schema of a store, and the processes that may use it.
+    """Schema of a store, and the revisions whose processes may use it.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class SchemaRange:
     def allows(self, own: str) -> bool:
         """Return whether a process of revision `own` may use the store.
 
-        Revisions are numbers of four digits, so they sort as texts.
+        Revisions are numbers of four digits, so their order is that of texts.
         """
         return self.revision == own or (
             self.revision.isdecimal() and self.least <= own < self.revision
@@ -107,7 +107,7 @@ def schema_range_of(connection: Connection) -> SchemaRange | None:
     revision = revision_of(connection)
     if revision is None:
         return None
-    if not inspect(connection).has_table(schema_range.name):  # another program's database
+    if not inspect(connection).has_table(schema_range.name):  # a database of another program
         return SchemaRange(revision, revision)
     return SchemaRange(revision, connection.execute(select(schema_range)).scalar_one())
 
@@ -117,7 +117,7 @@ def require_schema(connection: Connection) -> None:
 
     Raises
     ------
-    NewerSchema : a later version has migrated the store since this process opened it.
+    NewerSchema : If a later version has migrated the store since this process opened it.
     """
     _check_schema(connection.engine, connection.exec_driver_sql(postgres.SCHEMA).one())
 
@@ -128,14 +128,14 @@ def _check_schema(engine: Engine, row: Any) -> None:
         return
     what = "later" if found.revision > own else "earlier"
     raise NewerSchema(
-        f"{database_label(engine.url)} was brought to schema {found.revision} of a "
-        f"{what} version of sceneprint while this process ran, and this process works with {own}. "
-        "Nothing was stored. Stop this process, and start the version that the others run."
+        f"{database_label(engine.url)} was migrated to schema {found.revision} of a {what} version "
+        f"of sceneprint while this process, which needs {own}, was running. Nothing was stored. "
+        "Stop this process, and start the version of the other processes."
     )
 
 
 def create_schema(connection: Connection) -> None:
-    """Create all tables of this version in an empty database, and note its revision."""
+    """Create all tables of this version in an empty database, and record its revision."""
     head, _ = known_revisions()
     metadata.create_all(connection, checkfirst=False)
     if connection.dialect.name == "postgresql":
@@ -150,7 +150,7 @@ def create_schema(connection: Connection) -> None:
     connection.execute(text("INSERT INTO alembic_version VALUES (:head)"), {"head": head})
 
 
-#: Schemes of URLs of a server; providers issue URLs with the short ones.
+#: Schemes of URLs of a server. Hosting providers issue URLs with the short schemes.
 _SERVERS = ("postgresql", "postgres", "postgresql+psycopg")
 
 
@@ -159,45 +159,45 @@ def database_url(url_text: str) -> URL:
 
     Raises
     ------
-    UnusableStore : the URL is of no such database; the message repeats only its scheme.
+    UnusableStore : If the URL is not that of such a database. The message repeats only its scheme.
     """
     kind = url_text.partition(":")[0]
     try:
         if kind in _SERVERS:
-            if url_text.count("@") > 1:  # SQLAlchemy would take the rest for the name of a host
+            if url_text.count("@") > 1:  # SQLAlchemy would parse a part of the password as host
                 raise ValueError("an @ in a password")
             return make_url(url_text).set(drivername="postgresql+psycopg")
         url = make_url(url_text)
         is_sqlite = url.get_backend_name() == "sqlite"
-    # ValueError: a port that is not a number, and may be half of a password
+    # ValueError is raised for a port that is not a number and may be a part of a password
     except (ArgumentError, ValueError):
         raise UnusableStore(
-            f"The database URL that begins with {kind!r:.80} is not valid. Set "
-            "SCENEPRINT_DATABASE_URL to one such as postgresql+psycopg://user:password@host/name, "
-            "with @ : and / in a password written as %40, %3A and %2F; or leave it out for SQLite "
-            "in the data folder."
+            f"The database URL that starts with {kind!r:.80} is not valid. Set "
+            "SCENEPRINT_DATABASE_URL to a URL such as "
+            "postgresql+psycopg://user:password@host/name, with @ : and / in a password written "
+            "as %40, %3A and %2F; or unset it for SQLite in the data folder."
         ) from None
     if not is_sqlite:
         raise UnusableStore(
             f"{kind!r:.80} is not a supported database. Set SCENEPRINT_DATABASE_URL to "
-            "postgresql+psycopg://user:password@host/database, or leave it out for SQLite in the "
+            "postgresql+psycopg://user:password@host/database, or unset it for SQLite in the "
             "data folder."
         )
     return url
 
 
-#: Alembic stores the running migration in a variable of its module.
+#: Lock for migrations, since Alembic stores the running migration in a module variable.
 _migrating = threading.Lock()
 
 
 def migrate(database: Database) -> None:
-    """Bring a database to the schema of this version, in one transaction; other processes wait.
+    """Migrate a database to the schema of this version in one transaction; other processes wait.
 
     Raises
     ------
-    ReadOnlyStore : the database is read-only, and an earlier version wrote it.
-    NewerSchema : a later version of sceneprint wrote the database; nothing is changed.
-    UnusableStore : the database cannot be written, or a foreign key refers to a missing row.
+    ReadOnlyStore : If the database is read-only, and an earlier version wrote it.
+    NewerSchema : If a later version of sceneprint wrote the database; nothing is changed.
+    UnusableStore : If the database cannot be written, or a foreign key refers to a missing row.
     """
     head, _ = known_revisions()
     with database.read() as connection:
@@ -206,11 +206,10 @@ def migrate(database: Database) -> None:
         return
     if database.read_only:
         raise ReadOnlyStore(
-            f"{database.shown} has schema {current}, this version needs {head}, and "
-            "the file is read-only. Open it once from a writable disk, or use the version that "
-            "wrote it."
+            f"{database.shown} has schema {current}, but this version needs {head}, and the file "
+            "is read-only. Open it once from a writable disk, or use the version that wrote it."
         )
-    with database.write(unchecked=True) as connection:  # another process may have been first
+    with database.write(unchecked=True) as connection:  # another process may migrate first
         current = current_revision(connection)
         if current is None:
             create_schema(connection)
@@ -220,7 +219,7 @@ def migrate(database: Database) -> None:
             config = migration_config()
             config.attributes["connection"] = connection
             if not database.is_sqlite:
-                # wait for writers without a turn; later ones see the new schema
+                # wait for writers without a turn; later writers see the new schema
                 connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
             with _migrating:
                 command.upgrade(config, "head")
@@ -230,64 +229,63 @@ def migrate(database: Database) -> None:
                 and connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None
             ):
                 raise UnusableStore(
-                    f"{database.shown}: rows refer to missing rows, so the database was not "
+                    f"{database.shown}: Some rows refer to missing rows, so the database was not "
                     "migrated, and nothing was changed. Run `sceneprint fsck` of the version that "
-                    "wrote it."
+                    "wrote the database."
                 )
 
 
 def current_revision(connection: Connection) -> str | None:
-    """Return the revision of a database as this version knows it; None if it has no schema.
+    """Return the revision of a database; None if it has no schema.
 
-    For a later schema that this version may write to, return the revision of this version.
+    For a later schema that this version may use, return the revision of this version.
 
     Raises
     ------
-    NewerSchema : a later version of sceneprint wrote the database, and this one may not use it.
+    NewerSchema : If a later version of sceneprint wrote the database, and this one may not use it.
     """
-    found, (head, known) = schema_range_of(connection), known_revisions()
-    if found is None:
+    stored, (head, known) = schema_range_of(connection), known_revisions()
+    if stored is None:
         return None
-    if found.revision in known:
-        return found.revision
-    if found.allows(head):
+    if stored.revision in known:
+        return stored.revision
+    if stored.allows(head):
         return head
     raise NewerSchema(
-        f"{database_label(connection.engine.url)} has schema {found.revision}, which this version "
-        "of sceneprint does not know: a later one wrote it. Use that version, or another data "
-        "folder."
+        f"{database_label(connection.engine.url)} has schema {stored.revision} of a later version "
+        "of sceneprint. Use that version, or another data folder."
     )
 
 
 class Database:
-    """Transactions on one database; safe to share between threads, not between processes.
+    """Transactions on a database, which threads but not processes may share.
 
     Parameters
     ----------
-    engine : SQLAlchemy's engine
-    sealed : the file, if it is read-only
+    engine : SQLAlchemy engine
+    sealed : database file if it is read-only
     """
 
     def __init__(self, engine: Engine, sealed: ReadOnlyFile | None = None) -> None:
         self._engine, self._sealed = engine, sealed
-        # a reader sees one snapshot; in SQLite every transaction does
+        # readers see a single snapshot; in SQLite this is true for all transactions
         self._readers = engine if self.is_sqlite else engine.execution_options(
             isolation_level="REPEATABLE READ", postgresql_readonly=True
         )  # fmt: skip
-        # writers on PostgreSQL begin their transactions themselves, see `postgres.begin`
+        # writers on PostgreSQL begin their transactions explicitly, see `postgres.begin`
         self._writers = engine if self.is_sqlite else engine.execution_options(
             isolation_level="AUTOCOMMIT"
         )  # fmt: skip
-        # one writer of this process waits for the turn at the database, and the others wait here
-        # without a connection, which readers need
+        # only one writer of this process waits at the database; the others wait here, so that they
+        # occupy no connections
         self._turns, self._map_turns = ThreadTurns(1), ThreadTurns(MAP_WRITERS)
         file = None if sealed is not None else self.file
         self._line = None if file is None else WriterLine(file.parent)
         self._held = False  # another process has held the lock for longer than BUSY_S
         self._guarded = False
         self._schema = postgres.KnownSchema(self._check_schema)
-        #: Timeline of the PostgreSQL server at the last connection; None of SQLite. A promoted
-        #: standby begins another timeline, and may lack the last commits: caches of rows of the
+        #: Timeline of the PostgreSQL server at the last connection; None for SQLite. A promoted
+        #: standby starts a new timeline and may lack the last commits, so caches of rows of the
         #: former timeline must be dropped.
         self.history: str | None = None
         if not self.is_sqlite:
@@ -298,7 +296,7 @@ class Database:
 
     @property
     def dialect(self) -> str:
-        """The kind of database: `sqlite` or `postgresql`."""
+        """Kind of database: `sqlite` or `postgresql`."""
         return self._engine.dialect.name
 
     @property
@@ -308,25 +306,23 @@ class Database:
 
     @property
     def shown(self) -> str:
-        """The database's name for messages, without a password."""
+        """Name of the database for messages, without a password."""
         return database_label(self._engine.url)
 
     @property
     def file(self) -> Path | None:
-        """The database file; None for a server or a database in memory."""
+        """Path of the database file; None for a server or a database in memory."""
         name = self._engine.url.database if self.is_sqlite else None
         return Path(name).absolute() if name and name != ":memory:" else None
 
     @property
     def read_only(self) -> bool:
-        """Whether the database was opened read-only, so that every `write` raises ReadOnlyStore."""
+        """Whether the database was opened read-only, so that `write` raises ReadOnlyStore."""
         return self._sealed is not None
 
     @property
     def turned_read_only(self) -> bool:
-        """Whether the file is read-only by now: a disk may be remounted read-only while it is in
-        use.
-        """
+        """Whether the file has become read-only, for example because its disk was remounted."""
         return self.is_sqlite and read_only_file(self._engine.url) is not None
 
     def require_writable(self) -> None:
@@ -335,20 +331,18 @@ class Database:
             raise self._sealed.refusal()
 
     def guard_schema(self) -> None:
-        """Let each later `write` check that this version may use the schema."""
+        """Make each later `write` check that this version may use the schema."""
         self._guarded = True
 
     def require_schema(self) -> None:
-        """Check that this process may still write; raise NewerSchema if a later version migrated
-        the store.
-        """
+        """Raise NewerSchema if a later version has migrated the store meanwhile."""
         if self._guarded:
             with self.read() as connection:
                 require_schema(connection)
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
-        """Run a transaction that reads one snapshot and changes nothing."""
+        """Run a transaction that reads a single snapshot and changes nothing."""
         before = None if self._sealed is None else self._sealed.state()
         with self.explained(), self._readers.connect() as connection:
             yield connection
@@ -360,29 +354,29 @@ class Database:
         self, *, unchecked: bool = False, turn: bool = True, map_number: int | None = None,
         single: bool = False,
     ) -> Iterator[Connection]:  # fmt: skip
-        """Run a transaction that is committed at the end, or rolled back if it raises.
+        """Run a transaction that is committed at the end, or rolled back after an exception.
 
         Parameters
         ----------
-        unchecked : turn off SQLite's foreign key checks, so that tables can be rebuilt. On
-            PostgreSQL, wait longer for the turn and for statements
+        unchecked : whether to turn off SQLite's foreign key checks, so that tables can be rebuilt;
+            on PostgreSQL, to wait longer for the turn and for statements
         turn : whether other writers wait until the commit. Without a turn on PostgreSQL, change
-            only rows that are locked, and record no event. SQLite ignores it
-        map_number : number of the only map that is written to. On PostgreSQL, writers of other maps
-            then do not wait: change no row that several maps share, and record events with
-            `record_event`
-        single : whether the transaction is one statement. With a single map, PostgreSQL waits for
-            the turn, executes and commits it in one round trip; the answer means that it is
-            committed. SQLite ignores it
+            only locked rows, and record no events. SQLite ignores the parameter
+        map_number : number of the map, if the transaction writes to a single map. On PostgreSQL,
+            writers of other maps then do not wait: do not change rows that maps share, and record
+            events with `record_event`
+        single : whether the transaction is a single statement. For a single map, PostgreSQL then
+            waits for the turn, executes and commits the statement in one round trip. SQLite
+            ignores the parameter
 
         Raises
         ------
-        ReadOnlyStore : the database is read-only.
-        StoreLocked : another process has been writing for longer than BUSY_S. Later writers then
+        ReadOnlyStore : If the database is read-only.
+        StoreLocked : If another process has been writing for longer than BUSY_S. Later writers then
             wait for HELD_S only, until one succeeds.
-        StoreFull : the disk is full.
-        NewerSchema : another version migrated the store beyond what this process may write.
-        UnusableStore : the database cannot be written for another reason.
+        StoreFull : If the disk is full.
+        NewerSchema : If another version migrated the store beyond what this process may write.
+        UnusableStore : If the database cannot be written for another reason.
         """
         self.require_writable()
         if not turn and not self.is_sqlite:
@@ -410,25 +404,24 @@ class Database:
 
     @contextmanager
     def write_maps(self, map_numbers: Collection[int], wait_s: float) -> Iterator[Connection]:
-        """Run a single-statement transaction (see `write`) that writes to several maps on
-        PostgreSQL.
+        """Run a transaction of a single statement that writes to several maps on PostgreSQL.
 
-        Only one thread of a process may do so at a time.
+        Only one thread of a process may do so at a time. See `write`.
 
         Parameters
         ----------
-        map_numbers : numbers of the only maps that are written to
-        wait_s : seconds to wait for each map. Writers of the other maps wait for it as well
+        map_numbers : numbers of the maps
+        wait_s : maximum seconds to wait for each map; writers of the other maps wait meanwhile
 
         Raises
         ------
-        MapsInUse : a map was still in use after `wait_s`; nothing was written.
-        ReadOnlyStore and others : see `write`.
+        MapsInUse : If a map is still in use after `wait_s`; nothing is written.
+        ReadOnlyStore and others : If `write` raises the error.
         """
         self.require_writable()
         turn_s = postgres.HELD_S if self._held else BUSY_S
-        # no turn among the threads of this process: the statement serves many tenants, and would
-        # wait for maps in use by them
+        # the statement takes no turn among the threads of this process: it serves many tenants, and
+        # would wait for maps that they use
         with self._note_locks(), self.explained(), self._writers.connect() as connection:
             with self._write_single(connection, map_numbers, turn_s, wait_s) as writing:
                 yield writing
@@ -439,7 +432,7 @@ class Database:
         self, connection: Connection, map_numbers: Collection[int], wait_s: float,
         maps_wait_s: float | None,
     ) -> Iterator[Connection]:  # fmt: skip
-        """Run a transaction of one statement; see `SingleStatement`."""
+        """Run a transaction of a single statement; see `SingleStatement`."""
         known = self._schema if self._guarded else None
         only = postgres.SingleStatement(map_numbers, wait_s, maps_wait_s, known)
         options: dict[str, Any] = {MAPS_OPTION: True, postgres.SINGLE: only}
@@ -450,7 +443,7 @@ class Database:
 
     @contextmanager
     def _write_out_of_turn(self) -> Iterator[Connection]:
-        """Run a transaction without a turn, on PostgreSQL."""
+        """Run a transaction without a turn on PostgreSQL."""
         # a migration waits for this lock
         checks = (f"{postgres.SCHEMA} FOR KEY SHARE",) if self._guarded else ()
         with self.explained(), self._writers.begin() as connection:
@@ -465,8 +458,8 @@ class Database:
         tenant = current_tenant()
         if not turns.acquire(tenant, wait_s):
             raise StoreLocked(
-                f"{self.shown}: other writers of this process have waited for too long, and "
-                "nothing was stored. Try again later."
+                f"{self.shown}: Other writers of this process took too long. Nothing was stored. "
+                "Try again later."
             )
         try:
             with self._note_locks():
@@ -476,7 +469,7 @@ class Database:
 
     @contextmanager
     def _note_locks(self) -> Iterator[None]:
-        """Let later writers wait for less time if the lock could not be taken."""
+        """Shorten the wait of later writers after the lock could not be taken."""
         try:
             yield
         except StoreLocked:
@@ -499,7 +492,7 @@ class Database:
         writing = connection.execution_options(**options)
         with writing.begin():
             checked, row = self._guarded and not unchecked, None
-            if not self.is_sqlite:  # SQLite gave the turn with the transaction
+            if not self.is_sqlite:  # in SQLite, the transaction has the turn
                 schema = postgres.SCHEMA if checked else None
                 row = postgres.take_turn(writing, wait_s, schema, map_number)
             self._held = False
@@ -524,20 +517,18 @@ class Database:
                 connection.close()
 
     def explained(self) -> AbstractContextManager[None]:
-        """Translate errors of the database and its driver within the context into errors of the
-        store.
-        """
+        """Translate errors of the database within the context to errors of the store."""
         return explained(self._engine)
 
     def driver_connection(self) -> psycopg.Connection[Any]:
-        """Return a new connection to PostgreSQL that commits each statement at once.
+        """Return a new connection to PostgreSQL that commits each statement immediately.
 
-        Session state such as LISTEN and session locks needs a connection of its own. The caller
-        closes it, and executes its statements within `explained`.
+        Session state such as LISTEN and session locks needs a separate connection. The caller must
+        close it, and execute its statements within `explained`.
 
         Raises
         ------
-        UnusableStore : the server cannot be reached.
+        UnusableStore : If the server cannot be reached.
         """
         if self.is_sqlite:
             raise ValueError(f"{self.shown} has no sessions")
@@ -555,11 +546,11 @@ class Database:
         return connection
 
     def close(self) -> None:
-        """Close all connections; those in use close when they are returned."""
+        """Close all connections; connections in use are closed when they are returned."""
         pool = self._engine.pool
-        self._engine.dispose()  # it leaves connections in use to the garbage collector
+        self._engine.dispose()  # connections in use are left to the garbage collector
         event.listen(pool, "checkin", _close_connection)
-        pool.dispose()  # connections that were returned meanwhile
+        pool.dispose()  # closes connections that were returned meanwhile
         if self._line is not None:
             self._line.close()
 
@@ -574,12 +565,12 @@ def database_exists(url: str) -> bool:
 
     Raises
     ------
-    UnusableStore : the server cannot be reached.
+    UnusableStore : If the server cannot be reached.
     """
     try:
         parsed = database_url(url)
     except UnusableStore:
-        return False  # opening the database reports what is wrong
+        return False  # opening the database reports the error
     if parsed.get_backend_name() == "sqlite":
         return parsed.database is not None and Path(parsed.database).is_file()
     database = reach_database(url)
@@ -591,11 +582,11 @@ def database_exists(url: str) -> bool:
 
 
 def reach_database(url_text: str) -> Database:
-    """Open a database without looking at its schema; a server is not contacted yet.
+    """Open a database without checking its schema or contacting its server.
 
     Raises
     ------
-    UnusableStore : the URL is not valid.
+    UnusableStore : If the URL is not valid.
     """
     url = database_url(url_text)
     if url.get_backend_name() == "sqlite":
@@ -604,13 +595,13 @@ def reach_database(url_text: str) -> Database:
 
 
 def open_database(url: str) -> Database:
-    """Open a database and bring it to the schema of this version; a read-only file is only read.
+    """Open a database and migrate it to the schema of this version, unless the file is read-only.
 
     Raises
     ------
-    UnusableStore : the database cannot be opened.
-    ReadOnlyStore : the database is read-only, and an earlier version wrote it.
-    NewerSchema : a later version of sceneprint wrote the database; nothing is changed.
+    UnusableStore : If the database cannot be opened.
+    ReadOnlyStore : If the database is read-only, and an earlier version wrote it.
+    NewerSchema : If a later version of sceneprint wrote the database; nothing is changed.
     """
     database = reach_database(url)
     try:
@@ -624,7 +615,7 @@ def open_database(url: str) -> Database:
 
 @contextmanager
 def explained(engine: Engine) -> Iterator[None]:
-    """Translate errors of a database within the context into errors of the store."""
+    """Translate errors of a database within the context to errors of the store."""
     try:
         yield
     except Exception as error:

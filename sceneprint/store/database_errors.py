@@ -1,4 +1,4 @@
-"""Translate faults of the machine into errors of the store, and wait for a server that is starting.
+"""Translate system and database errors to errors of the store, and wait for a starting server.
 
 OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLocked or
 UnusableStore
@@ -24,7 +24,7 @@ from sqlalchemy.exc import TimeoutError as AllInUse
 
 from sceneprint.errors import ReadOnlyStore, StoreAway, StoreFull, StoreLocked, UnusableStore
 
-#: A failed write counts as one on a full disk if less space than this is free, bytes.
+#: Free space below which a failed write counts as a write to a full disk, bytes.
 NO_ROOM = 1 << 20
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -34,14 +34,14 @@ def unusable(what: str, error: OSError) -> UnusableStore:
 
     Parameters
     ----------
-    what : what happened, with the place
-    error : error of the system
+    what : beginning of the message, with the path
+    error : system error
     """
     text = f"{what} ({error.strerror})."
     if error.errno in _FULL:
-        return StoreFull(f"{text} The disk is full: free some space.")
+        return StoreFull(f"{text} The disk is full. Free some space.")
     if error.errno == errno.EROFS:
-        return ReadOnlyStore(f"{text} It is read-only: make it writable, or name another folder.")
+        return ReadOnlyStore(f"{text} It is read-only. Make it writable, or use another folder.")
     return UnusableStore(f"{text} Check the folder and its permissions.")
 
 
@@ -58,16 +58,16 @@ def database_label(url: URL) -> str:
 
 
 def fault_of(engine: Engine, error: Exception) -> UnusableStore | None:
-    """Return the store's error for an error of a database; None if the caller made a mistake."""
+    """Return the store error for a database error; None if the error is a bug of the caller."""
     if isinstance(error, DBAPIError):
         translate = _of_sqlite if engine.dialect.name == "sqlite" else _of_server
         return translate(engine.url, error)
     if isinstance(error, AllInUse):
         return StoreLocked(
-            f"{database_label(engine.url)}: all connections of this process are in use. "
+            f"{database_label(engine.url)}: All connections of this process are in use. "
             "Try again later."
         )
-    driver = sys.modules.get("psycopg")  # for connections without SQLAlchemy; SQLite never loads it
+    driver = sys.modules.get("psycopg")  # only PostgreSQL imports it
     if driver is None or not isinstance(error, driver.Error):
         return None
     return explain_error(engine.url, error, isinstance(error, driver.OperationalError))
@@ -87,11 +87,11 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
             )
         return None
     what = f"{url!r}: {_database_message(error)}."
-    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # the primary code of an extended one
+    code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF  # primary error code
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
         return StoreLocked(
-            f"{what} Another process has been writing for too long, and nothing was stored. Try "
-            "again later; `fuser` on the file shows the process."
+            f"{what} Another process has been writing for too long. Nothing was stored. Try again "
+            "later. Use `fuser` on the file to find the process."
         )
     if code == sqlite3.SQLITE_READONLY:
         return ReadOnlyStore(
@@ -99,19 +99,19 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
         )
     if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and _turned_read_only(url.database):
         return ReadOnlyStore(
-            f"{what} Its disk is mounted read-only, possibly after a disk error. Look into the "
-            "system's log, make the disk writable, and start again."
+            f"{what} The disk is mounted read-only, possibly after a disk error. Check the system "
+            "log, make the disk writable, and start again."
         )
     no_room = code == sqlite3.SQLITE_IOERR and _no_room(url.database)
     if code == sqlite3.SQLITE_FULL or no_room:
-        return StoreFull(f"{what} Nothing was stored. Free some space on its disk.")
+        return StoreFull(f"{what} The disk is full. Nothing was stored. Free some space.")
     return UnusableStore(
-        f"{what} Check that the database exists and is writable, and that the disk has room."
+        f"{what} Check that the database exists and is writable, and that the disk has free space."
     )
 
 
 def _turned_read_only(path: str | None) -> bool:
-    """Return whether the disk of a file is read-only by now: SQLite reports `disk I/O error`."""
+    """Return whether the disk of a file is read-only; SQLite only reports a disk I/O error."""
     try:
         return path is not None and bool(os.statvfs(Path(path).parent).f_flag & os.ST_RDONLY)
     except OSError:
@@ -119,7 +119,7 @@ def _turned_read_only(path: str | None) -> bool:
 
 
 def _no_room(path: str | None) -> bool:
-    """Return whether the disk of a file is full: SQLite reports this cause for some writes only."""
+    """Return whether the disk of a file is full, which SQLite does not report for all writes."""
     try:
         return path is not None and shutil.disk_usage(Path(path).parent).free < NO_ROOM
     except OSError:
@@ -127,73 +127,74 @@ def _no_room(path: str | None) -> bool:
 
 
 def _database_message(error: DBAPIError) -> str:
-    """Return the database's message on one line: it may quote a statement of several lines."""
+    """Return the message of an error as one line, since it may quote a long statement."""
     return " ".join(str(error.orig).split())
 
 
-#: Errors and hints for faults of PostgreSQL, by SQLSTATE, its class, or our own name.
+#: Error and advice for errors of PostgreSQL, by SQLSTATE, its class, or a name of this module.
 _FAULTS: dict[str, tuple[type[UnusableStore], str]] = {
     "55P03": (
         StoreLocked,
-        "Another process has been writing for too long, and nothing was stored. Try again later; "
-        "`SELECT a.pid, a.client_addr, a.state, a.query FROM pg_stat_activity a JOIN pg_locks l "
-        "USING (pid) WHERE l.locktype = 'advisory' AND l.granted` shows the process.",
+        "Another process has been writing for too long. Nothing was stored. Try again later. To "
+        "find the process, run `SELECT a.pid, a.client_addr, a.state, a.query FROM "
+        "pg_stat_activity a JOIN pg_locks l USING (pid) WHERE l.locktype = 'advisory' AND "
+        "l.granted`.",
     ),
-    "40": (StoreLocked, "Another transaction was in the way, and nothing was stored. Try again."),
+    "40": (StoreLocked, "The transaction conflicted with another. Nothing was stored. Try again."),
     "53100": (StoreFull, "Nothing was stored. Free some space on the disk of the server."),
     "53300": (
         StoreAway,
-        "The server has no free connection. Raise its max_connections, or run fewer processes. "
-        "The service tries again.",
+        "The server has no free connections. Increase its max_connections, or run fewer "
+        "processes. The service tries again.",
     ),
-    "53": (UnusableStore, "The server lacks resources. Look into its log."),
+    "53": (UnusableStore, "The server lacks resources. Check its log."),
     "25006": (
         ReadOnlyStore,
-        "The server is a standby, or is read-only. Name the primary in "
-        "SCENEPRINT_DATABASE_URL, or all with `target_session_attrs=read-write`.",
+        "The server is a standby, or is read-only. Set SCENEPRINT_DATABASE_URL to the primary, or "
+        "to all servers with `target_session_attrs=read-write`.",
     ),
     "26": (
         StoreLocked,
-        "A prepared statement is gone, and nothing was stored. Try again. If this goes on, a "
-        "pooler gives one connection to several clients: connect to the server itself.",
+        "A prepared statement no longer exists. Nothing was stored. Try again. If the error "
+        "persists, a pooler shares connections among clients: connect directly to the server.",
     ),
-    "25P03": (UnusableStore, "This transaction was idle for too long, and nothing was stored."),
-    "57014": (UnusableStore, "The server took too long, and nothing was stored. Try again later."),
+    "25P03": (UnusableStore, "The transaction was idle for too long. Nothing was stored."),
+    "57014": (UnusableStore, "The server took too long. Nothing was stored. Try again later."),
     "57": (StoreAway, "The server was stopped, or is starting. The service tries again."),
     "08": (
         StoreAway,
         "The connection was lost. Check that the server runs. The service tries again.",
     ),
     "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
-    "3D000": (UnusableStore, "Create the database, or name another in SCENEPRINT_DATABASE_URL."),
+    "3D000": (UnusableStore, "Create the database, or set SCENEPRINT_DATABASE_URL to another one."),
     "URL": (UnusableStore, "Correct SCENEPRINT_DATABASE_URL."),
-    "plan": (StoreLocked, "Tables were changed meanwhile, and nothing was stored. Try again."),
+    "plan": (StoreLocked, "The tables were changed meanwhile. Nothing was stored. Try again."),
     # the tables existed when this process started
-    "42P01": (UnusableStore, "Its tables are missing. Restore the database from a copy."),
-    "42501": (UnusableStore, "The user must own the database's tables: grant the ownership."),
-    "58": (UnusableStore, "The server cannot use its files. Look into its log."),
+    "42P01": (UnusableStore, "Tables are missing. Restore the database from a copy."),
+    "42501": (UnusableStore, "The user does not own the tables. Make it their owner."),
+    "58": (UnusableStore, "The server cannot use its files. Check its log."),
     "XX001": (UnusableStore, "The server's files are damaged. Restore a bundle or a backup."),
     "XX002": (UnusableStore, "An index of the server is damaged. REINDEX the database."),
 }
-#: Messages of failed connections that a retry does not help, and their SQLSTATE or our own name.
+#: Patterns of connection errors for which retries are useless, with SQLSTATE or name in `_FAULTS`.
 _REFUSALS = {
     r"database .+ does not exist": "3D000",
     r"authentication failed|no pg_hba\.conf entry|role .+ does not exist|no password": "28000",
     r"bad value for|invalid (connection option|.+ value|integer value|port number)": "URL",
 }
 _AWAY = (
-    "Check that the server runs and can be reached from here, and that SCENEPRINT_DATABASE_URL is "
-    "right. The service tries again."
+    "Check that the server is running and reachable from this machine, and that "
+    "SCENEPRINT_DATABASE_URL is correct. The service tries again."
 )
 
 
 def explain_error(url: URL, error: object, broken: bool) -> UnusableStore | None:
-    """Return the store's error for a fault of PostgreSQL; None if the caller made a mistake.
+    """Return the store error for an error of PostgreSQL; None if it is a bug of the caller.
 
     Parameters
     ----------
     error : error of psycopg
-    broken : whether any other statement would have failed as well
+    broken : whether the connection is broken, so that other statements would fail too
     """
     message = " ".join(str(error).split()).rstrip(".")
     state = getattr(error, "sqlstate", None) or ""
@@ -208,16 +209,16 @@ def explain_error(url: URL, error: object, broken: bool) -> UnusableStore | None
 
 
 def is_conflict(error: UnusableStore) -> bool:
-    """Return whether PostgreSQL aborted a transaction for another, as in a deadlock."""
+    """Return whether PostgreSQL aborted a transaction in favour of another, as in a deadlock."""
     cause = error.__cause__
     state = getattr(getattr(cause, "orig", cause), "sqlstate", None)
     return state is not None and str(state).startswith("40")
 
 
 def is_of_old_plan(error: object) -> bool:
-    """Return whether a statement was prepared for tables whose columns have changed since.
+    """Return whether a statement was prepared for tables whose columns have changed.
 
-    Its SQLSTATE is a general one, and its text is in the server's language.
+    The SQLSTATE of this error is unspecific, and its text is in the server's language.
     """
     diagnosis = getattr(error, "diag", None)
     return getattr(diagnosis, "source_function", None) == "RevalidateCachedQuery"
@@ -229,7 +230,7 @@ T = TypeVar("T")
 
 #: Seconds that a starting process waits for its server.
 PATIENCE_S = 60.0
-#: Seconds between two attempts.
+#: Seconds between two attempts to connect.
 AGAIN_S = 1.0
 
 
@@ -237,17 +238,18 @@ def open_patiently(
     attempt: Callable[[], T], patience_s: float = PATIENCE_S,
     may_go_on: Callable[[float], bool] | None = None,
 ) -> T:  # fmt: skip
-    """Return the result of an attempt, retried while its server is unreachable.
+    """Return the result of an attempt, which is repeated while the server is unreachable.
 
     Parameters
     ----------
     attempt : function that opens the store
     patience_s : maximum seconds to wait
-    may_go_on : function that waits so many seconds, and returns whether to retry; default: always
+    may_go_on : function that takes a number of seconds, waits for that time, and returns whether to
+        retry; by default, retry until `patience_s`
 
     Raises
     ------
-    StoreAway : the server was still unreachable after `patience_s`.
+    StoreAway : If the server is still unreachable after `patience_s`.
     """
     until, logged = time.monotonic() + patience_s, False
     while True:

@@ -1,9 +1,10 @@
-"""Deleted frames and maps: which rows stay, and which blobs must be removed.
+"""Delete frames and maps, and record the blobs that must be removed.
 
-A deletion that can be undone leaves tombstones (see `tombstones`): frames that no search, list or
-count includes, with their uploads, signatures and metadata. After the purge of a frame a bare row
-stays for some days, so that readers learn of the deletion by its revision. Its blobs are recorded
-as doomed in the same transaction, so that they are removed even if this process dies.
+A deletion that can be undone leaves tombstones (see `tombstones`): frames with their uploads,
+signatures and metadata that are excluded from searches, lists and counts. After the purge of a
+frame, a bare row remains for some days, so that readers learn of the deletion from its revision.
+The same transaction records the blobs as doomed, so that they are removed even if this process
+dies.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ from sceneprint.store.tables import (
 from sceneprint.store.tenants import save_turns
 from sceneprint_client.api import FrameState, JobState
 
-#: Columns that a purge clears: all metadata but that of the camera.
+#: Columns that a purge clears: all metadata except that of the camera.
 _PURGED = (
     "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x", "pose_y",
     "pose_z", "sent_parent", "sent_pose", "base_frame", "base", "novelty", "up", "name",
@@ -81,13 +82,13 @@ def delete_frames(
     Parameters
     ----------
     connection : writing transaction
-    numbers : numbers of a few hundred frames of the map at most; deleted ones are ignored
+    numbers : numbers of at most a few hundred frames of the map; deleted frames are ignored
     reason : data of the events if no user requested the deletion
-    deletion : number of the deletion of the tombstones; None: purge the frames at once
+    deletion : number of the deletion for the tombstones; None purges the frames immediately
 
     Returns
     -------
-    blobs : doomed blobs; sweep them after the commit
+    blobs : doomed blobs, to sweep after the commit
     """
     c = frames.c
     existing = c.number.in_(numbers), c.state != FrameState.DELETED
@@ -99,7 +100,7 @@ def delete_frames(
     cancel_jobs(connection, jobs.c.frame_number.in_(living))
     redundant = [one.number for one in rows if one.state == FrameState.REDUNDANT]
     add_usage(connection, row.number, len(redundant) - len(rows), 0)
-    # each frame gets its own revision, as readers of changes continue after their last revision
+    # each frame gets its own revision, because readers continue after their last revision
     last = next_revision(connection, row.number, len(living))
     connection.execute(
         update(frames)
@@ -115,7 +116,7 @@ def delete_frames(
         connection,
         [event_values("frame.deleted", row.name, one.id, None, data) for one in rows],
     )
-    # a redundant frame has no upload to restore
+    # a redundant frame has no upload and cannot be restored
     return purge_frames(connection, row.number, living if deletion is None else redundant)
 
 
@@ -124,7 +125,7 @@ def purge_frames(connection: Connection, map_number: int, numbers: Sequence[int]
 
     Returns
     -------
-    blobs : doomed blobs; sweep them after the commit
+    blobs : doomed blobs, to sweep after the commit
     """
     if not numbers:
         return []
@@ -143,21 +144,21 @@ def purge_frames(connection: Connection, map_number: int, numbers: Sequence[int]
 
 
 def without_content(frame: FrameRow) -> FrameRow:
-    """Return a frame as its purge leaves it, if it is deleted; else return it unchanged."""
+    """Return a deleted frame without the columns that a purge clears; others are unchanged."""
     if frame.deletion is None:
         return frame
     bare: dict[str, Any] = dict.fromkeys(_PURGED)
     return replace(frame, tags=[], **bare)
 
 
-#: Number of tombstones to purge in one transaction.
+#: Number of tombstones that are purged in one transaction.
 PURGED_AT_ONCE = 100
 
 
 def oldest_tombstones(
     connection: Connection, map_number: int, limit: int = PURGED_AT_ONCE
 ) -> list[tuple[int, int, float]]:
-    """Return number, bytes and time of deletion of the oldest tombstones of a map."""
+    """Return the number, bytes and deletion time of the oldest tombstones of a map."""
     c = frames.c
     statement = select(c.number, c.bytes, c.ended_at).where(
         c.map_number == map_number, c.deletion.is_not(None)
@@ -167,7 +168,7 @@ def oldest_tombstones(
 
 
 def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> list[str]:
-    """Check a map's quota, and purge the oldest tombstones if they leave too little room.
+    """Check a map's quota, and purge the oldest tombstones if they use too much of it.
 
     Parameters
     ----------
@@ -176,11 +177,11 @@ def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = Tru
 
     Returns
     -------
-    blobs : doomed blobs; sweep them after the commit
+    blobs : doomed blobs, to sweep after the commit
 
     Raises
     ------
-    QuotaExceeded : there is too little room even without tombstones; none is purged.
+    QuotaExceeded : If the quota would be exceeded even without tombstones; none is purged.
     """
     require_room(connection, row, size, new=new)
     blobs: list[str] = []
@@ -200,7 +201,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
 
     Returns
     -------
-    blobs : blobs that the rows referred to
+    blobs : blobs of the removed rows
     """
     own = select(frames.c.number).where(frames.c.map_number == row.number)
     own_jobs = select(jobs.c.number).where(jobs.c.map_number == row.number)
@@ -233,7 +234,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     return blobs
 
 
-#: Rows to remove in one commit; other writers wait for approximately 30 ms.
+#: Number of rows that one commit removes; other writers wait approximately 30 ms.
 BLOCK = 500
 
 
@@ -247,15 +248,15 @@ def remove_in_blocks(
     Parameters
     ----------
     database : database of the rows
-    find : function that returns the numbers of rows to remove, up to a limit; called without the
-        lock, as it usually finds none
+    find : function that returns the numbers of rows to remove, up to a limit; it is called without
+        the lock, because it usually returns none
     remove : function that removes the rows
     most : maximum number of rows; the last block may exceed it
-    block : number of rows in each commit
+    block : number of rows per commit
 
     Returns
     -------
-    removed : number of removed rows
+    count : number of removed rows
     """
     removed = 0
     while removed < most:
@@ -271,16 +272,16 @@ def remove_in_blocks(
 
 
 def doom(connection: Connection, blobs: Iterable[str]) -> float:
-    """Record a few thousand blobs at most that may have to be removed.
+    """Record at most a few thousand blobs that may have to be removed.
 
-    Existing records get the new time, so that their former author can no longer clear them.
+    Existing records get the new time, so that the process that wrote them cannot clear them.
 
     Returns
     -------
     at : time of the records, seconds since 1970
     """
     at = time.time()
-    # sorted against deadlocks: writers of two maps may doom the same blobs at once
+    # the order prevents deadlocks between writers of two maps that doom the same blobs
     if rows := [{"blob": blob, "at": at} for blob in sorted(set(blobs))]:
         connection.execute(_replace_time(dialect_insert(connection, doomed)), rows)
     return at
@@ -291,9 +292,9 @@ def _replace_time(new: Any) -> Any:
 
 
 def doom_found(connection: Connection, *statements: Select[tuple[str]]) -> None:
-    """Record the blobs that the statements select, however many; see `doom`."""
+    """Record all blobs that the statements select; see `doom`."""
     blobs = union(*statements).subquery()
-    # without WHERE, SQLite parses the ON of ON CONFLICT as a join's
+    # without WHERE, SQLite would parse the ON of ON CONFLICT as that of a join
     rows = select(blobs.c[0], literal(time.time(), Float)).where(true())
     new = dialect_insert(connection, doomed).from_select(["blob", "at"], rows)
     connection.execute(_replace_time(new))
@@ -302,7 +303,7 @@ def doom_found(connection: Connection, *statements: Select[tuple[str]]) -> None:
 def doomed_blobs(
     connection: Connection, limit: int, before: float | None = None, after: str = ""
 ) -> list[str]:
-    """Return up to `limit` doomed blobs after one of them, recorded before a time if it is set."""
+    """Return up to `limit` doomed blobs in order, after `after` and recorded before `before`."""
     statement = (
         select(doomed.c.blob).where(doomed.c.blob > after).order_by(doomed.c.blob).limit(limit)
     )
@@ -315,14 +316,14 @@ def clear_doomed(
     connection: Connection, blobs: Sequence[str], at: float | None = None,
     before: float | None = None,
 ) -> None:  # fmt: skip
-    """Clear the records of blobs that were removed, or that are referred to again.
+    """Clear the records of blobs that were removed, or have references again.
 
     Parameters
     ----------
     connection : writing transaction of all maps
-    blobs : a few hundred blobs at most
-    at : time of the records to clear; None: any
-    before : time; later records stay
+    blobs : at most a few hundred blobs
+    at : time of the records to clear; None clears records of any time
+    before : time from which records are not cleared
     """
     if not blobs:
         return
@@ -334,11 +335,11 @@ def clear_doomed(
     connection.execute(statement)
 
 
-# Frames older than the retention of their map.
+# Frames older than the retention period of their map.
 
 #: Seconds of a day.
 DAY_S = 86_400.0
-#: Condition as in the partial index: planners do not match bound values to it.
+#: Condition with a literal value, because planners do not match bound values to a partial index.
 _LIVING: ColumnElement[bool] = frames.c.state != literal_column("'deleted'")
 
 
@@ -349,7 +350,7 @@ def aging_maps(connection: Connection) -> list[MapRow]:
 
 
 def old_frames(connection: Connection, map_number: int, before: float, limit: int) -> list[int]:
-    """Return the numbers of frames of a map that were received before a time, the oldest first."""
+    """Return the numbers of a map's frames that were received before a time, the oldest first."""
     statement = (
         select(frames.c.number).where(_old(map_number, before)).order_by(frames.c.received_at)
     )
@@ -357,7 +358,7 @@ def old_frames(connection: Connection, map_number: int, before: float, limit: in
 
 
 def count_old_frames(connection: Connection, map_number: int, before: float) -> int:
-    """Return the number of frames of a map that were received before a time."""
+    """Return the number of a map's frames that were received before a time."""
     return count_rows(connection, _old(map_number, before))
 
 
@@ -365,8 +366,9 @@ def _old(map_number: int, before: float) -> ColumnElement[bool]:
     return and_(frames.c.map_number == map_number, frames.c.received_at < before, _LIVING)
 
 
-# Rows of frames that ended some days ago. Readers of a map's signatures learn of deletions from
-# them. The map stores the greatest revision whose row was removed: a reader behind it starts again.
+# Rows of frames that were deleted, rejected or redundant for some days. Readers of a map's
+# signatures learn of deletions from these rows. The map stores the greatest revision of a removed
+# row; a reader at an earlier revision must start again.
 
 
 def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
@@ -379,19 +381,19 @@ def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
 
 
 def remove_ended(connection: Connection, map_number: int, before: float, limit: int) -> int:
-    """Remove rows of frames of a map that ended before a time, with their jobs.
+    """Remove the rows of a map's frames that ended before a time, with their jobs.
 
-    Restorable frames, frames that a surface contains, and frames with an unfinished job stay.
+    Restorable frames, frames in a surface, and frames with an unfinished job are not removed.
 
     Parameters
     ----------
     connection : writing transaction of the map
-    before : seconds since 1970
+    before : time, seconds since 1970
     limit : maximum number of frames of each state
 
     Returns
     -------
-    removed : number of removed frames
+    count : number of removed frames
     """
     removed = 0
     for state in ROOMLESS:
@@ -411,7 +413,7 @@ def remove_ended(connection: Connection, map_number: int, before: float, limit: 
 
 
 def newest_deletion(connection: Connection, map_number: int, before: float) -> int:
-    """Return the revision of a map's newest frame that was deleted before a time; 0 if none."""
+    """Return the revision of a map's newest frame deleted before a time; 0 if there is none."""
     statement = (
         select(frames.c.revision)
         .where(_ended(map_number, FrameState.DELETED, before))
@@ -429,7 +431,7 @@ def _ended(
 
 
 def _unreferred() -> list[ColumnElement[bool]]:
-    """Return the conditions that nothing needs the row of a frame."""
+    """Return the conditions under which the row of a frame is no longer needed."""
     unfinished = select(jobs.c.number).where(
         jobs.c.frame_number == frames.c.number,
         jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),

@@ -1,11 +1,11 @@
-"""Events: what happened, in order. Each event is written in the transaction of its change.
+"""Events report changes in order. Each event is written in the transaction of its change.
 
     writer of all maps  --record_event-->  events  <--number_events--  pending_events  <--  writer
     of a map
 
-Numbers are in commit order, so a reader of all events up to a number never misses a smaller one.
+Numbers are in commit order, so a reader of all events up to a number never misses a smaller number.
 Writers of all maps run one at a time and assign numbers themselves. Writers of single maps commit
-concurrently: their events are pending until a process numbers the committed ones. The pending
+concurrently, so their events are pending until a process numbers the committed events. The pending
 events of a map are in commit order, since its writers take turns.
 """
 
@@ -95,24 +95,24 @@ def record_events(
     )  # fmt: skip
 
 
-#: Kinds of events that the reader of a frame discovers and does not cause.
+#: Kinds of events that the reader of a frame discovers but does not cause.
 _DISCOVERIES = frozenset(("frame.damaged",))
 
 
 def events_table(connection: Connection) -> Table:
-    """Return the table that the events of a writer are inserted into."""
+    """Return the table for the events of a writer."""
     of_maps = connection.get_execution_options().get(MAPS_OPTION)
     return pending_events if of_maps else events
 
 
-#: Maximum seconds to wait for another process that numbers events, such as in a long transaction.
+#: Maximum seconds to wait for another process that is numbering events.
 NUMBERING_S = 1.0
 
 
 def number_events(database: Database) -> None:
     """Assign numbers to the committed events before they are read.
 
-    If that is not possible now, such as in a read-only database, the pending events appear later.
+    If this is not possible, for example in a read-only database, the pending events appear later.
     """
     if not database.read_only:
         with suppress(UnusableStore):
@@ -120,7 +120,7 @@ def number_events(database: Database) -> None:
 
 
 def _number_pending(database: Database) -> None:
-    """Assign numbers to the committed events; raise UnusableStore if that is not possible now."""
+    """Assign numbers to the committed events. Raise UnusableStore if this is not possible now."""
     if database.is_sqlite:
         return
     with database.read() as connection:
@@ -133,13 +133,13 @@ def _number_pending(database: Database) -> None:
 
 
 def anchor_of_now(database: Database, map_name: str) -> str:
-    """Return the last event of a map as an anchor that identifies the map's present state.
+    """Return the last event of a map as an anchor that identifies the current state of the map.
 
-    It covers all changes that were committed before this call.
+    The anchor covers all changes that were committed before this call.
 
     Raises
     ------
-    UnusableStore : the pending events cannot be numbered now.
+    UnusableStore : If the pending events cannot be numbered now.
     """
     _number_pending(database)
     with database.read() as connection:
@@ -153,10 +153,10 @@ def anchor_of_now(database: Database, map_name: str) -> str:
 
 
 def holds_anchor(connection: Connection, anchor: str) -> bool:
-    """Return whether an anchor marks the present state, or an earlier one of the same history.
+    """Return whether an anchor marks the current state, or an earlier state of the same history.
 
-    A database that was restored to an earlier state assigns the same numbers again, but not at the
-    same times to the same frames.
+    A database that was restored to an earlier state assigns the same numbers again, but to events
+    with other times and frames.
     """
     number = anchor_number(anchor)
     if number is None:
@@ -173,7 +173,7 @@ def _fingerprint(number: int, at: float, frame_id: str | None) -> str:
 
 @dataclass(frozen=True)
 class EventRow:
-    """An event; fields as in the table."""
+    """Event; see the table for the fields."""
 
     number: int
     at: float
@@ -190,11 +190,11 @@ class EventFilter:
 
     Parameters
     ----------
-    maps : names of the only maps; None: all maps, and events without a map
-    kinds : prefixes of kinds, one of which must match; empty: all kinds
+    maps : names of the selected maps; None selects all maps, and events without a map
+    kinds : prefixes of kinds, one of which must match; empty selects all kinds
     of_maps : whether events without a map are excluded
-    since : time at which the caller first got access, seconds since 1970. Events of a map that was
-        deleted before are hidden, even if another map has its name; None: show them
+    since : time of the caller's first access, seconds since 1970; events of maps that were deleted
+        before are hidden, even if another map has the same name. None shows them
     """
 
     maps: frozenset[str] | None = None
@@ -219,9 +219,10 @@ def newest_number(connection: Connection) -> int:
 
 
 def newest_seen(connection: Connection, wanted: EventFilter) -> int:
-    """Return the number of the newest event of any kind that the caller may see; 0 if none.
+    """Return the number of the newest event of any kind that the caller may see; 0 if there is
+    none.
 
-    Positions in the list are reported as this number: it does not change with hidden events.
+    Positions in the list are reported as this number, since hidden events do not change it.
     """
     if wanted.maps is not None:
         beginnings = _beginnings(connection, wanted)
@@ -243,7 +244,7 @@ def list_events(
     connection: Connection, wanted: EventFilter, *, after: int = 0, before: int | None = None,
     limit: int = 1000, newest_first: bool = False,
 ) -> list[EventRow]:  # fmt: skip
-    """Return the events between two numbers, both excluded.
+    """Return the events between two numbers, which are excluded.
 
     Call `number_events` first to include the events of writers of single maps.
     """
@@ -261,16 +262,14 @@ def list_events(
     return [EventRow(**row) for row in connection.execute(statement).mappings()]
 
 
-#: Maximum number of maps with their own beginning in a statement: SQLite limits its depth.
+#: Maximum number of maps with a beginning in a statement, whose depth SQLite limits.
 _MOST_BEGINNINGS = 500
-#: Condition as in the partial index; see `_LIVING` of `deletion`.
+#: Condition with a literal value for the partial index; see `_LIVING` of `deletion`.
 _DELETED: ColumnElement[bool] = events.c.kind == literal_column("'map.deleted'")
 
 
 def _beginnings(connection: Connection, wanted: EventFilter) -> dict[str, int]:
-    """Return, by map, the last event to hide: a map with that name was deleted before the caller's
-    access.
-    """
+    """Return the last hidden event of each map whose name a deleted map had before the access."""
     if wanted.since is None or wanted.maps is None:
         return {}
     statement = (
@@ -282,7 +281,7 @@ def _beginnings(connection: Connection, wanted: EventFilter) -> dict[str, int]:
 
 
 def _of_maps(names: Collection[str], beginnings: Mapping[str, int]) -> ColumnElement[bool]:
-    """Return the condition that an event is of one of the maps, and after the map's beginning."""
+    """Return the condition for events of some maps, after the beginnings of these maps."""
     whole = events.c.map.in_(sorted(set(names) - beginnings.keys()))
     if len(beginnings) > _MOST_BEGINNINGS:
         last = max(beginnings.values())
@@ -300,20 +299,18 @@ def anchor_number(anchor: str) -> int | None:
     return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else None
 
 
-def removal_floors(connection: Connection, kept: int) -> dict[str | None, int]:
-    """Return, by map, the number of its newest surplus event, for maps with more than `kept`
-    events.
+def removal_floors(connection: Connection, most_events: int) -> dict[str | None, int]:
+    """Return the number of the newest surplus event of each map with too many events.
 
-    None stands for the events without a map and those of deleted maps together, so that their
-    number is bounded.
+    The key None stands for the events without a map and of deleted maps, whose total is limited.
 
     Parameters
     ----------
-    kept : maximum number of events per map
+    most_events : maximum number of events per map
     """
     oldest = connection.execute(select(func.min(events.c.number))).scalar()
-    if oldest is None or newest_number(connection) - oldest < kept:
-        return {}  # all maps together have no more
+    if oldest is None or newest_number(connection) - oldest < most_events:
+        return {}  # the total number of events does not exceed the limit
     numbers: dict[str | None, int] = {}
     for name in (*_names(connection), None):
         condition = _of(name)
@@ -321,70 +318,70 @@ def removal_floors(connection: Connection, kept: int) -> dict[str | None, int]:
             connection.execute(select(end(events.c.number)).where(condition)).scalar()
             for end in (func.min, func.max)
         )
-        if least is None or most is None or most - least < kept:
+        if least is None or most is None or most - least < most_events:
             continue
         beyond = select(events.c.number).where(condition).order_by(events.c.number.desc())
-        number = connection.execute(beyond.offset(kept).limit(1)).scalar()
+        number = connection.execute(beyond.offset(most_events).limit(1)).scalar()
         if number is not None:
             numbers[name] = number
     return numbers
 
 
-def removal_floor(connection: Connection, wanted: EventFilter, kept: int, after: int) -> int:
-    """Return the number up to which requested events may have been removed; 0: none were.
+def removal_floor(connection: Connection, wanted: EventFilter, most_events: int, after: int) -> int:
+    """Return the number up to which requested events may have been removed; 0 if none were.
 
     Parameters
     ----------
-    wanted : filter; its kinds are ignored
-    kept : see `removal_floors`
+    wanted : filter, whose kinds are ignored
+    most_events : maximum number of events per map
     after : position of the reader; a smaller result may be returned as 0
     """
-    if newest_number(connection) - kept <= after:
-        return 0  # a map has no more events than there are numbers
-    numbers = removal_floors(connection, kept)
+    if newest_number(connection) - most_events <= after:
+        return 0  # no map can have too many events after that position
+    numbers = removal_floors(connection, most_events)
     if wanted.maps is None:
         return max(numbers.values(), default=0)
     names = set(_names(connection))
     own = [numbers.get(name, 0) for name in wanted.maps & names]
     beginnings = _beginnings(connection, wanted)
-    gone = {
+    deleted = {
         name for name in wanted.maps - names
         if last_event(connection, name) > beginnings.get(name, 0)
     }  # fmt: skip
-    return max([*own, *_former_floors(connection, gone, numbers.get(None, 0))])
+    return max([*own, *_former_floors(connection, deleted, numbers.get(None, 0))])
 
 
 def _former_floors(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
-    """Yield the result of `removal_floor` for each deleted map, after a 0.
+    """Yield 0, and the result of `removal_floor` for each deleted map.
 
-    The events of deleted maps are removed together, but a reader misses nothing after a map's last
-    event.
+    The events of deleted maps are removed together, but a reader behind the last event of a map has
+    missed nothing.
     """
     yield 0
     for name in names:
         last = last_event(connection, name)
         left = select(events.c.number).where(events.c.map == name).limit(1)
-        # if its last event is removed as well, the common floor does not cover the map
+        # the common floor does not apply to a map whose last event has been removed
         yield last if connection.execute(left).first() is None else min(floor, last)
 
 
 def surplus_events(
-    connection: Connection, kept: int, anchors: Collection[int], limit: int
+    connection: Connection, most_events: int, anchors: Collection[int], limit: int
 ) -> list[int]:
     """Return the numbers of events to remove, map by map, the oldest first.
 
-    An index is valid while its anchor exists: the last event of its map when it was built. So the
-    newest surplus event of each map stays, which an index under construction may use, and so do the
-    anchors of existing indexes.
+    An index is valid while its anchor exists, which is the last event of its map at the time of the
+    build. The anchors of existing indexes are therefore not removed, nor is the newest surplus
+    event of each map, which an index under construction may use.
 
     Parameters
     ----------
-    kept : maximum number of events per map
-    anchors : numbers of the events that stay
-    limit : maximum number of events
+    most_events : maximum number of events per map
+    anchors : numbers of events that must not be removed
+    limit : maximum number of returned events
     """
     numbers: list[int] = []
-    for name, floor in removal_floors(connection, kept).items():
+    for name, floor in removal_floors(connection, most_events).items():
         old = select(events.c.number).where(_of(name), events.c.number <= floor)
         stay = {number for number in anchors if number <= floor}
         if name is not None:
@@ -408,21 +405,21 @@ def _names(connection: Connection) -> list[str]:
 
 
 def _of(name: str | None) -> ColumnElement[bool]:
-    """Return the condition that an event is of a map; None: of no existing map."""
+    """Return the condition for events of a map; None selects events of no existing map."""
     if name is not None:
         return events.c.map == name
     return or_(events.c.map.is_(None), events.c.map.not_in(select(maps.c.name)))
 
 
-# Former maps, by name: the number of the last event, after which a reader has missed nothing, and
-# the quota, which the next map with the name inherits.
+# Former maps by name, with the number of the last event, and the quota, which the next map with the
+# name inherits.
 
 #: Maximum number of former maps without a quota.
 MOST_FORMER = 10_000
 
 
 def record_former_map(connection: Connection, row: MapRow) -> None:
-    """Record a map that was just removed, after its last event."""
+    """Record a removed map after its last event."""
     last = select(func.max(events.c.number)).where(events.c.map == row.name)
     connection.execute(delete(former_maps).where(former_maps.c.name == row.name))
     connection.execute(
@@ -446,7 +443,7 @@ def record_former_map(connection: Connection, row: MapRow) -> None:
 
 
 def inherit_quota(connection: Connection, name: str) -> dict[str, float | None]:
-    """Return the quota of the former map with a name, and pass it on to the new one."""
+    """Return the quota of the former map with a name, and remove it from the former map."""
     statement = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
     row = connection.execute(statement.where(former_maps.c.name == name)).mappings().first()
     connection.execute(delete(former_maps).where(former_maps.c.name == name))
@@ -454,7 +451,7 @@ def inherit_quota(connection: Connection, name: str) -> dict[str, float | None]:
 
 
 def last_event(connection: Connection, name: str) -> int:
-    """Return the number of the last event of a deleted map, or a lower bound if forgotten."""
+    """Return the number of a deleted map's last event, or a lower bound if it is not recorded."""
     number = connection.execute(
         select(former_maps.c.number).where(former_maps.c.name == name)
     ).scalar()

@@ -1,4 +1,4 @@
-"""Frames of a map by their metadata: filters, lists, sessions and paths."""
+"""Select frames of a map by their metadata: filters, lists, sessions and paths."""
 
 from __future__ import annotations
 
@@ -45,25 +45,25 @@ from sceneprint_client.api.listing import FrameListing, Run, Stamp
 
 _NONE: NDArray[np.int64] = np.empty(0, np.int64)
 
-#: The order in which the frames of a session were captured: by time; then, without a time, by their
-#: position in the session; then by upload. Every list, path and graph of a session follows it.
-TAKEN_ORDER: tuple[ColumnElement[Any], ...] = (
+#: Order in which the frames of a session were captured: by time, then by position in the session,
+#: then by upload. All lists, paths and graphs of a session use it.
+CAPTURE_ORDER: tuple[ColumnElement[Any], ...] = (
     frames.c.captured_at.is_(None), frames.c.captured_at,
     frames.c.sequence.is_(None), frames.c.sequence, frames.c.number,
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class TakenPosition:
-    """The position of a frame in `TAKEN_ORDER`; fields as in the table."""
+class CapturePosition:
+    """Position of a frame in `CAPTURE_ORDER`; see the table for the fields."""
 
     number: int
     captured_at: float | None
     sequence: int | None
 
 
-def _after_taken(last: TakenPosition) -> ColumnElement[bool]:
-    """Return the condition that a frame comes after a position in `TAKEN_ORDER`."""
+def _after_capture(last: CapturePosition) -> ColumnElement[bool]:
+    """Return the condition for frames after a position in `CAPTURE_ORDER`."""
     after: ColumnElement[bool] = frames.c.number > last.number
     for column, value in (
         (frames.c.sequence, last.sequence),
@@ -78,7 +78,7 @@ def _after_taken(last: TakenPosition) -> ColumnElement[bool]:
 
 @dataclass(frozen=True)
 class QueryOrigin:
-    """The robot, session and time (seconds since 1970) of a query, if known."""
+    """Robot, session and time (seconds since 1970) of a query, if known."""
 
     robot: str | None
     session: str | None
@@ -95,7 +95,7 @@ def passing_frames(
     wanted : filter
     origin : origin of the query, with session and time if the filter excludes its surroundings
     """
-    # one text: 100,000 rows take many times as long
+    # a single text is much faster than 100,000 rows
     listed = func.aggregate_strings(cast(frames.c.number, String), ",")
     numbers = connection.execute(
         select(listed).where(
@@ -110,7 +110,7 @@ def passing_frames(
 def _common_conditions(
     wanted: Filter | FrameListing | Run, tags: Sequence[str] = ()
 ) -> list[ColumnElement[bool]]:
-    """Return conditions on robot, session, tags and time, which null columns fail."""
+    """Return conditions on robot, session, tags and time, which are false for null columns."""
     c, conditions = frames.c, list[ColumnElement[bool]]()
     for column, names in ((c.robot, wanted.robot), (c.session, wanted.session)):
         if isinstance(names, str):
@@ -147,7 +147,7 @@ def _conditions(map_number: int, wanted: Filter, origin: QueryOrigin) -> list[Co
 
 
 def _elsewhere(origin: QueryOrigin, seconds: float) -> ColumnElement[bool]:
-    """Return the condition that a frame is of another session, or taken long before or after."""
+    """Return the condition for frames of other sessions, or captured long before or after."""
     if origin.session is None or origin.captured_at is None:
         raise ValueError("the query has no session or no time")
     apart = [
@@ -156,19 +156,19 @@ def _elsewhere(origin: QueryOrigin, seconds: float) -> ColumnElement[bool]:
         frames.c.captured_at < origin.captured_at - seconds,
         frames.c.captured_at > origin.captured_at + seconds,
     ]
-    if origin.robot is not None:  # two robots may use the same names of sessions
+    if origin.robot is not None:  # two robots may use the same session names
         apart.append(frames.c.robot != origin.robot)
     return or_(*apart)
 
 
 # Lists of frames, a page at a time.
 
-#: States of the frames that a list contains by default.
+#: States of frames in a list by default.
 _LIVING = tuple(state for state in FrameState if state != FrameState.DELETED)
 
 
 def list_frames(
-    connection: Connection, map_number: int, beyond: TakenPosition | None, limit: int,
+    connection: Connection, map_number: int, beyond: CapturePosition | None, limit: int,
     wanted: FrameListing,
 ) -> list[FrameRow]:  # fmt: skip
     """Return frames of a map in upload order, its reverse, or the order of capture.
@@ -178,12 +178,12 @@ def list_frames(
     beyond : position of the last frame of the previous page, by its number unless the list is in
         the order of capture; None for the first page
     limit : maximum number of frames
-    wanted : conditions; deleted frames only on request
+    wanted : conditions; deleted frames are excluded unless requested
     """
     states = _LIVING if wanted.state is None else (wanted.state,)
-    # A page of a large map is read in one of two ways: in the order of numbers until it is full, if
-    # most frames pass or another index finds few; else by the index that covers all conditions.
-    # "+ 0" rules out the first way for SQLite.
+    # A page of a large map is read in one of two ways: in the order of numbers until the page is
+    # full, if most frames match or another index selects few; or by the index that covers all
+    # conditions. "+ 0" rules out the first way for SQLite.
     number: ColumnElement[Any] = frames.c.number + 0 if _is_narrow(wanted) else frames.c.number
     numbers: Select[Any] = select(frames.c.number).where(
         frames.c.map_number == map_number,
@@ -191,9 +191,9 @@ def list_frames(
         *_listing_conditions(map_number, wanted),
     )
     if wanted.order == "taken":
-        numbers = numbers.order_by(*TAKEN_ORDER)
+        numbers = numbers.order_by(*CAPTURE_ORDER)
         if beyond is not None:
-            numbers = numbers.where(_after_taken(beyond))
+            numbers = numbers.where(_after_capture(beyond))
     elif wanted.order == "desc":
         numbers = numbers.order_by(number.desc())
         if beyond is not None:
@@ -211,7 +211,7 @@ def list_frames(
 
 
 def count_listed(connection: Connection, map_number: int, wanted: FrameListing, after: int) -> int:
-    """Return the number of frames of `list_frames`, in upload order, after a number."""
+    """Return the number of frames that `list_frames` returns in upload order after a number."""
     states = _LIVING if wanted.state is None else (wanted.state,)
     return count_rows(
         connection, frames.c.map_number == map_number, frames.c.state.in_(states),
@@ -221,7 +221,7 @@ def count_listed(connection: Connection, map_number: int, wanted: FrameListing, 
 
 def _is_narrow(wanted: FrameListing) -> bool:
     if wanted.tag or wanted.content_id is not None or wanted.find is not None:
-        return False  # these have indexes of their own
+        return False  # these conditions have separate indexes
     named = (wanted.captured_after, wanted.captured_before, wanted.parent_frame, wanted.has_pose)
     rare = wanted.state not in (None, FrameState.INDEXED)
     return bool(wanted.robot or wanted.session or wanted.name or rare) or any(
@@ -247,37 +247,35 @@ def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnEle
     if wanted.find is not None:
         conditions.append(_begins_any(map_number, wanted.find))
     if wanted.state == FrameState.DELETED and conditions:
-        conditions.append(c.deletion.is_(None))  # the metadata of tombstones is hidden
+        conditions.append(c.deletion.is_(None))  # tombstones must not reveal their metadata
     return conditions
 
 
 def _begins_any(map_number: int, prefix: str) -> ColumnElement[bool]:
-    """Return the condition that id, name or session of a frame begins with a prefix, each by its
-    index.
-    """
+    """Return the condition for frames whose id, name or session starts with a prefix."""
     own = frames.c.map_number == map_number
     ways = [
         select(frames.c.number).where(own, *_begins(column, prefix)).correlate(None)
         for column in (frames.c.id, frames.c.name)
     ]
-    # the index of sessions has the state before them
+    # the index of sessions starts with the state
     living = frames.c.state.in_(_LIVING)
     ways.append(select(frames.c.number).where(own, living, *_begins(frames.c.session, prefix)))
     return frames.c.number.in_(union(*ways))
 
 
 def _begins(column: Column[Any], prefix: str) -> list[ColumnElement[bool]]:
-    """Return the conditions that a text begins with a prefix, as a range that indexes support."""
+    """Return the conditions for texts that start with a prefix, as a range that indexes support."""
     head = prefix.rstrip(_LAST)
     if not head:
         return [column >= prefix]
     above = ord(head[-1]) + 1
-    if above in _SURROGATES:  # no characters
+    if above in _SURROGATES:  # surrogates are not characters
         above = _SURROGATES.stop
     return [column >= prefix, column < head[:-1] + chr(above)]
 
 
-#: The last code point, and those of surrogates.
+#: The last code point, and the code points of surrogates.
 _LAST, _SURROGATES = chr(0x10FFFF), range(0xD800, 0xE000)
 
 
@@ -286,11 +284,11 @@ _LAST, _SURROGATES = chr(0x10FFFF), range(0xD800, 0xE000)
 
 @dataclass
 class RunSummary:
-    """The frames of one robot and one session.
+    """Summary of the frames of one robot and one session.
 
     Parameters
     ----------
-    robot, session : None if unknown
+    robot, session : names, or None if unknown
     states : number of frames by state
     posed : number of frames with a pose
     first, last : range of the capture times, seconds since 1970
@@ -315,7 +313,7 @@ def list_runs(
 
     Parameters
     ----------
-    after : session and robot of the last run of the previous page; "" for unknown ones
+    after : session and robot of the last run of the previous page; "" if unknown
     limit : maximum number of runs
     """
     key = (func.coalesce(frames.c.session, ""), func.coalesce(frames.c.robot, ""))
@@ -352,7 +350,7 @@ def list_runs(
         .join_from(frames, frame_tags, number == frames.c.number)
         .where(*of_page)
         .group_by(*key, tag)
-        .order_by(tag)  # sorts tags of equal counts
+        .order_by(tag)  # the order of tags with equal counts
     )
     for session, robot, name, count in connection.execute(tagged):
         runs[session, robot].tags[name] += count
@@ -362,7 +360,7 @@ def list_runs(
 def count_run(
     connection: Connection, map_number: int, run: Run
 ) -> list[tuple[str | None, str | None, int]]:
-    """Return robot, parent frame and number of frames of each part of a session."""
+    """Return the robot, parent frame and number of frames of each part of a session."""
     groups = connection.execute(
         select(frames.c.robot, frames.c.pose_parent, func.count())
         .where(*_of_session(map_number, run))
@@ -373,9 +371,9 @@ def count_run(
 
 
 def stamps_of_run(connection: Connection, map_number: int, run: Run) -> Stamp | None:
-    """Return the stamps of a run's poses: times, or positions in the session; None without either.
+    """Return the kind of stamps for a run's poses: times or positions in the session.
 
-    Only the clock `taken` leaves a choice.
+    Return None if the frames have neither. Only the clock `taken` leaves a choice.
     """
     if run.clock != "taken":
         return run.clock
@@ -393,18 +391,18 @@ def stamps_of_run(connection: Connection, map_number: int, run: Run) -> Stamp | 
 def poses_of_run(
     connection: Connection, map_number: int, run: Run, stamp: Stamp
 ) -> tuple[list[tuple[str, float, list[list[float]]]], int]:
-    """Return posed frames of a run, sorted by stamp; of frames with equal stamps, only the first.
+    """Return posed frames of a run, sorted by stamp. Of frames with equal stamps, only one counts.
 
     Parameters
     ----------
-    run : run; with `most`, at most so many frames, evenly spaced. Only their rows are read: an
-        index covers the selection
-    stamp : see `stamps_of_run`; with `received`, all posed frames in upload order
+    run : run; if `most` is set, at most that many evenly spaced frames are returned, whose rows an
+        index selects
+    stamp : kind of stamp from `stamps_of_run`; `received` selects all posed frames in upload order
 
     Returns
     -------
     poses : id of the frame, stamp (seconds since 1970, or position), and T_parent_sensor
-    count : number of all such frames
+    count : total number of such frames
     """
     c = frames.c
     at = {"captured": c.captured_at, "sequence": c.sequence, "received": c.received_at}[stamp]
@@ -413,8 +411,8 @@ def poses_of_run(
     if stamp == "received":
         first = posed.add_columns(c.number.label("order")).subquery()
     else:
-        order = (at, *TAKEN_ORDER)
-        rank = func.row_number().over(partition_by=at, order_by=TAKEN_ORDER).label("rank")
+        order = (at, *CAPTURE_ORDER)
+        rank = func.row_number().over(partition_by=at, order_by=CAPTURE_ORDER).label("rank")
         stamped = posed.add_columns(at.label("order"), rank).where(at.is_not(None)).subquery()
         first = select(stamped.c.number, stamped.c.order).where(stamped.c.rank == 1).subquery()
     chosen = select(first.c.number)
@@ -422,7 +420,7 @@ def poses_of_run(
     if run.most is not None and run.most < count:
         place = (func.row_number().over(order_by=first.c.order) - 1).label("place")
         placed = select(first.c.number, place).subquery()
-        # the `most` multiples of (count - 1) / (most - 1), rounded up: from 0 to count - 1
+        # selects the `most` multiples of (count - 1) / (most - 1), rounded up, from 0 to count - 1
         even = (placed.c.place * (run.most - 1)) % (count - 1) < run.most - 1
         chosen = select(placed.c.number).where(even)
     poses = select(c.id, at, c.pose).where(c.number.in_(chosen)).order_by(*order)
@@ -430,7 +428,7 @@ def poses_of_run(
 
 
 def _posed(map_number: int, run: Run) -> list[ColumnElement[bool]]:
-    """Return the conditions of a run's frames with a pose in its parent frame."""
+    """Return the conditions for a run's frames with a pose in its parent frame."""
     return [
         *_of_session(map_number, run),
         frames.c.pose_parent == run.parent_frame,
@@ -448,11 +446,11 @@ def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
 
 @dataclass(frozen=True)
 class PathFrame:
-    """A frame of a run, with the values that associations need.
+    """Frame of a run with the values that associations need.
 
     Parameters
     ----------
-    robot, session, captured_at, name, sequence : None if unknown
+    robot, session, captured_at, name, sequence : metadata, or None if unknown
     parent : parent frame of the pose
     pose : T_parent_sensor, or None
     is_cloud : whether the frame is a point cloud
@@ -471,7 +469,7 @@ class PathFrame:
 
     @property
     def kind(self) -> Kind:
-        """Whether the frame is a depth image or a point cloud."""
+        """Kind of the frame: depth image or point cloud."""
         return "cloud" if self.is_cloud else "depth"
 
 
@@ -485,11 +483,11 @@ def numbers_of_session(
     )
     if robot is not None:
         statement = statement.where(c.robot == robot)
-    return list(connection.execute(statement.order_by(*TAKEN_ORDER)).scalars())
+    return list(connection.execute(statement.order_by(*CAPTURE_ORDER)).scalars())
 
 
 def parents_of_session(connection: Connection, map_number: int, session: str) -> dict[str, int]:
-    """Return the number of a session's indexed frames by the parent frame of their poses."""
+    """Return the number of a session's indexed frames by parent frame of their poses."""
     c = frames.c
     counts = select(c.pose_parent, func.count()).where(*_posed_in(map_number, session))
     groups = connection.execute(counts.group_by(c.pose_parent).order_by(c.pose_parent))
@@ -499,12 +497,10 @@ def parents_of_session(connection: Connection, map_number: int, session: str) ->
 def posed_in_session(
     connection: Connection, map_number: int, session: str, parent: str
 ) -> list[int]:
-    """Return the numbers of a session's indexed frames with poses in a parent frame, in capture
-    order.
-    """
+    """Return the numbers of a session's indexed, posed frames of a parent frame, as captured."""
     own = (*_posed_in(map_number, session), frames.c.pose_parent == parent)
     return list(
-        connection.execute(select(frames.c.number).where(*own).order_by(*TAKEN_ORDER)).scalars()
+        connection.execute(select(frames.c.number).where(*own).order_by(*CAPTURE_ORDER)).scalars()
     )
 
 
@@ -517,7 +513,7 @@ def _posed_in(map_number: int, session: str) -> list[ColumnElement[bool]]:
 
 
 def any_purged(connection: Connection, numbers: Iterable[int]) -> bool:
-    """Return whether any of some frames was removed, or deleted so that it cannot be restored."""
+    """Return whether any frame was removed, or deleted without the possibility of a restore."""
     own = set(numbers)
     existing = select(frames.c.number).where(not_purged())
     return len(own) > sum(1 for _ in rows_among(connection, existing, frames.c.number, own))
@@ -526,9 +522,9 @@ def any_purged(connection: Connection, numbers: Iterable[int]) -> bool:
 def numbers_of_runs(
     connection: Connection, map_number: int, session: str | None, robot: str | None
 ) -> list[int]:
-    """Return the numbers of the indexed frames of a map, of one session or robot if set.
+    """Return the numbers of the indexed frames of a map, of a session or a robot.
 
-    They are sorted by run, then by time, then by upload; frames without a time are last.
+    The order is by run, time and upload; frames without a time are last.
     """
     c = frames.c
     statement = select(c.number).where(c.map_number == map_number, c.state == FrameState.INDEXED)
@@ -541,7 +537,7 @@ def numbers_of_runs(
 
 
 def path_frames(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
-    """Return the indexed frames by their numbers."""
+    """Return indexed frames by number."""
     statement = select(
         frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
         frames.c.pose_parent, frames.c.pose, frames.c.cloud.is_not(null()), frames.c.name,
@@ -555,12 +551,12 @@ def path_frames(connection: Connection, numbers: Iterable[int]) -> dict[int, Pat
 
 @dataclass(frozen=True)
 class FrameUp:
-    """The stored up vectors of a frame and its map.
+    """Stored up vectors of a frame and its map.
 
     Parameters
     ----------
     parent, pose : parent frame and T_parent_sensor, 4 rows of 4; None without a pose
-    up : unit vector in the sensor's axes, as sent
+    up : unit vector in the sensor's axes from the upload
     map_up : unit vector in the parent frames of the map
     """
 
@@ -592,7 +588,7 @@ def positions_of_map(connection: Connection, map_number: int) -> dict[str, NDArr
     positions: dict[str, list[NDArray[np.float64]]] = {}
     for rows in connection.execute(statement).partitions(
         10_000
-    ):  # arrays take much less memory than rows
+    ):  # arrays need much less memory than rows
         parents = np.array([row[0] for row in rows], object)
         at = np.array([row[1:] for row in rows], np.float64)
         for parent in dict.fromkeys(parents):
@@ -609,7 +605,7 @@ def has_parent_frame(connection: Connection, map_number: int, parent: str) -> bo
     return connection.execute(statement.limit(1)).first() is not None
 
 
-# Sizes of a map, and samples of its frames, by indexes.
+# Sizes of a map, and samples of its frames, which indexes provide.
 
 _WITH_UPLOAD = tuple(state for state in FrameState if state not in ROOMLESS)
 
@@ -617,12 +613,10 @@ _WITH_UPLOAD = tuple(state for state in FrameState if state not in ROOMLESS)
 def frames_with_uploads(
     connection: Connection, map_number: int, most: int
 ) -> tuple[list[int], int]:
-    """Return the numbers of evenly spaced frames of a map that have an upload, and the number of
-    all.
-    """
+    """Return the numbers of evenly spaced frames with uploads, and the count of all such frames."""
     own = (frames.c.map_number == map_number) & frames.c.state.in_(_WITH_UPLOAD)
     total = count_rows(connection, own)
-    # "+ 0", as above, so that the index of states is used, and no rows are read
+    # "+ 0" makes SQLite use the index of states, which avoids reading rows
     place = (func.row_number().over(order_by=frames.c.number + 0) - 1).label("place")
     listed = select(frames.c.number, place).where(own).subquery()
     step = max(-(-total // most), 1)
@@ -631,17 +625,17 @@ def frames_with_uploads(
 
 
 def sample_frames(connection: Connection, most: int) -> list[int]:
-    """Return the numbers of frames of all maps that have an upload, from the oldest to the newest.
+    """Return the numbers of a sample of the frames of all maps with uploads, the oldest first.
 
     Parameters
     ----------
-    most : maximum number; fewer are returned if neighbours were deleted
+    most : maximum number of frames; fewer are returned if some were deleted
     """
     ends = select(func.min(frames.c.number), func.max(frames.c.number))
     first, last = connection.execute(ends).one()
     if first is None:
         return []
-    # the index finds each number: counting would read all frames
+    # each number is a search in the index, whereas counting would read all frames
     numbers = {first + (last - first) * place // max(most - 1, 1) for place in range(most)}
     nearest = set()
     for number in numbers:
@@ -658,14 +652,12 @@ def count_uploads(connection: Connection) -> int:
 
 
 def bytes_of_files(connection: Connection) -> int:
-    """Return the bytes of all files of jobs."""
+    """Return the total size of the files of all jobs, bytes."""
     return int(connection.execute(select(func.sum(job_files.c.bytes))).scalar() or 0)
 
 
 def stored_sizes(connection: Connection, numbers: Sequence[int]) -> tuple[int, int, list[str]]:
-    """Return the bytes of the uploads and signatures of some frames, and the blobs of their
-    artifacts.
-    """
+    """Return the bytes of uploads and of signatures of frames, and the blobs of their artifacts."""
     sizes = rows_among(connection, select(frames.c.bytes), frames.c.number, numbers)
     uploads = sum(row.bytes for row in sizes)
     statement = select(func.length(signatures.c.vector), signatures.c.geometry)

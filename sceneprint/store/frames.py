@@ -1,4 +1,4 @@
-"""Changes to existing frames and maps, and references to blobs."""
+"""Change existing frames and maps, and find references to blobs."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> 
 def renew_upload(
     connection: Connection, number: int, blob: str, size: int, reason: str | None
 ) -> None:
-    """Replace the upload of a frame by one with the same content; nothing else changes.
+    """Replace the upload of a frame by one with the same content.
 
     Parameters
     ----------
-    blob, size : new upload
+    blob, size : digest and size of the new upload
     reason : new reason of the frame's state
     """
     _update_usage(connection, number, None, size)
@@ -65,7 +65,7 @@ def renew_upload(
 def set_state(
     connection: Connection, number: int, state: FrameState, reason: str | None = None
 ) -> None:
-    """Move a frame to a state in which it is not searched; a deleted frame stays deleted."""
+    """Set a frame to a state without searches; a deleted frame remains deleted."""
     ended_at = None
     if state == FrameState.REDUNDANT:
         _update_usage(connection, number, state, None)
@@ -80,29 +80,29 @@ def set_state(
 def delete_frame(
     connection: Connection, row: MapRow, frame: FrameRow, deletion: int | None = None
 ) -> list[str]:
-    """Delete one frame; parameters and result as in `delete_frames`.
+    """Delete one frame; see `delete_frames` for parameters and result.
 
     Raises
     ------
-    UnknownFrame : the frame is deleted already.
+    UnknownFrame : If the frame is already deleted.
     """
     if frame.state == FrameState.DELETED:
-        raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
+        raise UnknownFrame(f"Frame {frame.id} of map {row.name!r} is already deleted.")
     return delete_frames(connection, row, [frame.number], deletion=deletion)
 
 
 def not_purged() -> ColumnElement[bool]:
-    """Return the condition that a frame exists, or is deleted and can be restored."""
+    """Return the condition for frames that exist or can be restored."""
     return or_(frames.c.state != FrameState.DELETED, frames.c.deletion.is_not(None))
 
 
 def refers_to(connection: Connection, blob: str) -> bool:
-    """Return whether anything refers to a blob; see `referred_blobs`."""
+    """Return whether a row refers to a blob; see `referred_blobs`."""
     return bool(referred_blobs(connection, [blob]))
 
 
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
-    """Return those of at most a thousand blobs that a row of any table refers to."""
+    """Return the blobs that a row of any table refers to, of at most a thousand blobs."""
     has_upload = or_(frames.c.state.not_in(ROOMLESS), frames.c.deletion.is_not(None))
     referring = (
         (frames.c.blob, has_upload),
@@ -126,13 +126,13 @@ def count_states(connection: Connection, map_number: int | None = None) -> dict[
 def _update_usage(
     connection: Connection, number: int, state: FrameState | None, size: int | None
 ) -> None:
-    """Update the use of the map for a frame's new state and size.
+    """Update the usage of the map for a frame's new state and size.
 
     Parameters
     ----------
     connection : writing transaction
-    state : new state; None: unchanged
-    size : new bytes of the upload; None: unchanged
+    state : new state; None if unchanged
+    size : new size of the upload, bytes; None if unchanged
     """
     statement = select(frames.c.map_number, frames.c.state, frames.c.bytes)
     map_number, old, before = connection.execute(statement.where(frames.c.number == number)).one()
@@ -144,10 +144,7 @@ def _update_usage(
 
 
 def relax_novelty(connection: Connection, number: int, novelty: float | None) -> None:
-    """Set the weaker of two novelty thresholds for a frame that is not signed yet.
-
-    None is the weakest: the frame is stored in any case.
-    """
+    """Set the smaller of two novelty thresholds for an unsigned frame. None accepts every frame."""
     weaker: ColumnElement[bool] = frames.c.novelty.is_not(None)
     if novelty is not None:
         weaker = frames.c.novelty > novelty
@@ -165,12 +162,12 @@ def relax_novelty(connection: Connection, number: int, novelty: float | None) ->
 def write_frame(
     connection: Connection, row: MapRow, frame: FrameRow, values: Mapping[str, Any]
 ) -> FrameRow:
-    """Change columns of a frame's metadata, with the columns and tags that searches use.
+    """Change columns of a frame's metadata, including the columns and tags for searches.
 
     Parameters
     ----------
     connection : writing transaction
-    frame : present row
+    frame : current row
     values : new values by column
     """
     changed = {name: new for name, new in values.items() if getattr(frame, name) != new}
@@ -190,12 +187,12 @@ def write_frame(
     return frame_of(connection, frame.number)
 
 
-#: Columns of a map whose new values the audit log contains.
+#: Columns of a map whose new values are written to the audit log.
 _LIMITS = ("quota_frames", "quota_bytes", "retention_days")
 
 
 def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
-    """Change columns of a map: title, quotas, retention, up."""
+    """Change columns of a map: title, quotas, retention or up."""
     changed = {name: new for name, new in values.items() if getattr(row, name) != new}
     if not changed:
         return row

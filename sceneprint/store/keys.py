@@ -1,4 +1,4 @@
-"""Keys of the API, stored as hashes, and requests with an `Idempotency-Key`."""
+"""API keys, which are stored as hashes, and requests with an `Idempotency-Key`."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from sceneprint_client.api.admin import Scope
 if TYPE_CHECKING:
     from sceneprint.store.database import Database
 
-#: Prefix by which scanners recognise a leaked key, such as in a public file.
+#: Prefix with which scanners recognise a leaked key, for example in a public file.
 PREFIX = "sp_"
 
 
 @dataclass(frozen=True)
 class KeyRow:
-    """A key; times are seconds since 1970.
+    """API key; times are seconds since 1970.
 
     Parameters
     ----------
-    id : unique for ever, unlike the name
+    id : identifier that is never reused, unlike the name
     name : unique name
-    grants : scope by name of a map, `*` for all maps
-    created_at, expires_at : None: the key does not expire
+    grants : scope by name of a map; `*` stands for all maps
+    created_at, expires_at : times of creation and expiry; None if the key does not expire
     tenant : owner of the key
-    previous_until : end of validity of the secret before the last rotation; None: it is not valid
-    last_used_at : time of the last use, to the hour; None: never
+    previous_until : end of validity of the secret before the last rotation; None if it is invalid
+    last_used_at : time of the last use, to the hour; None if the key was never used
     """
 
     id: str
@@ -66,17 +66,17 @@ def create_key(
     connection: Connection, name: str, grants: Mapping[str, Scope],
     expires_at: float | None = None, tenant: str | None = None,
 ) -> str:  # fmt: skip
-    """Create a key and return its secret, which is not stored; parameters as in KeyRow.
+    """Create a key, and return its secret, which is not stored; see KeyRow for the parameters.
 
-    Without `tenant`, the key belongs to a tenant of its own name.
+    Without `tenant`, the key belongs to a tenant with the name of the key.
 
     Raises
     ------
-    Conflict : the name is in use.
-    UnknownTenant : the tenant does not exist.
+    Conflict : If the name is in use.
+    UnknownTenant : If the tenant does not exist.
     """
     if connection.execute(select(keys.c.id).where(keys.c.name == name)).first() is not None:
-        raise Conflict(f"There is a key named {name!r}. Choose another name.")
+        raise Conflict(f"A key named {name!r} already exists. Choose another name.")
     secret = _new_secret()
     connection.execute(
         insert(keys).values(
@@ -93,9 +93,9 @@ def create_key(
 
 
 def find_key(connection: Connection, secret: str) -> KeyRow | None:
-    """Return the key with a secret, even if it has expired; None if there is none.
+    """Return the key with a secret, even if the key has expired; None if the secret is unknown.
 
-    If the secret is the one before the last rotation, the key expires with it.
+    For the secret before the last rotation, the returned key expires together with this secret.
     """
     digest = _digest(secret)
     row = connection.execute(_select_keys().where(keys.c.digest == digest)).mappings().first()
@@ -110,20 +110,20 @@ def find_key(connection: Connection, secret: str) -> KeyRow | None:
 
 
 def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
-    """Give a key a new secret, and return it; the grants stay.
+    """Replace the secret of a key, and return the new secret; the grants do not change.
 
-    The current secret stays valid for the overlap. If an earlier secret is still valid, it keeps
-    its time instead and the current one ends: a lost answer with a new secret then does not
-    invalidate the secret in use.
+    The current secret remains valid for the overlap. If an earlier secret is still valid, that one
+    remains valid instead, and the current secret expires. Thus the loss of a reply with a new
+    secret does not invalidate the secret in use.
 
     Parameters
     ----------
     connection : writing transaction
-    overlap_s : seconds; 0: all former secrets end now
+    overlap_s : duration of the overlap, seconds; 0 invalidates all former secrets
 
     Raises
     ------
-    UnknownKey : the key does not exist.
+    UnknownKey : If the key does not exist.
     """
     now = time.time()
     row = connection.execute(
@@ -149,7 +149,7 @@ def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
 
 
 def find_named_key(connection: Connection, name: str) -> KeyRow:
-    """Return the key of a name; raise UnknownKey if it does not exist."""
+    """Return the key with a name. Raise UnknownKey if it does not exist."""
     row = connection.execute(_select_keys().where(keys.c.name == name)).mappings().first()
     if row is None:
         raise _unknown_key(name)
@@ -159,7 +159,7 @@ def find_named_key(connection: Connection, name: str) -> KeyRow:
 def list_keys(
     connection: Connection, after: str | None = None, limit: int | None = None
 ) -> list[KeyRow]:
-    """Return keys sorted by name, after the name `after`; default: all keys."""
+    """Return keys sorted by name, after the name `after`; return all keys by default."""
     statement = _select_keys().order_by(keys.c.name).limit(limit)
     if after is not None:
         statement = statement.where(keys.c.name > after)
@@ -167,9 +167,9 @@ def list_keys(
 
 
 def revoke_key(connection: Connection, name: str) -> None:
-    """Delete a key; raise UnknownKey if the key does not exist."""
-    gone = delete(keys).where(keys.c.name == name).returning(keys.c.tenant)
-    tenant = connection.execute(gone).scalar()
+    """Delete a key. Raise UnknownKey if it does not exist."""
+    removal = delete(keys).where(keys.c.name == name).returning(keys.c.tenant)
+    tenant = connection.execute(removal).scalar()
     if tenant is None:
         raise _unknown_key(name)
     leave_tenant(connection, name, tenant)
@@ -191,19 +191,19 @@ def _select_keys() -> Select[Any]:
 
 
 def _new_secret() -> str:
-    return PREFIX + secrets.token_urlsafe(32)  # 256 random bits: no slow hash is needed
+    return PREFIX + secrets.token_urlsafe(32)  # 256 random bits do not need a slow hash
 
 
 def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-#: Seconds after a recorded use of a key in which other uses are not recorded.
+#: Seconds after a recorded use of a key for which further uses are not recorded.
 USED_S = 3600.0
 
 
 class KeyUses:
-    """Record uses of keys in memory, and write them to the database in batches; safe to share."""
+    """Uses of keys, which are collected in memory and written in batches; threads may share it."""
 
     def __init__(self) -> None:
         self._due: dict[str, float] = {}
@@ -217,27 +217,27 @@ class KeyUses:
                 self._due[key.id] = now
 
     def write(self, database: Database) -> None:
-        """Write the recorded uses; if that fails, they are lost until the next use."""
+        """Write the recorded uses; if this fails, they are lost."""
         with self._lock:
             due, self._due = self._due, {}
         if not due or database.read_only:
             return
-        # sorted against deadlocks: two processes may write the same keys at once
+        # the order prevents deadlocks between processes that write the same keys
         rows = [{"key_id": key_id, "at": at} for key_id, at in sorted(due.items())]
         statement = update(keys).where(keys.c.id == bindparam("key_id"))
         with database.write(turn=False) as connection:
             connection.execute(statement.values(last_used_at=bindparam("at")), rows)
 
 
-# Requests with an `Idempotency-Key`, stored in the transaction of their effect.
+# Requests with an `Idempotency-Key`, whose results are stored in the transaction of their effect.
 
-#: Seconds for which the result of a request is stored.
-KEPT_S = 86_400.0
+#: Seconds for which the result of a request remains stored.
+RESULT_S = 86_400.0
 
 
 @dataclass(frozen=True)
 class IdempotentRequest:
-    """A request that must take effect once.
+    """Request that must take effect only once.
 
     Parameters
     ----------
@@ -255,21 +255,21 @@ class IdempotentRequest:
 
         Raises
         ------
-        IdempotencyConflict : another request was sent with the key.
+        IdempotencyConflict : If the key was used for another request.
         """
         row = connection.execute(
             select(idempotency.c.fingerprint, idempotency.c.data).where(
                 idempotency.c.actor == self.actor,
                 idempotency.c.key == self.key,
-                idempotency.c.created_at > time.time() - KEPT_S,
+                idempotency.c.created_at > time.time() - RESULT_S,
             )
         ).first()
         if row is None:
             return None
         if row.fingerprint != self.fingerprint:
             raise IdempotencyConflict(
-                f"The Idempotency-Key {self.key!r:.80} was sent with another request within a day. "
-                "Create a key for each request, and send it again only with the same content."
+                f"The Idempotency-Key {self.key!r:.80} was used for another request within a day. "
+                "Create a new key for each request, and reuse it only for the same content."
             )
         data: dict[str, Any] = row.data
         return data
@@ -282,17 +282,17 @@ class IdempotentRequest:
     def store(self, connection: Connection, data: dict[str, Any]) -> None:
         """Store the result, in the transaction of the effect.
 
-        One statement, as other writers wait. It replaces a stored result that is older than a day
-        or of a map that was deleted since.
+        This is a single statement, because other writers wait. It replaces a stored result that is
+        older than a day or belongs to a deleted map.
 
         Raises
         ------
-        Overtaken : a transaction on another map has stored a result for the key meanwhile.
+        Overtaken : If a transaction on another map has stored a result for the key meanwhile.
         """
         values, own = self.columns(data), ("actor", "key")
         replaceable = or_(
             idempotency.c.fingerprint == self.fingerprint,
-            idempotency.c.created_at <= values["created_at"] - KEPT_S,
+            idempotency.c.created_at <= values["created_at"] - RESULT_S,
         )
         others = {name: value for name, value in values.items() if name not in own}
         statement = (
@@ -306,16 +306,16 @@ class IdempotentRequest:
 
 
 class Overtaken(Exception):
-    """Another transaction stored a row first that this one required to be absent: repeat it."""
+    """Error for a transaction that must be repeated: another one stored the same row first."""
 
 
-#: Keys to remove in one transaction; other writers wait for it.
+#: Number of results that one transaction removes; other writers wait meanwhile.
 _REMOVED_AT_ONCE = 5_000
 
 
 def remove_old_requests(database: Database) -> int:
-    """Remove results of requests older than a day, in short transactions; return their number."""
-    old = idempotency.c.created_at <= time.time() - KEPT_S
+    """Remove results older than a day in short transactions, and return their number."""
+    old = idempotency.c.created_at <= time.time() - RESULT_S
     some = select(idempotency.c.actor, idempotency.c.key).where(old).limit(_REMOVED_AT_ONCE)
     removed = 0
     with database.read() as connection:

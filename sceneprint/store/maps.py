@@ -1,4 +1,4 @@
-"""Maps, their models and quotas, and their frames: insert, find, and poses."""
+"""Insert and find maps, models and frames, check quotas, and read poses."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from sceneprint_client.api import FrameState
 
 
 def find_map(connection: Connection, name: str) -> MapRow:
-    """Return the map of a name; raise UnknownMap if the map does not exist."""
+    """Return the map with a name. Raise UnknownMap if it does not exist."""
     row = connection.execute(_map_of_name(), {"name": name}).first()
     if row is None:
         raise unknown_map(name)
@@ -66,9 +66,7 @@ def _map_of_name() -> Select[Any]:
 
 
 def current_map(connection: Connection, former: MapRow) -> MapRow:
-    """Return the present row of a map; raise UnknownMap if it was deleted, even if its name is in
-    use.
-    """
+    """Return the current row of a map. Raise UnknownMap if it was deleted, even if replaced."""
     row = find_map(connection, former.name)
     if row.number != former.number:
         raise unknown_map(former.name)
@@ -76,7 +74,7 @@ def current_map(connection: Connection, former: MapRow) -> MapRow:
 
 
 def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
-    """Return maps by their names, in order; raise UnknownMap if one does not exist."""
+    """Return the maps with these names, in order. Raise UnknownMap if one does not exist."""
     if len(names) == 1:
         return [find_map(connection, names[0])]
     selected = connection.execute(select(maps).where(maps.c.name.in_(names))).mappings()
@@ -88,7 +86,7 @@ def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
 
 
 def unknown_map(name: str) -> UnknownMap:
-    """Return the error for a map that does not exist, or that the caller may not see."""
+    """Return the error for a map that does not exist or is hidden from the caller."""
     return UnknownMap(
         f"There is no map {name!r:.80}. List the maps with `sceneprint maps` or GET /v1/maps, "
         "or create it."
@@ -96,7 +94,7 @@ def unknown_map(name: str) -> UnknownMap:
 
 
 def map_of_number(connection: Connection, number: int) -> MapRow:
-    """Return the map of a number, which must exist."""
+    """Return the map with a number, which must exist."""
     return map_row(connection.execute(select(maps).where(maps.c.number == number)).mappings().one())
 
 
@@ -111,14 +109,14 @@ def add_map(
     connection: Connection, name: str, title: str | None, model_id: str,
     limits: Mapping[str, object] | None = None,
 ) -> MapRow:  # fmt: skip
-    """Create a map; its name must be free.
+    """Create a map, whose name must be unused.
 
     Parameters
     ----------
     connection : writing transaction
-    limits : `quota_frames`, `quota_bytes`, `retention_days` and `up`, as far as they are set. Other
-        quotas are those of the former map with the name: a user who may delete and create maps must
-        not remove a quota by doing so
+    limits : values of `quota_frames`, `quota_bytes`, `retention_days` and `up`. Quotas that are not
+        set are those of the former map with the name, so that a user who may delete and create maps
+        cannot remove a quota
     """
     connection.execute(
         insert(maps).values(
@@ -131,9 +129,9 @@ def add_map(
 
 
 def next_revision(connection: Connection, map_number: int, count: int = 1) -> int:
-    """Reserve consecutive revisions of a map, and return the last.
+    """Reserve consecutive revisions of a map, and return the last one.
 
-    A revision is a change to what is searched; they are in commit order.
+    A revision is a change to the searched frames. Revisions are in commit order.
     """
     own = update(maps).where(maps.c.number == map_number)
     raised = own.values(revision=maps.c.revision + count).returning(maps.c.revision)
@@ -141,7 +139,7 @@ def next_revision(connection: Connection, map_number: int, count: int = 1) -> in
 
 
 def store_model(connection: Connection, model_id: str, name: str, content: bytes) -> None:
-    """Store a model's file, unless it is stored already."""
+    """Store the file of a model unless it is already stored."""
     if connection.execute(select(models.c.id).where(models.c.id == model_id)).first() is None:
         connection.execute(
             insert(models).values(
@@ -158,15 +156,14 @@ def model_content(connection: Connection, model_id: str) -> bytes:
 
 
 def model_names(connection: Connection) -> dict[str, str]:
-    """Return the names of all models by their id."""
+    """Return the names of all models by id."""
     return {row.id: row.name for row in connection.execute(select(models.c.id, models.c.name))}
 
 
-# Use and quotas of a map. Frames count unless they are deleted or redundant. Bytes are those of
-# uploads, including those of tombstones and of robots' own signatures while they wait, and of
-# archives until their import ends. Signatures, artifacts and indexes of the service do not count.
-# Two columns of the map hold the sums. Each transaction updates them in the map's turn, so quotas
-# are exact.
+# Usage and quotas of a map. Frames count unless they are deleted or redundant. Bytes are those of
+# uploads, including tombstones, pending signatures that robots computed, and archives until their
+# import ends. Signatures, artifacts and indexes of the service do not count. Two columns of the map
+# store the sums. Each transaction updates them in the map's turn, so quotas are exact.
 
 #: States of frames without an upload, which do not count.
 ROOMLESS = (FrameState.DELETED, FrameState.REDUNDANT)
@@ -174,20 +171,20 @@ ROOMLESS = (FrameState.DELETED, FrameState.REDUNDANT)
 
 @dataclass(frozen=True)
 class MapUsage:
-    """Frames and bytes that count against a map's quota."""
+    """Numbers of frames and bytes that count against a map's quota."""
 
     frames: int
     bytes: int
 
 
 def map_usage(connection: Connection, map_number: int) -> MapUsage:
-    """Return the stored use of a map."""
+    """Return the stored usage of a map."""
     statement = select(maps.c.used_frames, maps.c.used_bytes).where(maps.c.number == map_number)
     return MapUsage(*connection.execute(statement).one())
 
 
 def add_usage(connection: Connection, map_number: int, new_frames: int, new_bytes: int) -> None:
-    """Add frames and bytes, which may be negative, to the use of a map."""
+    """Add numbers of frames and bytes, which may be negative, to the usage of a map."""
     connection.execute(
         update(maps)
         .where(maps.c.number == map_number)
@@ -198,7 +195,7 @@ def add_usage(connection: Connection, map_number: int, new_frames: int, new_byte
 
 
 def counted_usage(connection: Connection, map_number: int) -> MapUsage:
-    """Count the use of a map over all its frames; `map_usage` must return the same."""
+    """Compute the usage of a map from all its frames; `map_usage` must return the same."""
     statement = select(func.count(), func.coalesce(func.sum(frames.c.bytes), 0)).where(
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
@@ -213,44 +210,44 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
-    """Check that a map's quota leaves room for another frame, or for a larger upload of a frame.
+    """Check that a map's quota allows another frame, or a larger upload of a frame.
 
-    Tombstones count as free: `make_room` purges as many as necessary.
+    Tombstones do not count here, since `make_room` purges as many as necessary.
 
     Parameters
     ----------
-    connection : transaction that adds the frame, or a reading one for an early check
-    size : additional bytes
+    connection : transaction that adds the frame, or a reading transaction for an early check
+    size : number of additional bytes
     new : whether the frame does not count yet
 
     Raises
     ------
-    QuotaExceeded : there is no room.
+    QuotaExceeded : If the quota would be exceeded.
     """
     if row.quota_frames is None and row.quota_bytes is None:
         return
     hint = (
-        "Delete frames that are no longer needed, or ask the operator for a larger quota "
+        "Delete frames that are no longer needed, or request a larger quota from the operator "
         f"(PATCH /v1/maps/{row.name})."
     )
     use = map_usage(connection, row.number)
     if new and row.quota_frames is not None and use.frames >= row.quota_frames:
         raise QuotaExceeded(
-            f"Map {row.name!r} holds {use.frames} frames of the {row.quota_frames} that its quota "
-            f"allows, so the frame was not stored. {hint}"
+            f"Map {row.name!r} has {use.frames} frames, and its quota is {row.quota_frames}, so "
+            f"the frame was not stored. {hint}"
         )
     if size <= 0 or row.quota_bytes is None or use.bytes + size <= row.quota_bytes:
         return
     held = use.bytes - tombstone_bytes(connection, row.number)
     if held + size > row.quota_bytes:
         raise QuotaExceeded(
-            f"Map {row.name!r} holds {held} bytes of uploads of the {row.quota_bytes} that its "
-            f"quota allows, so {size} bytes more were not stored. {hint}"
+            f"Map {row.name!r} has {held} bytes of uploads, and its quota is {row.quota_bytes}, so "
+            f"{size} more bytes were not stored. {hint}"
         )
 
 
 def tombstone_bytes(connection: Connection, map_number: int) -> int:
-    """Return the bytes of uploads of deleted frames that can be restored."""
+    """Return the total size of the uploads of a map's tombstones, bytes."""
     c = frames.c
     statement = select(func.coalesce(func.sum(c.bytes), 0)).where(
         c.map_number == map_number, c.deletion.is_not(None)
@@ -266,8 +263,8 @@ def add_frame(
     Parameters
     ----------
     connection : writing transaction
-    values : columns but number, id, state and times
-    frame_id : id, which no existing frame of the map has; default: a new one
+    values : columns except number, id, state and times
+    frame_id : id that is unused in the map; default: a new id
     """
     if frame_id is None:
         frame_id = uuid.uuid4().hex
@@ -283,23 +280,23 @@ def add_frame(
 def received_values(
     connection: Connection, map_number: int, frame_id: str, values: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the columns of a frame that is received now; see `add_frame`."""
+    """Return the columns of a frame that has just been received; see `add_frame`."""
     state, at = FrameState.RECEIVED, now(connection)
     own = {"id": frame_id, "map_number": map_number, "state": state, "received_at": at}
     return {**own, **values, **position(values["pose"])}
 
 
 def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
-    """Return the columns of a frame's position, which searches use."""
+    """Return the columns with the position of a frame, which searches use."""
     return {f"pose_{axis}": None if pose is None else pose[i][3] for i, axis in enumerate("xyz")}
 
 
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
-    """Return the frame of an id in a map, even if it is deleted.
+    """Return the frame with an id in a map, even if it is deleted.
 
     Raises
     ------
-    UnknownFrame : the frame does not exist.
+    UnknownFrame : If the frame does not exist.
     """
     frame = _first(connection, frames.c.map_number == row.number, frames.c.id == frame_id)
     if frame is None:
@@ -311,7 +308,7 @@ def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
 
 
 def frames_of_content(connection: Connection, map_number: int, content_id: str) -> list[FrameRow]:
-    """Return up to 100 frames of a map with some content, in the order of their upload."""
+    """Return up to 100 frames of a map with the same content, in upload order."""
     rows = connection.execute(
         select(frames)
         .where(frames.c.map_number == map_number, frames.c.content_id == content_id)
@@ -322,19 +319,19 @@ def frames_of_content(connection: Connection, map_number: int, content_id: str) 
 
 
 def living_frame(connection: Connection, map_number: int, frame_id: str) -> FrameRow | None:
-    """Return the frame of an id in a map; None if it does not exist or is deleted."""
+    """Return the frame with an id in a map; None if it does not exist or is deleted."""
     existing = frames.c.state != FrameState.DELETED
     return _first(connection, frames.c.map_number == map_number, frames.c.id == frame_id, existing)
 
 
 def frame_of(connection: Connection, number: int) -> FrameRow:
-    """Return the frame of a number, which must exist."""
+    """Return the frame with a number, which must exist."""
     row = connection.execute(select(frames).where(frames.c.number == number)).mappings().one()
     return frame_row(row)
 
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
-    """Return frames by their numbers, without deleted ones."""
+    """Return frames by number, except deleted frames."""
     rows = rows_of_statement(connection, _frames_of_numbers, numbers)
     return {row.number: row for row in frame_rows(rows)}
 
@@ -346,7 +343,10 @@ def _frames_of_numbers(dialect: str) -> Select[Any]:
 
 
 def free_id(connection: Connection, map_number: int, frame_id: str) -> None:
-    """Give the row of a deleted frame another id; a tombstone can then no longer be restored."""
+    """Replace the id of a deleted frame, so that the id can be reused.
+
+    A tombstone can then no longer be restored.
+    """
     deleted = frames.c.state == FrameState.DELETED
     own = update(frames).where(frames.c.map_number == map_number, frames.c.id == frame_id, deleted)
     connection.execute(own.values(id=uuid.uuid4().hex, deleted_from=None))
@@ -358,13 +358,13 @@ def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow
 
 
 def write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
-    """Write the tags of a frame without tags."""
+    """Insert the tags of a frame that has none."""
     if rows := [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]:
         connection.execute(insert(frame_tags), rows)
 
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
-    """Return the blobs of the geometry artifacts of frames."""
+    """Return the blobs of the geometry artifacts of frames, by number."""
     rows = rows_of_statement(connection, _geometry_of_numbers, numbers, model_id=model_id)
     return {row.frame_number: row.geometry for row in rows}
 
@@ -376,13 +376,13 @@ def _geometry_of_numbers(dialect: str) -> Select[Any]:
     return select(signatures.c.frame_number, signatures.c.geometry).where(own, among)
 
 
-# Frames by their positions. A query reads hundreds of poses, mostly those of the query before.
-# Parsed poses are cached by their stored text, so entries are never stale; each takes 800 bytes.
+# Frames by position. A query reads hundreds of poses, mostly the same ones as the previous query.
+# Parsed poses are cached by their stored text, so entries are never stale. An entry has 800 bytes.
 
 
 @lru_cache(8192)
 def _pose_of_text(text: str) -> Floats:
-    """Return T_parent_sensor (4, 4) of its stored text; the array is shared and read-only."""
+    """Parse T_parent_sensor (4, 4) from its stored text; the array is shared and read-only."""
     pose = np.array(json.loads(text), np.float64)
     pose.flags.writeable = False
     return pose
@@ -390,7 +390,7 @@ def _pose_of_text(text: str) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFrame:
-    """Number, T_parent_sensor (4, 4), artifact, kind (point cloud?) and tags of a posed frame."""
+    """Posed frame: number, T_parent_sensor (4, 4), artifact, whether it is a cloud, and tags."""
 
     number: int
     pose: Floats
@@ -409,7 +409,7 @@ def placed_frames(
     ----------
     map_number, parent : map and parent frame
     centre : x, y, z of the point, metres
-    within : half the edge of the cube around the point, metres
+    within : half of the edge of the cube around the point, metres
     most : maximum number of frames
     """
     values: dict[str, object] = {
@@ -451,7 +451,7 @@ def _placed_frames() -> Select[Any]:
 
 @dataclass(frozen=True, eq=False)
 class FrameViewpoint:
-    """A frame's viewpoint, with its pose T_parent_sensor (4, 4); fields as in the table."""
+    """Viewpoint of a frame with its pose T_parent_sensor (4, 4); see the table for the fields."""
 
     number: int
     map_number: int
@@ -461,7 +461,7 @@ class FrameViewpoint:
 
 
 def viewpoints_among(connection: Connection, numbers: Iterable[int]) -> list[FrameViewpoint]:
-    """Return the viewpoints of frames by their numbers, without frames that have no pose."""
+    """Return the viewpoints of the frames with these numbers, except frames without a pose."""
     return [
         FrameViewpoint(number, of_map, parent, _pose_of_text(pose), is_cloud)
         for number, of_map, parent, pose, is_cloud in rows_of_statement(

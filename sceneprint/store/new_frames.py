@@ -1,11 +1,10 @@
-"""New frames: insert them with their jobs, events and audit lines, which is all that most uploads
-write.
+"""Insert new frames with their jobs, events and audit lines. Most uploads write nothing else.
 
     [NewFrame, ...]  --receive_frames-->  ids of the inserted frames
 
-Other writers wait for this. On PostgreSQL, one statement inserts frames of several maps, which
-share its overhead and the wait for the disk. On SQLite, which has no round trips, it is one
-statement per table and frame.
+Other writers wait meanwhile. On PostgreSQL, one statement inserts frames of several maps, which
+share its overhead and the wait for the disk. SQLite has no round trips and uses one statement per
+table and frame.
 """
 
 from __future__ import annotations
@@ -69,14 +68,14 @@ from sceneprint.store.tables import (
 
 @dataclass(frozen=True, eq=False)
 class NewFrame:
-    """A frame to insert, if its map lacks the content.
+    """Frame that is inserted if its map does not have the content.
 
     Parameters
     ----------
-    row : map, as last read
+    row : row of the map when last read
     values : columns, see `add_frame`
     priority : priority of the job that signs the frame
-    kept : columns of `idempotency`, on PostgreSQL
+    kept : columns of the row of `idempotency`; only on PostgreSQL
     frame_id, job_id : new ids
     context : context variables of the upload's request
     """
@@ -91,12 +90,12 @@ class NewFrame:
 
     @property
     def content(self) -> tuple[int, str]:
-        """Number of the map and id of the content, which together are unique."""
+        """Number of the map and id of the content, whose combination is unique."""
         return self.row.number, self.values["content_id"]
 
     @property
     def tags(self) -> list[str]:
-        """The frame's tags, without duplicates."""
+        """Tags of the frame without duplicates."""
         return sorted(set(self.values["tags"]))
 
     @property
@@ -106,9 +105,7 @@ class NewFrame:
                 "size": self.values["bytes"], "content": self.values["content_id"]}  # fmt: skip
 
     def rows(self, connection: Connection) -> dict[str, dict[str, Any]]:
-        """Return the columns of the frame, job and event, and of audit line and idempotency key if
-        any.
-        """
+        """Return the columns of the frame, its job and event, and of optional rows, by table."""
         number = self.row.number
         job = self.context.run(job_values, connection, "sign", self.priority)
         event = event_values("frame.received", self.row.name, self.frame_id, self.job_id, {})
@@ -123,22 +120,22 @@ class NewFrame:
 
 
 def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
-    """Insert frames whose content their maps lack, and queue their signing.
+    """Insert frames whose content their maps do not have, and queue jobs to sign them.
 
     Parameters
     ----------
     connection : transaction that writes to the maps
-    new : frames; the first one with a content in a map is inserted
+    new : frames; of frames with the same map and content, the first one is inserted
 
     Returns
     -------
-    ids : ids of the inserted frames. Nothing was written for the others: the map was deleted or
-        renamed, lacks room for all of its frames, or has the content; `add_frame` and its checks
-        say which. On PostgreSQL, the key in `kept` may also have a result already
+    ids : ids of the inserted frames. The other frames are not inserted, because the map was deleted
+        or renamed, its quota does not allow all its frames, it has the content, or (on PostgreSQL)
+        the idempotency key has a result; `add_frame` and its checks determine the reason
 
     Raises
     ------
-    IntegrityError : another map is storing a result for the key in `kept` at this moment.
+    IntegrityError : If a writer of another map is storing a result for the same idempotency key.
     """
     of_content = dict[tuple[int, str], NewFrame]()
     for one in new:
@@ -165,7 +162,7 @@ def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
 
 
 def _insert_on_sqlite(connection: Connection, one: NewFrame) -> bool:
-    """Insert a frame on SQLite; return whether it was inserted."""
+    """Insert a frame on SQLite, and return whether it was inserted."""
     if connection.execute(_count_frame(), one.room).first() is None:
         return False
     rows = one.rows(connection)
@@ -180,9 +177,7 @@ def _insert_on_sqlite(connection: Connection, one: NewFrame) -> bool:
 
 @cache
 def _count_frame() -> ReturningUpdate[tuple[int]]:
-    """Return the statement that counts a frame if its map is unchanged, has room, and lacks the
-    content.
-    """
+    """Return the statement that counts a frame if its map and quota allow the insertion."""
     number, size = bindparam("map_number", type_=WHOLE), bindparam("size", type_=WHOLE)
     content = bindparam("content", type_=TEXT)
     alike = frames.c.map_number == number, frames.c.content_id == content
@@ -200,7 +195,7 @@ def _count_frame() -> ReturningUpdate[tuple[int]]:
 
 
 def _room_conditions(n: Any, size: Any) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
-    """Return the conditions that a map has room for so many more frames and bytes."""
+    """Return the conditions for maps whose quota allows `n` more frames and `size` more bytes."""
     return (
         or_(maps.c.quota_frames.is_(None), maps.c.used_frames + n <= maps.c.quota_frames),
         or_(maps.c.quota_bytes.is_(None), maps.c.used_bytes + size <= maps.c.quota_bytes),
@@ -211,28 +206,29 @@ def _counted(n: Any, size: Any) -> dict[str, Any]:
     return {"used_frames": maps.c.used_frames + n, "used_bytes": maps.c.used_bytes + size}
 
 
-# One statement for many frames, on PostgreSQL. Keys such as `frame_<column>` name the columns of
-# the records. Values that the server knows are not sent: reading them took a fifth of the time.
+# One statement for many frames on PostgreSQL. Keys such as `frame_<column>` name the columns of the
+# records. Values that the server can derive are not sent, because parsing them took a fifth of the
+# time.
 
-#: Columns whose values are the time of the statement.
+#: Columns whose value is the time of the statement.
 _STAMPED = frozenset(("frame_received_at", "job_run_after", "job_created_at"))
-#: Columns whose values are the same for all new frames.
+#: Columns whose value is the same for all new frames.
 _FIXED = frozenset(
     ("frame_state", "job_kind", "job_model_id", "job_state", "job_attempts", "job_failures",
      "job_token", "event_kind")
 )  # fmt: skip
-#: Columns whose values equal another column's.
+#: Columns whose value equals that of another column.
 _SAME = {
     "job_map_number": "frame_map_number", "event_frame_id": "frame_id", "event_job_id": "job_id",
     "line_at": "event_at", "line_tenant": "job_tenant", "line_action": "event_kind",
     "line_map": "event_map", "line_target": "frame_id", "line_data": "event_data",
 }  # fmt: skip
-#: Optional rows of a new frame, each with a column that is null if the row is missing.
+#: Optional rows of a new frame, each with the column that is null if the row is missing.
 _OPTIONAL = {"line": "actor", "kept": "key"}
 
 
 def _keys(names: Mapping[str, Iterable[str]]) -> Iterator[tuple[str, str, str]]:
-    """Yield table, name and key of each column."""
+    """Yield the table, the name and the key of each column."""
     return ((of, name, f"{of}_{name}") for of, columns in names.items() for name in columns)
 
 
@@ -251,15 +247,14 @@ def _insert_frames(
     event_table: Table, columns: tuple[tuple[str, tuple[str, ...]], ...], *,
     fixed: tuple[tuple[str, Any], ...], tagged: bool,
 ) -> Select[Any]:  # fmt: skip
-    """Return the statement that inserts frames with their jobs, events, tags, audit lines and
-    idempotency keys.
+    """Return the statement that inserts frames with all related rows.
 
     Parameters
     ----------
     event_table : table of the events
     columns : names of the columns of each row
-    fixed : values of columns by their keys, equal for all frames
-    tagged : whether a frame has a tag
+    fixed : values of columns that are equal for all frames, by key
+    tagged : whether any frame has a tag
     """
     of = {"frame": frames, "job": jobs, "event": event_table, "line": audit, "kept": idempotency}
     tables = {name: (of[name], names) for name, names in columns}
@@ -308,17 +303,15 @@ def _records(tables: _Tables) -> TableValuedAlias:
 
 
 def _kind(kind: TypeEngine[Any]) -> TypeEngine[Any]:
-    """Return the type of a record's column, without a length: the table must refuse what is too
-    long.
-    """
+    """Return the type of a record's column without its length, so that long values are errors."""
     return TEXT if isinstance(kind, String) else kind
 
 
 def _lacking(records: TableValuedAlias, *, kept: bool) -> CTE:
-    """Return the records whose content their map lacks, and whose key has no result.
+    """Return the records whose map does not have the content, and whose key has no result.
 
-    Each content is looked up as the next entry of one index: a cached plan may date from when the
-    tables were empty and all indexes seemed equally good.
+    Each content is looked up as the next entry of one index, because a cached plan may date from a
+    time when the tables were empty and all indexes seemed equally good.
     """
     key = frames.c.map_number, frames.c.content_id
     own = records.c.frame_map_number, records.c.frame_content_id
@@ -337,7 +330,7 @@ def _lacking(records: TableValuedAlias, *, kept: bool) -> CTE:
 
 
 def _count_frames(lacking: CTE) -> CTE:
-    """Return the unchanged maps that have room for all of their records, after counting these."""
+    """Count the records of each unchanged map whose quota allows them, and return these maps."""
     each = lacking.c.frame_map_number, lacking.c.event_map
     size = cast(func.sum(lacking.c.size), BigInteger)
     more = select(*each, func.count().label("n"), size.label("size")).group_by(*each).cte("more")
@@ -354,7 +347,7 @@ def _insert_rows(
     of: str, tables: _Tables, fixed: dict[str, Any], lacking: CTE, source: FromClause,
     *conditions: ColumnElement[bool], **more: ColumnElement[Any],
 ) -> Insert:  # fmt: skip
-    """Return the INSERT of a row for each frame of a source, in the order of the records."""
+    """Return the INSERT statement of a row for each frame of a source, in record order."""
     table, names = tables[of]
 
     def value(name: str) -> ColumnElement[Any]:
@@ -365,7 +358,7 @@ def _insert_rows(
         if key in fixed:
             return literal(fixed[key], _kind(table.c[name].type))
         sent, kind = lacking.c[key], table.c[name].type
-        if isinstance(kind, JSON) and not kind.none_as_null:  # a record's null is that of SQL
+        if isinstance(kind, JSON) and not kind.none_as_null:  # null in a record is SQL's null
             return func.coalesce(sent, literal_column("CAST('null' AS json)"))
         return sent
 

@@ -1,8 +1,8 @@
-"""Opaque forms of row numbers for clients: ids of events, and cursors of pages.
+"""Encrypt row numbers for clients, as ids of events and as cursors of pages.
 
-Rows are numbered across all maps, so plain numbers and their gaps would reveal to a user of one map
-how much happens in the others. A seal is a number encrypted with AES-SIV (RFC 5297) and the store's
-secret. It is deterministic, and unrelated to the seals of other numbers.
+Rows are numbered across all maps, so plain numbers and their gaps would reveal the activity in
+other maps. A seal is a number encrypted with AES-SIV (RFC 5297) and the store's secret. Seals are
+deterministic, and seals of different numbers are unrelated.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sceneprint.errors import InvalidRequest, UnusableStore
 from sceneprint.store.database import Database
 from sceneprint.store.tables import secrets
 
-#: Kinds of rows: a seal is valid for one kind only.
+#: Kinds of rows. A seal is valid for only one kind.
 Kind = Literal["audit", "deletion", "event", "frame", "job", "query"]
 #: Position before all rows; no row has number 0, so it needs no seal.
 START = "0"
@@ -31,19 +31,19 @@ _MOMENT = struct.Struct(">dQ")
 
 
 class OpaqueIds:
-    """Encrypt and decrypt the row numbers of one store."""
+    """Cipher for the row numbers of one store."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def seal(self, kind: Kind, number: int) -> str:
-        """Return 48 digits that stand for a number; START for 0."""
+        """Return 48 digits that represent a number; START for 0."""
         if number == 0:
             return START
         return self._cipher.encrypt(number.to_bytes(8, "big"), [kind.encode()]).hex()
 
     def open(self, kind: Kind, seal: str) -> int | None:
-        """Return the number behind a seal; None if this store did not issue it."""
+        """Return the number of a seal; None if this store did not issue the seal."""
         if seal == START:
             return 0
         if not re.fullmatch(r"[0-9a-f]{48}", seal):
@@ -55,17 +55,17 @@ class OpaqueIds:
         return int.from_bytes(plain, "big")
 
     def event(self, event_id: str, place: str = "after") -> int:
-        """Return the number of the event behind an id; 0 for START, the position before all events.
+        """Return the number of the event with an id; 0 for START, the position before all events.
 
         Raises
         ------
-        InvalidRequest : the id is not that of an event of this store.
+        InvalidRequest : If the id is not that of an event of this store.
         """
         number = self.open("event", event_id)
         if number is None:
             raise InvalidRequest(
-                f"{event_id!r:.40} is not the id of an event here. Start again: with {START} for "
-                "all stored events, or without an id for new events only.",
+                f"{event_id!r:.40} is not the id of an event of this service. Start again with "
+                f"{START} for all stored events, or without an id for only new events.",
                 ((place, "not the id of an event"),),
             )
         return number
@@ -75,7 +75,7 @@ class OpaqueIds:
 
         Raises
         ------
-        InvalidRequest : this store did not issue the cursor.
+        InvalidRequest : If this store did not issue the cursor.
         """
         if cursor is None:
             return None
@@ -91,19 +91,17 @@ class OpaqueIds:
     def next_moment(
         self, kind: Kind, moments: Sequence[tuple[float, int]], limit: int
     ) -> str | None:
-        """Return the cursor of the page after `limit` rows of a list that is sorted by time and
-        number.
-        """
+        """Return the cursor after `limit` rows of a list sorted by time and number, or None."""
         if len(moments) <= limit:
             return None
         return self._cipher.encrypt(_MOMENT.pack(*moments[limit - 1]), [kind.encode()]).hex()
 
     def moment(self, kind: Kind, cursor: str | None) -> tuple[float, int] | None:
-        """Return time and number of the last row of the previous page; None for the first page.
+        """Return the time and number of the previous page's last row; None for the first page.
 
         Raises
         ------
-        InvalidRequest : this store did not issue the cursor.
+        InvalidRequest : If this store did not issue the cursor.
         """
         if cursor is None:
             return None
@@ -119,7 +117,7 @@ class OpaqueIds:
 
     @property
     def owner(self) -> str:
-        """Return 32 digits that identify the store, and reveal nothing of its secret."""
+        """Return 32 digits that identify the store without revealing its secret."""
         return owner_of(self._secret)
 
     @cached_property
@@ -133,18 +131,18 @@ class OpaqueIds:
             value = connection.execute(statement).scalar()
         if value is None:
             raise UnusableStore(
-                "The database lacks the secret that encrypts the ids of events. Restore the data "
-                "folder from a copy."
+                "The secret that encrypts the ids of events is missing in the database. Restore "
+                "the data folder from a copy."
             )
         return bytes(value)
 
 
 def row_of(cursor: str | None) -> int | None:
-    """Return the position behind the cursor of a list with its own numbers.
+    """Return the position of a cursor that is not encrypted.
 
     Raises
     ------
-    InvalidRequest : the service did not issue the cursor.
+    InvalidRequest : If the service did not issue the cursor.
     """
     if cursor is None:
         return None
@@ -162,5 +160,5 @@ def invalid_cursor(cursor: str) -> InvalidRequest:
 
 
 def owner_of(secret: bytes) -> str:
-    """Return the public name of the store that has a secret."""
+    """Return the public name of a store, derived from its secret."""
     return hmac.digest(secret, b"store", "sha256")[:16].hex()

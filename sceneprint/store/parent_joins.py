@@ -1,7 +1,8 @@
-"""Joins of parent frames: their rows, and the poses of frames that follow them.
+"""Joins of parent frames, and the resulting poses of frames.
 
-A join transforms poses from one parent frame to another. Frames that were sent with poses in a
-joined parent frame have poses in its root, where its joins end, and keep the sent pose as well.
+A join transforms poses from one parent frame to another. A frame with an uploaded pose in a joined
+parent frame has a pose in the root of that parent frame, where its joins end. The uploaded pose is
+also stored.
 
     join_parent, undo_joins  -->  rows of joins  --find_joins-->  roots  -->  poses of frames
 """
@@ -25,7 +26,7 @@ from sceneprint_client.api import FrameState
 
 @dataclass(frozen=True, eq=False)
 class ParentJoin:
-    """A joined parent frame, its root, and T_root_parent (4, 4)."""
+    """Joined parent frame, its root, and T_root_parent (4, 4)."""
 
     parent: str
     root: str
@@ -34,7 +35,7 @@ class ParentJoin:
 
 @dataclass(frozen=True)
 class ParentRun:
-    """The indexed frames of a map in one parent frame and session: count and first number."""
+    """Number of indexed frames in one parent frame and session, and the first frame's number."""
 
     parent: str
     session: str | None
@@ -44,14 +45,14 @@ class ParentRun:
 
 
 def find_joins(connection: Connection, map_number: int) -> dict[str, ParentJoin]:
-    """Return the joins of a map's parent frames to their roots, by parent frame."""
+    """Return the joins from a map's parent frames to their roots, by parent frame."""
     c = parent_joins.c
     stands = c.map_number == map_number, c.undone_at.is_(None)
     rows = connection.execute(select(c.parent, c.towards, c.transform).where(*stands))
     steps = {row.parent: (row.towards, np.array(row.transform)) for row in rows}
     joins = {}
     for parent, (root, T) in steps.items():
-        while root in steps:  # this ends, as a join leads from one root to another
+        while root in steps:  # this loop ends, because a join leads from one root to another
             root, onwards = steps[root]
             T = onwards @ T
         joins[parent] = ParentJoin(parent, root, T)
@@ -66,7 +67,7 @@ def is_joined_by(connection: Connection, map_number: int, job_id: str) -> bool:
 
 
 def undone_pairs(connection: Connection, map_number: int) -> list[set[str]]:
-    """Return the present roots of the two ends of each undone join."""
+    """Return the current roots of the two parent frames of each undone join."""
     c, joins = parent_joins.c, find_joins(connection, map_number)
     undone = select(c.parent, c.towards).where(c.map_number == map_number, c.undone_at.is_not(None))
     return [{_root(joins, name) for name in row} for row in connection.execute(undone)]
@@ -88,7 +89,7 @@ def posed_runs(connection: Connection, map_number: int) -> list[ParentRun]:
 
 
 def count_poses(connection: Connection, map_number: int) -> tuple[int, int]:
-    """Return the number of posed, indexed frames of a map, and of their parent frames."""
+    """Return the number of posed, indexed frames of a map, and that of their parent frames."""
     c = frames.c
     statement = select(func.count(c.pose_x), func.count(c.pose_parent.distinct())).where(
         c.map_number == map_number, c.state == FrameState.INDEXED, c.pose_x.is_not(None)
@@ -98,17 +99,15 @@ def count_poses(connection: Connection, map_number: int) -> tuple[int, int]:
 
 
 def root_columns(connection: Connection, frame: FrameRow) -> dict[str, Any]:
-    """Return the pose in the root of a frame with an unmoved pose in a joined parent frame; else
-    {}.
-    """
+    """Return the columns with the pose in the root, if a join applies and has not been applied."""
     if frame.pose is None or frame.pose_parent is None or frame.sent_parent is not None:
-        return {}  # a moved pose follows its joins anyway
+        return {}  # the joins have already been applied
     one = find_joins(connection, frame.map_number).get(frame.pose_parent)
     return {} if one is None else _columns(frame.pose_parent, frame.pose, one)
 
 
 def _columns(parent: str, sent: Any, one: ParentJoin | None) -> dict[str, Any]:
-    """Return the columns of a frame with its sent pose, moved by the join of the parent frame."""
+    """Return the columns of a frame with its uploaded pose transformed by a join."""
     if one is None:
         return {"pose_parent": parent, "pose": sent, "sent_parent": None, "sent_pose": None}
     moved = (one.T @ np.array(sent)).tolist()
@@ -116,25 +115,25 @@ def _columns(parent: str, sent: Any, one: ParentJoin | None) -> dict[str, Any]:
 
 
 def join_parent(connection: Connection, map_number: int, one: ParentJoin, job_id: str) -> bool:
-    """Move all poses in a parent frame, and those joined to it, to a root.
+    """Transform all poses in a root, and in parent frames joined to it, to another root.
 
     Parameters
     ----------
     connection : writing transaction of the map
-    map_number : map
+    map_number : number of the map
     one : join of two roots
-    job_id : association that proposed it
+    job_id : id of the association that proposed the join
 
     Returns
     -------
-    joined : False, and nothing was written, if one of the roots is joined already
+    joined : False if one of the roots is already joined, and nothing was written
     """
     before = find_joins(connection, map_number)
     if one.parent in before or one.root in before:
         return False
     c = parent_joins.c
     ends = c.map_number == map_number, c.parent == one.parent, c.towards == one.root
-    connection.execute(delete(parent_joins).where(*ends))  # an undone join may exist
+    connection.execute(delete(parent_joins).where(*ends))  # removes an undone join
     connection.execute(
         insert(parent_joins).values(
             map_number=map_number, parent=one.parent, towards=one.root, transform=one.T.tolist(),
@@ -150,7 +149,7 @@ def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
 
     Returns
     -------
-    undone : False, and nothing was written, if none is in effect
+    undone : False if no such join is in effect, and nothing was written
     """
     before = find_joins(connection, map_number)
     if not is_joined_by(connection, map_number, job_id):
@@ -163,7 +162,7 @@ def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
 
 
 def _move_frames(connection: Connection, map_number: int, before: Mapping[str, ParentJoin]) -> None:
-    """Write the poses, from the sent ones, of the frames whose root has changed."""
+    """Recompute the poses of frames whose root has changed from the uploaded poses."""
     now = find_joins(connection, map_number)
     changed = [name for name in {*before, *now} if _root(before, name) != _root(now, name)]
     f = frames.c
@@ -171,11 +170,11 @@ def _move_frames(connection: Connection, map_number: int, before: Mapping[str, P
         f.map_number == map_number,
         f.pose_x.is_not(None),
         f.pose_parent.in_(changed) | f.sent_parent.in_(changed),
-    )  # includes deleted frames, which may be restored
+    )  # this includes deleted frames, which may be restored
     moved = []
     for number, parent, pose, sent_parent, sent_pose in connection.execute(affected).all():
         sent = (parent, pose)
-        if sent_parent in changed:  # else the frame was copied from a map that had moved it
+        if sent_parent in changed:  # other frames were copied from a map with a different join
             sent = (sent_parent, sent_pose)
         values = _columns(*sent, now.get(sent[0]))
         moved.append({"own": number, **values, **position(values["pose"])})

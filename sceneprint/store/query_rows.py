@@ -1,4 +1,4 @@
-"""Rows of queries: who searched which map, the outcome, and whether the answer is stored.
+"""Rows of queries, with the searched maps, the sender, the outcome, and the stored answer.
 
 NewQuery, ...  --add_queries-->  rows and events in one commit  --list_queries-->  QueryRow, ...
 """
@@ -38,7 +38,7 @@ from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.results import RecordStatus
 
 _c = queries.c
-#: Maximum number of characters of `reason`.
+#: Maximum length of `reason`, characters.
 MOST_REASON = 1000
 
 
@@ -66,26 +66,26 @@ class _Query:
 
 @dataclass(frozen=True)
 class NewQuery(_Query):
-    """A query that was answered, or that failed.
+    """Query that was answered or failed.
 
     Parameters
     ----------
-    at : arrival of the query, seconds since 1970
-    map : name of the map that the row belongs to
-    maps : names of all searched maps; None: only `map`
+    at : time of arrival, seconds since 1970
+    map : name of the map to which the row belongs
+    maps : names of all searched maps; None if only `map` was searched
     robot, session : sender and run, if known
-    status, cause, reason : those of the answer; or `failed`, the type of the error, and its text
-    pose_parent, pose : parent frame, and x, y, z, qx, qy, qz, qw of T_parent_query, if it was found
+    status, cause, reason : values of the answer; or `failed`, the type of the error, and its text
+    pose_parent, pose : parent frame, and x, y, z, qx, qy, qz, qw of T_parent_query, if found
     confidence : confidence of that pose, or of the best alternative
     support : support of that pose
     alternatives : number of other poses that the evidence supports
-    milliseconds : duration
+    milliseconds : duration of the query
     kind : kind of the query frame, if it was decoded
-    frame_map, frame_id : map and id of a stored frame that was the query
+    frame_map, frame_id : map and id of the query frame, if it is a stored frame
     key_id : id of the request's key
-    listed : whether the history lists the query, and an event reports it
-    bytes : size of the stored answer; 0: it is not stored
-    shown : numbers of the frames that the answer shows
+    listed : whether the history contains the query, and an event reports it
+    bytes : size of the stored answer; 0 if it is not stored
+    shown : numbers of the frames in the answer
     """
 
     key_id: str | None
@@ -96,13 +96,13 @@ class NewQuery(_Query):
 
 @dataclass(frozen=True)
 class QueryRow(_Query):
-    """A stored query; other fields as in NewQuery.
+    """Stored query; see NewQuery for the other fields.
 
     Parameters
     ----------
-    key : name of the key; None without a key, or if it was revoked
-    bytes : size of the stored answer; 0: it is not stored
-    kept_at : time since which the answer is kept; None: it expires
+    key : name of the key; None without a key, or if the key was revoked
+    bytes : size of the stored answer; 0 if it is not stored
+    kept_at : time at which the answer was marked as kept; None if it expires
     title : title of a kept answer
     """
 
@@ -118,23 +118,23 @@ class QueryRow(_Query):
         return [self.map] if self.maps is None else self.maps
 
 
-#: Statement that reads rows without their answers.
+#: Statement that selects rows without their answers.
 _ROW = select(
     *(_c[one.name] for one in fields(QueryRow) if one.name not in ("map", "key")),
     select(maps.c.name).where(maps.c.number == _c.map_number).scalar_subquery().label("map"),
     select(keys.c.name).where(keys.c.id == _c.key_id).scalar_subquery().label("key"),
 )
-#: Condition as in the partial index: planners do not match bound values to it.
+#: Condition with a literal value, because planners do not match bound values to a partial index.
 _STORED: ColumnElement[bool] = literal_column("bytes > 0")
-#: Kind of the event that reports a query, and the columns that it contains.
+#: Kind of the event that reports a query.
 EVENT = "query.answered"
 _REPORTED = ("status", "robot", "session", "cause", "support", "milliseconds")
 
 
 def add_queries(connection: Connection, new: Sequence[NewQuery]) -> None:
-    """Store queries, and an event for each listed one.
+    """Store queries, and an event for each listed query.
 
-    Queries of a map that was deleted or replaced since their arrival are ignored.
+    Queries of a map that was deleted or replaced after their arrival are ignored.
     """
     names = sorted({one.map for one in new})
     statement = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
@@ -167,7 +167,7 @@ def _event(one: NewQuery) -> dict[str, Any]:
             "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
         }
     own = one.frame_id if one.frame_map == one.map else None
-    # the time of the event, not of the query, as events are sorted by time
+    # events are sorted by their own time, not by the time of the query
     return {
         "at": time.time(), "kind": EVENT, "map": one.map, "frame_id": own, "job_id": None,
         "data": data,
@@ -180,10 +180,10 @@ class WantedQueries:
 
     Parameters
     ----------
-    map_numbers : numbers of the only maps; None: all maps
-    statuses : statuses, one of which must match; empty: any
-    robot : sender; None: any
-    since, until : interval of the arrival, without its end, seconds since 1970
+    map_numbers : numbers of the selected maps; None selects all maps
+    statuses : statuses, one of which must match; empty matches all
+    robot : sender; None matches all
+    since, until : half-open interval of the arrival, seconds since 1970
     kept : whether only kept answers match
     """
 
@@ -217,7 +217,7 @@ def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
     yield _c.kept_at.is_not(None) if wanted.kept else or_(_c.listed, _c.kept_at.is_not(None))
     numbers = wanted.map_numbers
     if numbers is not None:
-        # "+ 0" rules out the indexes of the map: the robot's own finds its few queries faster
+        # "+ 0" rules out the indexes of maps, because the index of the robot selects fewer rows
         own = _c.map_number if wanted.robot is None else _c.map_number + 0
         yield own == numbers[0] if len(numbers) == 1 else own.in_(numbers)
     if wanted.statuses:
@@ -231,7 +231,7 @@ def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
 
 
 def find_query(connection: Connection, query_id: str) -> QueryRow | None:
-    """Return a query by its id, or None."""
+    """Return the query with an id, or None."""
     row = connection.execute(_ROW.where(_c.id == query_id)).mappings().first()
     return None if row is None else QueryRow(**row)
 
@@ -260,11 +260,11 @@ def is_current(connection: Connection, row: QueryRow) -> bool:
     )  # fmt: skip
     number = connection.execute(own).scalar()
     shown = connection.execute(select(_c.shown).where(_c.number == row.number)).scalar()
-    return number is not None and number in (shown or [])  # else another frame has its id
+    return number is not None and number in (shown or [])  # another frame may have the id now
 
 
 def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> bool:
-    """Store an answer in the database and its backups; return False if it has expired."""
+    """Store an answer in the database, and so in its backups; return False if it has expired."""
     own = update(queries).where(_c.number == number, _STORED)
     return connection.execute(own.values(answer=data, kept_at=at)).rowcount == 1
 
@@ -275,24 +275,25 @@ def set_title(connection: Connection, number: int, title: str | None) -> None:
 
 
 def release_answer(connection: Connection, number: int) -> None:
-    """Let an answer expire."""
-    gone = {"answer": None, "kept_at": None, "title": None}
-    connection.execute(update(queries).where(_c.number == number).values(gone))
+    """Mark an answer as expiring."""
+    expired = {"answer": None, "kept_at": None, "title": None}
+    connection.execute(update(queries).where(_c.number == number).values(expired))
 
 
 def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
-    """Return the number of kept answers of a map, and the bytes of those of all maps."""
-    kept = select(func.count(), func.coalesce(func.sum(_c.bytes), 0)).where(_c.kept_at.is_not(None))
+    """Return the number of kept answers of a map, and the total bytes of those of all maps."""
+    counts = func.count(), func.coalesce(func.sum(_c.bytes), 0)
+    statement = select(*counts).where(_c.kept_at.is_not(None))
     of_map = select(maps.c.number).where(maps.c.name == map_name).scalar_subquery()
-    count = connection.execute(kept.where(_c.map_number == of_map)).one()[0]
-    return int(count), int(connection.execute(kept).one()[1])
+    count = connection.execute(statement.where(_c.map_number == of_map)).one()[0]
+    return int(count), int(connection.execute(statement).one()[1])
 
 
 # Removal of old and surplus queries, of the oldest answers, and of answers with deleted frames.
 
 
 def old_queries(connection: Connection, before: float, limit: int) -> list[int]:
-    """Return the numbers of the oldest queries from before a time that are not kept."""
+    """Return the numbers of the oldest queries before a time, except kept ones."""
     spent = select(_c.number).where(_c.at < before, _c.kept_at.is_(None))
     return list(connection.execute(spent.order_by(_c.at, _c.number).limit(limit)).scalars())
 
@@ -300,7 +301,7 @@ def old_queries(connection: Connection, before: float, limit: int) -> list[int]:
 def surplus_queries(connection: Connection, most: int, limit: int) -> list[int]:
     """Return the numbers of the oldest queries of maps with more than `most` queries."""
     span = connection.execute(select(func.max(_c.number) - func.min(_c.number))).scalar()
-    if (span or 0) < most:  # the usual case, without counting
+    if (span or 0) < most:  # in this usual case, no count is necessary
         return []
     counts = select(_c.map_number, func.count()).group_by(_c.map_number)
     numbers: list[int] = []
@@ -318,7 +319,7 @@ def queries_of_map(connection: Connection, map_number: int, limit: int) -> list[
 
 
 def remove_queries(connection: Connection, numbers: Sequence[int]) -> list[str]:
-    """Remove a few hundred queries at most; return the ids of those with a stored answer."""
+    """Remove at most a few hundred queries, and return the ids of those with a stored answer."""
     own = among(connection, _c.number, numbers)
     stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
     connection.execute(delete(queries).where(own))
@@ -326,42 +327,42 @@ def remove_queries(connection: Connection, numbers: Sequence[int]) -> list[str]:
 
 
 def stored_bytes(connection: Connection) -> int:
-    """Return the bytes of all stored answers."""
+    """Return the total size of the stored answers, bytes."""
     total = connection.execute(select(func.sum(_c.bytes)).where(_STORED)).scalar()
     return int(total or 0)
 
 
 def oldest_answers(connection: Connection, limit: int) -> list[tuple[int, int]]:
-    """Return number and bytes of the oldest answers that are not kept."""
+    """Return the number and bytes of each of the oldest answers, except kept ones."""
     statement = select(_c.number, _c.bytes).where(_STORED, _c.kept_at.is_(None))
     rows = connection.execute(statement.order_by(_c.at, _c.number).limit(limit))
     return [(row.number, row.bytes) for row in rows]
 
 
 def shown_frames(connection: Connection, after: int, limit: int) -> list[tuple[int, list[int]]]:
-    """Return the next stored answers by number, and the numbers of the frames that each shows."""
+    """Return the next stored answers by number, each with the numbers of its frames."""
     statement = select(_c.number, _c.shown).where(_STORED, _c.number > after)
     rows = connection.execute(statement.order_by(_c.number).limit(limit))
     return [(row.number, row.shown or []) for row in rows]
 
 
 def unpurged_frames(connection: Connection, numbers: set[int]) -> set[int]:
-    """Return those of some frames that exist or can be restored."""
+    """Return the numbers of the frames that exist or can be restored."""
     statement = select(frames.c.number).where(not_purged())
     return {row.number for row in rows_among(connection, statement, frames.c.number, numbers)}
 
 
 def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
-    """Remove a few hundred answers at most, and their unlisted queries; return the ids."""
+    """Remove at most a few hundred answers and their unlisted queries, and return the ids."""
     own = among(connection, _c.number, numbers)
     stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
     connection.execute(delete(queries).where(own, ~_c.listed))
-    gone = {"answer": None, "bytes": 0, "shown": None, "kept_at": None, "title": None}
-    connection.execute(update(queries).where(own).values(gone))
+    removed = {"answer": None, "bytes": 0, "shown": None, "kept_at": None, "title": None}
+    connection.execute(update(queries).where(own).values(removed))
     return stored
 
 
 def stored_among(connection: Connection, query_ids: Sequence[str]) -> set[str]:
-    """Return those of a thousand ids at most whose answers are stored in files."""
+    """Return the ids, of at most a thousand, whose answers are stored in files."""
     statement = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
     return set(connection.execute(statement).scalars())

@@ -1,32 +1,32 @@
-"""The queue: jobs as rows, so that a frame and its job are one commit.
+"""Queue of jobs in the database, so that a frame and its job are written in one commit.
 
     enqueue  -->  queued  --claim-->  running  --finish | fail-->  over, or queued again
 
-Tenants take turns: a claim takes a due job of the tenant whose last claim is oldest, the one with
-the highest priority. Between two jobs of a tenant, each other tenant gets at most one per
+Tenants take turns: a claim selects the tenant whose last claim is oldest, and its due job with the
+highest priority. Between two jobs of a tenant, each other tenant gets at most one job per
 concurrently claiming worker. Upkeep without a tenant, such as the re-encoding of a map, waits for
 all other jobs.
 
 A claim is a lease: if the worker does not renew it in time, another worker gets the job. Each claim
-has a token greater than the last, and results with an older token are refused. So a job may run
-twice, but takes effect once.
+has a greater token than the previous one, and results with an older token are refused. A job may
+therefore run twice, but takes effect only once.
 
 On PostgreSQL, claims and renewals wait for no turn (`write(turn=False)`), so that a thousand
 workers do not delay uploads. Locks of the job's row order them:
 
-- two claims: SKIP LOCKED makes each go on to the next job; a row that changed before it was locked
-  is checked again, and skipped if it is no longer due;
+- two claims: SKIP LOCKED makes each continue with the next job; a row that changed before it was
+  locked is checked again, and skipped if it is no longer due;
 - a claim, and an end (`finish`, `fail`, `requeue_slice`, `release_job`, `check_held`) by a worker
-  whose lease is over: either the end locks the job first and the claim skips it, or the claim is
-  first and the end finds another token;
-- a claim, and `cancel`, a deletion, `dead_letter` or `fail_dead_worker`: these lock the job before
-  all else. If the claim is first, they wait for its commit and see the new row (READ COMMITTED
-  evaluates WHERE again); else the claim skips the job;
-- a renewal, and any of these: the UPDATE of the row with its token waits for the other one, and
-  then changes the row or finds none.
+  whose lease has expired: either the end locks the job first and the claim skips it, or the claim
+  is first and the end reads another token;
+- a claim, and `cancel`, a deletion, `dead_letter` or `fail_dead_worker`, which lock the job first:
+  after a claim, they wait for its commit and see the new row (READ COMMITTED evaluates WHERE
+  again); before a claim, they make it skip the job;
+- a renewal, and any of these: the UPDATE of the row with its token waits for the other transaction,
+  and then changes the row or matches none.
 
-A claim locks the job before its frame, and so do writers with a turn, which rules out deadlocks.
-Times are the database's (`now`), since the clocks of hosts may differ by hours.
+Claims and writers with a turn lock the job before its frame, which rules out deadlocks. Times are
+those of the database (`now`), since the clocks of hosts may differ by hours.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ from sceneprint_client.api import JobState
 
 @dataclass(frozen=True)
 class ListedJob:
-    """A job with the names of its frame and map."""
+    """Job with the names of its frame and map."""
 
     job: JobRow
     frame_id: str | None
     map_name: str | None
-    followed_by: str | None  # id of the latest job of the same frame and kind, if it is another
+    followed_by: str | None  # id of the latest job of the same frame and kind, if later
 
 
 def list_jobs(
@@ -95,8 +95,8 @@ def list_jobs(
     ----------
     before : number of the last job of the previous page
     limit : maximum number of jobs
-    state, kind : conditions; None: any
-    map_names : names of the only maps; jobs without a map are excluded then
+    state, kind : conditions; None matches all jobs
+    map_names : names of the selected maps, which exclude jobs without a map; None selects all
     """
     last = _later_job().scalar_subquery()
     statement = (
@@ -122,7 +122,7 @@ def list_jobs(
 
 
 def _later_job() -> Select[tuple[str]]:
-    """Select the id of the latest job of the frame, kind and model of a job, if it is another."""
+    """Return the query of the latest later job with the frame, kind and model of a job."""
     later = jobs.alias()
     return (
         select(later.c.id)
@@ -137,7 +137,7 @@ def _later_job() -> Select[tuple[str]]:
 
 
 def find_job(connection: Connection, job_id: str) -> JobRow:
-    """Return the job of an id; raise UnknownJob if the job does not exist."""
+    """Return the job with an id. Raise UnknownJob if it does not exist."""
     row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
     if row is None:
         raise unknown_job(job_id)
@@ -145,16 +145,16 @@ def find_job(connection: Connection, job_id: str) -> JobRow:
 
 
 def job_of_number(connection: Connection, number: int) -> JobRow | None:
-    """Return the job of a number; None if it was removed."""
+    """Return the job with a number; None if it was removed."""
     row = connection.execute(select(jobs).where(jobs.c.number == number)).mappings().first()
     return None if row is None else job_row(row)
 
 
 def unknown_job(job_id: str) -> UnknownJob:
-    """Return the error for a job that does not exist, or that the caller may not see."""
+    """Return the error for a job that does not exist or is hidden from the caller."""
     return UnknownJob(
-        f"There is no job {job_id!r:.80}. An upload returns the id of its job, and deleting a map "
-        "deletes its jobs."
+        f"There is no job {job_id!r:.80}. Check the id, which the upload returned. The deletion of "
+        "a map also deletes its jobs."
     )
 
 
@@ -175,7 +175,7 @@ def latest_job(
 
 
 def signing_jobs(connection: Connection, frame_numbers: list[int]) -> dict[int, str]:
-    """Return the latest `sign` job of each frame, without its re-encodings."""
+    """Return the latest `sign` job of each frame, which excludes re-encodings."""
     statement = select(jobs.c.frame_number, jobs.c.id).where(jobs.c.kind == "sign")
     rows = rows_among(
         connection, statement.order_by(jobs.c.number), jobs.c.frame_number, frame_numbers
@@ -187,9 +187,9 @@ def count_jobs(
     connection: Connection, map_number: int | None = None,
     states: Collection[JobState] | None = None,
 ) -> dict[str, int]:  # fmt: skip
-    """Return the numbers of jobs by state, of one map or of all; requested ones may be 0.
+    """Return the number of jobs by state, of one map or of all maps.
 
-    A dead job that was retried does not count: its latest retry does.
+    A dead job that was retried does not count, but its latest retry does.
     """
     counts = select(jobs.c.state, func.count()).group_by(jobs.c.state)
     if map_number is not None:
@@ -209,13 +209,13 @@ def count_jobs(
 
 
 def waiting_by_tenant(connection: Connection) -> dict[str, int]:
-    """Return the number of queued jobs of each tenant that has any."""
+    """Return the number of queued jobs by tenant, for tenants with queued jobs."""
     counts = select(jobs.c.tenant, func.count()).where(jobs.c.state == JobState.QUEUED)
     return {row[0]: row[1] for row in connection.execute(counts.group_by(jobs.c.tenant))}
 
 
 def read_clock(connection: Connection) -> float:
-    """Return the time now by the database's clock, seconds since 1970."""
+    """Return the current time of the database's clock, seconds since 1970."""
     if connection.dialect.name == "sqlite":
         return time.time()
     return float(connection.execute(select(now(connection))).scalar_one())
@@ -225,15 +225,15 @@ def read_clock(connection: Connection) -> float:
 PENDING = (JobState.QUEUED, JobState.RUNNING)
 #: Number of failures after which a job is dead.
 MAXIMUM_FAILURES = 3
-#: Number of attempts after which a job is dead. It is greater, since a worker may die of another
-#: cause than its job: frequent restarts of a machine must not cost a frame.
+#: Number of attempts after which a job is dead. It is greater, because a worker may die for another
+#: reason than its job: frequent restarts of a machine must not make a frame fail.
 MAXIMUM_ATTEMPTS = 10
 #: Highest priority of upkeep, which no user requested.
 UPKEEP = -10
-#: Seconds before the second attempt; the pause quadruples with each failure.
+#: Seconds before the second attempt. The pause quadruples with each failure.
 BACKOFF_S = 2.0
-#: Longest pause of a job, and longest lease (seconds). A job with a later time was written before
-#: the clock was set back, and is due now.
+#: Longest pause of a job, and longest lease, seconds. A job with a later time was written before
+#: the clock was set back, and is due immediately.
 LONGEST_PAUSE_S, LONGEST_LEASE_S = 60.0, 3600.0
 
 
@@ -242,13 +242,13 @@ def enqueue(
     model_id: str | None = None, *, map_number: int | None = None,
     data: dict[str, Any] | None = None,
 ) -> JobRow:  # fmt: skip
-    """Queue a job, in the transaction of the change that it follows from.
+    """Queue a job in the transaction of the change that requires it.
 
     Parameters
     ----------
     connection : writing transaction
     kind, frame_number, priority, model_id, data : columns of the table
-    map_number : map of a job without a single frame; else the frame's map is used
+    map_number : number of the map, for a job that is not about a single frame
     """
     map_column: Any = map_number
     if frame_number is not None:
@@ -260,9 +260,7 @@ def enqueue(
 
 
 def due_in_s(connection: Connection) -> float | None:
-    """Return the seconds until a job can be claimed if none changes; None without jobs. Takes no
-    lock.
-    """
+    """Return the seconds until the next job is due, without a lock; None if there are no jobs."""
     waiting = select(func.min(jobs.c.run_after)).where(jobs.c.state == JobState.QUEUED)
     silent = select(func.min(jobs.c.leased_until)).where(jobs.c.state == JobState.RUNNING)
     scalars = [connection.execute(one).scalar() for one in (waiting, silent)]
@@ -271,7 +269,7 @@ def due_in_s(connection: Connection) -> float | None:
 
 
 def has_due(connection: Connection) -> bool:
-    """Return whether there is a job to claim or to give up, without a lock."""
+    """Return whether a job can be claimed or must be declared dead, without a lock."""
     at = now(connection)
     early, late = jobs.c.run_after <= at, jobs.c.run_after > at + LONGEST_PAUSE_S
     waiting = and_(jobs.c.state == JobState.QUEUED, or_(early, late))
@@ -281,30 +279,28 @@ def has_due(connection: Connection) -> bool:
 
 
 def _lease_over(at: ColumnElement[float]) -> ColumnElement[bool]:
-    """Return the condition that a lease has ended, or is too long to have been granted by this
-    clock.
-    """
+    """Return the condition for leases that have expired, or were granted by a later clock."""
     return or_(jobs.c.leased_until < at, jobs.c.leased_until > at + LONGEST_LEASE_S)
 
 
 def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
-    """Take the next job: a queued one, or one whose lease has ended.
+    """Claim the next job, which is queued or has an expired lease.
 
     Parameters
     ----------
     connection : writing transaction
     worker : name of the worker
-    lease_s : seconds until the lease ends
+    lease_s : duration of the lease, seconds
     """
     at = now(connection)
     waiting = _waiting(at)
     silent = jobs.c.state == JobState.RUNNING, _lease_over(at)
     place = None
-    for one in _tenants_due(connection, *waiting):  # all jobs of the first one may be locked
+    for one in _tenants_due(connection, *waiting):  # all jobs of a tenant may be locked
         place = _lock_first(connection, one.turn, *waiting, jobs.c.tenant == one.tenant)
         if place is not None:
             break
-    # a silent worker's job, of which there are few, is locked only if it comes first
+    # a job of a silent worker, of which there are few, is locked only if it is next
     other = _first_of_few(connection, *silent)
     if other is not None and (place is None or other < place):
         own = jobs.c.number == other.number
@@ -324,27 +320,26 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     return job_row(row)
 
 
-#: Aliases of the table, created once, as each takes a millisecond.
+#: Aliases of the table, which are created only once, since each takes a millisecond.
 _FIRST, _LATER, _TURNS = (jobs.alias() for _ in range(3))
 
 
 class _Place(NamedTuple):
-    """The position of a job in the order of claims: the least is next."""
+    """Position of a job in the order of claims, where the smallest position is next."""
 
     upkeep: bool
-    turn: int  # of its tenant, the latest
+    turn: int  # latest turn of its tenant
     tenant: str
-    later: int  # its priority, negated
+    later: int  # negated priority
     attempts: int
     number: int
 
 
 def _lock_first(connection: Connection, turn: int, *due: ColumnElement[bool]) -> _Place | None:
-    """Lock and return the first due job of one tenant; None if other workers have locked all of
-    them.
+    """Lock and return the first due job of a tenant; None if other workers have locked all of them.
 
-    Jobs with fewer attempts come first, so that a job whose worker dies again and again does not
-    block others.
+    Jobs with fewer attempts come first, so that a job whose worker dies repeatedly does not block
+    the others.
     """
     row = connection.execute(
         select(jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant)
@@ -357,7 +352,7 @@ def _lock_first(connection: Connection, turn: int, *due: ColumnElement[bool]) ->
 
 
 def _first_of_few(connection: Connection, *due: ColumnElement[bool]) -> _Place | None:
-    """Return the first due job of all tenants; reads all due jobs."""
+    """Return the first due job of all tenants, after reading all due jobs."""
     statement = select(
         jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant, *_turns_of(jobs.c.tenant)
     ).where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS)
@@ -377,30 +372,30 @@ def _latest(*turns: int | None) -> int:
 
 
 def _is_upkeep(tenant: str, priority: int) -> bool:
-    """Return whether a job waits for all jobs that users requested."""
+    """Return whether a job is upkeep, which waits for all jobs that users requested."""
     return tenant == NOBODY and priority <= UPKEEP
 
 
 def _turns_of(tenant: ColumnElement[str]) -> tuple[Label[int | None], Label[int | None]]:
-    """Return the latest turns of a tenant: of its jobs, and of its removed jobs."""
+    """Return the latest turns of a tenant's jobs and of its removed jobs."""
     of_jobs = select(func.max(_TURNS.c.turn)).where(_TURNS.c.tenant == tenant)
     saved = select(tenants.c.turn).where(tenants.c.name == tenant)
     return of_jobs.scalar_subquery().label("of_jobs"), saved.scalar_subquery().label("saved")
 
 
 class _TenantDue(NamedTuple):
-    """A tenant with a due job: the least is next."""
+    """Tenant with a due job, where the smallest one is next."""
 
     upkeep: bool
-    turn: int  # its latest
+    turn: int  # latest turn
     tenant: str
-    priority: int  # of its first job
+    priority: int  # priority of its first job
 
 
 def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_TenantDue]:
     """Return the tenants with a due job, in the order of claims.
 
-    The index is read once for each tenant with a queued job, however many jobs there are.
+    The index is read once for each tenant with a queued job, independent of the number of jobs.
     """
     names = (
         select(func.min(_FIRST.c.tenant).label("tenant"))
@@ -436,9 +431,7 @@ def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_Ten
 
 
 def has_waiting_before(connection: Connection, held: JobRow) -> bool:
-    """Return whether a job of another tenant, or of a higher priority, waits for this one's next
-    slice.
-    """
+    """Return whether a job of another tenant or a higher priority precedes the next slice."""
     return any(
         one.tenant != held.tenant or one.priority > held.priority
         for one in _tenants_due(connection, *_waiting(now(connection)))
@@ -447,8 +440,8 @@ def has_waiting_before(connection: Connection, held: JobRow) -> bool:
 
 
 def _waiting(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions of queued jobs that are due."""
-    # "+ 0.0" makes SQLite use the index that has the order, instead of sorting all due jobs
+    """Return the conditions for queued jobs that are due."""
+    # "+ 0.0" makes SQLite use the index with the order, instead of sorting all due jobs
     due_at = jobs.c.run_after + 0.0
     return jobs.c.state == JobState.QUEUED, or_(due_at <= at, due_at > at + LONGEST_PAUSE_S)
 
@@ -461,7 +454,7 @@ def _last_turn(connection: Connection) -> int:
 
 
 def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
-    """Extend a lease; raise LostLease if another worker holds the job, or the job is over."""
+    """Extend a lease. Raise LostLease if another worker holds the job, or the job is over."""
     _hold(connection, held, leased_until=now(connection) + lease_s)
 
 
@@ -470,9 +463,9 @@ def check_held(connection: Connection, held: JobRow) -> None:
 
     Raises
     ------
-    LostLease : see `renew`.
+    LostLease : If another worker holds the job, or the job is over.
     """
-    # locked until the commit, so that no worker claims the job meanwhile if the lease is over
+    # the lock until the commit prevents claims by other workers if the lease has expired
     own = select(jobs.c.number).where(*_own(held)).with_for_update()
     if connection.execute(own).first() is None:
         raise _lost(held)
@@ -486,7 +479,7 @@ def finish(
 
     Raises
     ------
-    LostLease : see `renew`; the transaction must not be committed.
+    LostLease : If `renew` raises the error.
     """
     _hold(
         connection, held, state=state, error=error, traceback=traceback, leased_until=None,
@@ -497,20 +490,19 @@ def finish(
 def requeue_slice(
     connection: Connection, held: JobRow, progress: dict[str, Any], after_s: float = 0.0
 ) -> None:
-    """Queue a long job for its next slice, behind waiting jobs; the attempts start again.
+    """Queue a long job for its next slice behind waiting jobs, and reset its attempts.
 
     Parameters
     ----------
     connection : writing transaction
-    progress : progress so far
+    progress : new value of the column `progress`
     after_s : seconds until the job is due
 
     Raises
     ------
-    LostLease : see `renew`.
+    LostLease : If another worker holds the job, or the job is over.
     """
-    # one attempt, not zero: the job's number is lower than those of later jobs, and would put it
-    # before them again
+    # with zero attempts, the job's small number would put it before later jobs again
     _hold(
         connection, held, state=JobState.QUEUED, attempts=1, failures=0,
         leased_until=None, worker=None, run_after=now(connection) + after_s, progress=progress,
@@ -522,9 +514,9 @@ def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> Jo
 
     Raises
     ------
-    LostLease : see `renew`.
+    LostLease : If another worker holds the job, or the job is over.
     """
-    # read again: the death of an earlier worker may have been counted since the claim
+    # the death of an earlier worker may have been counted after the claim
     stored = select(jobs.c.failures).where(jobs.c.number == held.number)
     failures = (connection.execute(stored).scalar() or 0) + 1
     if failures >= MAXIMUM_FAILURES or held.attempts >= MAXIMUM_ATTEMPTS:
@@ -538,12 +530,12 @@ def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> Jo
 
 
 def pause_s(failures: int) -> float:
-    """Return the seconds before the next attempt of a job after a number of failures."""
+    """Return the pause before the next attempt of a job after some failures, seconds."""
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
 def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> None:
-    """Queue a job that was not started, as if it had not been claimed.
+    """Return a job that was not started to the queue, as if it had not been claimed.
 
     Parameters
     ----------
@@ -552,7 +544,7 @@ def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> N
 
     Raises
     ------
-    LostLease : see `renew`.
+    LostLease : If `renew` raises the error.
     """
     _hold(
         connection, held, state=JobState.QUEUED, attempts=held.attempts - 1,
@@ -561,45 +553,45 @@ def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> N
 
 
 def _hold(connection: Connection, held: JobRow, **values: object) -> None:
-    """Change a job if its claim is the latest; else raise LostLease."""
+    """Change a job. Raise LostLease if its claim is not the latest."""
     changed = connection.execute(update(jobs).where(*_own(held)).values(**values))
     if changed.rowcount != 1:
         raise _lost(held)
 
 
 def _own(held: JobRow) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions that a job is held by a claim."""
+    """Return the conditions for a job that a claim holds."""
     return (
         jobs.c.number == held.number,
         jobs.c.token == held.token,
         jobs.c.state == JobState.RUNNING,
-        # a promoted standby that lacked the claim may have issued its token again
+        # a promoted standby without the claim may issue its token again
         jobs.c.worker == held.worker,
     )
 
 
 def _lost(held: JobRow) -> LostLease:
     return LostLease(
-        f"Job {held.id} is no longer held by this worker: its lease ran out, or it was "
-        "cancelled. Nothing was stored."
+        f"This worker no longer holds job {held.id}: the lease expired, or the job was cancelled. "
+        "Nothing was stored."
     )
 
 
 def has_exhausted(connection: Connection) -> bool:
-    """Return whether there is a job for `dead_letter`, without a lock."""
+    """Return whether `dead_letter` would declare a job dead, without a lock."""
     statement = select(jobs.c.number).where(*_out_of_tries(now(connection))).limit(1)
     return connection.execute(statement).first() is not None
 
 
 def dead_letter(connection: Connection) -> list[JobRow]:
-    """Declare jobs dead whose workers fall silent again and again, and return them."""
+    """Declare jobs dead whose workers repeatedly stopped responding, and return these jobs."""
     at = now(connection)
     rows = connection.execute(
         update(jobs)
         .where(*_out_of_tries(at))
         .values(
             state=JobState.DEAD, finished_at=at, leased_until=None,
-            error=f"its worker fell silent in the last of {MAXIMUM_ATTEMPTS} attempts",
+            error=f"its worker stopped responding in the last of {MAXIMUM_ATTEMPTS} attempts",
         )
         .returning(jobs)
     ).mappings()  # fmt: skip
@@ -609,22 +601,20 @@ def dead_letter(connection: Connection) -> list[JobRow]:
 def fail_dead_worker(
     connection: Connection, job_id: str, token: int, error: str, traceback: str, *, counts: bool
 ) -> JobRow | None:
-    """Take a job from a worker that died, without waiting for its lease: queue it again, or declare
-    it dead.
+    """Queue the job of a dead worker again, or declare it dead, before the lease expires.
 
     Parameters
     ----------
     connection : writing transaction
     job_id, token : claim of the dead worker
-    error, traceback : description of its death
-    counts : whether the job may have caused the death; if not, the attempt is no failure
+    error, traceback : description of the worker's death
+    counts : whether the job may have caused the death, so that the attempt counts as a failure
 
     Returns
     -------
-    job : the job as it is now; None if nothing changed for its workers: the job is over, or another
-        worker claimed it when the lease ended
+    job : changed job; None if the job is over, or another worker has claimed it
     """
-    # locked, as claims wait for no turn
+    # the lock is necessary, since claims wait for no turn
     locked = select(jobs).where(jobs.c.id == job_id).with_for_update()
     row = connection.execute(locked).mappings().first()
     if row is None or JobState(row["state"]).over:
@@ -645,7 +635,7 @@ def fail_dead_worker(
 
 
 def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions of a job whose worker fell silent in the last attempt."""
+    """Return the conditions for jobs whose worker stopped responding in the last attempt."""
     return (
         jobs.c.state == JobState.RUNNING,
         _lease_over(at),
@@ -654,14 +644,14 @@ def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
 
 
 def cancel(connection: Connection, job: JobRow) -> None:
-    """Cancel a job; a worker that runs it learns so when it stores its result.
+    """Cancel a job; a worker that is running it will fail to store its result.
 
     Raises
     ------
-    JobOver : the job is over.
+    JobOver : If the job is over.
     """
     if job.state.over:
-        raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} Nothing is left to do.")
+        raise JobOver(f"Job {job.id} is {job.state}: {job.state.sentence} It cannot be cancelled.")
     cancel_jobs(connection, jobs.c.number == job.number)
 
 
@@ -675,7 +665,7 @@ def cancel_jobs(connection: Connection, *which: ColumnElement[bool]) -> None:
 
 
 def requeue_job(connection: Connection, job: JobRow) -> None:
-    """Queue a finished job again, with all attempts."""
+    """Queue a finished job again, and reset its attempts."""
     connection.execute(
         update(jobs)
         .where(jobs.c.number == job.number)
@@ -686,21 +676,21 @@ def requeue_job(connection: Connection, job: JobRow) -> None:
     )  # fmt: skip
 
 
-# Results of long jobs: items, appended slice by slice, and files.
+# Results of long jobs: items, which slices append, and files.
 
-#: Number of rows to insert at once.
+#: Number of rows that are inserted at once.
 _BLOCK = 500
 
 
 @dataclass(frozen=True)
 class JobFile:
-    """A file of a job.
+    """File of a job.
 
     Parameters
     ----------
     name : unique name within the job, such as mesh.ply
-    blob : existing blob with the content
-    bytes : size
+    blob : digest of the content, which must exist
+    bytes : size of the file
     """
 
     name: str
@@ -723,7 +713,7 @@ def append_items(connection: Connection, job_number: int, items: list[dict[str, 
 def items_of(
     connection: Connection, job_number: int, first: int = 0, limit: int | None = None
 ) -> list[dict[str, Any]]:
-    """Return items of a job in order, from number `first`."""
+    """Return items of a job in order, starting at number `first`."""
     statement = (
         select(job_items.c.data)
         .where(job_items.c.job_number == job_number, job_items.c.number >= first)
@@ -734,7 +724,7 @@ def items_of(
 
 
 def add_files(connection: Connection, job_number: int, files: Iterable[JobFile]) -> None:
-    """Add files to a job; they replace files of the same names."""
+    """Add files to a job, and replace files with the same names."""
     for one in files:
         remove_parts(connection, job_number, items=False, files=[one.name])
         connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
@@ -743,21 +733,21 @@ def add_files(connection: Connection, job_number: int, files: Iterable[JobFile])
 
 
 def _count_archive(connection: Connection, job_number: int, size: int) -> None:
-    """Add the bytes of an archive to the use of its import's map."""
+    """Add the size of an archive to the usage of its import's map."""
     own = select(jobs.c.map_number).where(jobs.c.number == job_number)
     map_number: Any = own.scalar_subquery()
     add_usage(connection, map_number, 0, size)
 
 
 def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
-    """Return the files of a job by their names."""
+    """Return the files of a job by name."""
     c = job_files.c
     statement = select(c.name, c.blob, c.bytes, c.media_type).where(c.job_number == job_number)
     return {row.name: JobFile(*row) for row in connection.execute(statement.order_by(c.name))}
 
 
 def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
-    """Return the jobs of a kind that have any file, the oldest first."""
+    """Return the jobs of a kind that have files, the oldest first."""
     having = jobs.c.number.in_(select(job_files.c.job_number)), jobs.c.kind == kind
     rows = connection.execute(select(jobs).where(*having).order_by(jobs.c.number)).mappings()
     return [job_row(row) for row in rows]
@@ -784,11 +774,11 @@ def remove_parts(
     ----------
     connection : writing transaction
     items : whether to remove the items
-    files : names of the files to remove; default: all
+    files : names of the files to remove; default: all files
 
     Returns
     -------
-    blobs : blobs of the removed files; sweep them after the commit
+    blobs : blobs of the removed files, to sweep after the commit
     """
     if items:
         connection.execute(delete(job_items).where(job_items.c.job_number == job_number))
@@ -805,17 +795,17 @@ def remove_parts(
 
 
 def replace_result(connection: Connection, job: JobRow, result: dict[str, Any]) -> JobRow:
-    """Correct the result of a finished job, and return the job."""
+    """Replace the result of a finished job, and return the job."""
     own = update(jobs).where(jobs.c.number == job.number).values(result=result)
     return job_row(connection.execute(own.returning(jobs)).mappings().one())
 
 
 def remove_job(connection: Connection, job: JobRow) -> list[str]:
-    """Remove a job with its items and files; a worker that runs it loses its lease.
+    """Remove a job with its items and files; a worker that is running it loses its lease.
 
     Returns
     -------
-    blobs : blobs of the removed files; sweep them after the commit
+    blobs : blobs of the removed files, to sweep after the commit
     """
     blobs = remove_parts(connection, job.number)
     save_turns(connection, job.tenant)

@@ -1,4 +1,4 @@
-"""Databases and blobs opened for inspection: nothing is written or created."""
+"""Open databases and blobs for inspection, without writing or creating anything."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from sceneprint.store.sqlite import begin_sqlite
 
 @contextmanager
 def inspect_database(url: str) -> Iterator[Database]:
-    """Open a database that may be in use without changing it: no schema, log or lock stays behind.
+    """Open a database that may be in use, without leaving changes, logs or locks.
 
     Raises
     ------
-    UnusableStore : there is no database, or its schema is older; or, at the end, a process wrote to
-        an unlocked file meanwhile, so that the read data may be wrong.
-    NewerSchema : a later version of sceneprint wrote the database.
+    UnusableStore : If there is no database, its schema is older, or a process wrote to an unlocked
+        file meanwhile, so that the data may be wrong.
+    NewerSchema : If a later version of sceneprint wrote the database.
     """
     parsed = database_url(url)
     path = _file_of(parsed) if parsed.get_backend_name() == "sqlite" else None
@@ -49,38 +49,37 @@ def inspect_database(url: str) -> Iterator[Database]:
         database.close()
         if alone and path is not None and _state(path) != before:
             raise UnusableStore(
-                f"{path} was written while it was read without locks, so the results may be wrong. "
-                "Run it again."
+                f"Another process wrote to {path} while it was read without locks, so the results "
+                "may be wrong. Run the command again."
             )
 
 
 def require_present_schema(database: Database) -> None:
-    """Check that a database has the schema of this version, without a migration.
+    """Check that a database has the schema of this version, without migrating it.
 
     Raises
     ------
-    UnusableStore, NewerSchema : the database has another schema.
+    UnusableStore, NewerSchema : If the database has another schema.
     """
     head, _ = known_revisions()
     with database.read() as connection:
         revision = current_revision(connection)
     if revision != head:
         raise UnusableStore(
-            f"{database.shown} has schema {revision}, and this version works with {head}. "
-            "`sceneprint migrate` brings it there."
+            f"{database.shown} has schema {revision}, but this version needs {head}. Run "
+            "`sceneprint migrate`."
         )
 
 
 def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
-    """Return an engine that writes nothing, and whether it reads the file without locks."""
+    """Return an engine that does not write, and whether it reads the file without locks."""
     if not path.is_file():
         raise UnusableStore(
-            f"{path}: there is no database. Name the data folder with --data, or check "
+            f"{path}: There is no database. Specify the data folder with --data, or check "
             "SCENEPRINT_DATABASE_URL."
         )
     wal, shm = _beside(path, "-wal"), _beside(path, "-shm")
-    # without a log, no process has the file open. A log whose index is missing cannot be read
-    # without creating the index
+    # without a log, no process has opened the file; reading a log would create a missing log index
     alone = not wal.exists()
     how = "&immutable=1" if alone else "&readonly_shm=1" if shm.exists() else ""
 
@@ -97,7 +96,7 @@ def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
 
 
 def _file_of(url: URL) -> Path | None:
-    """Return the file of a SQLite URL; None: the database is in memory."""
+    """Return the file of a SQLite URL; None for a database in memory."""
     name = url.database or ""
     if name.startswith("file:"):
         name = unquote(urlsplit(name).path)
@@ -124,7 +123,7 @@ def inspect_blobs(place: Path | str, database: Database) -> Iterator[Blobs]:
 
     Raises
     ------
-    UnusableStore : the folder is missing, or the blobs belong to another database.
+    UnusableStore : If the folder is missing, or the blobs belong to another database.
     """
     if isinstance(place, Path):
         require_folder(place)
@@ -139,10 +138,10 @@ def require_folder(place: Path) -> None:
 
     Raises
     ------
-    UnusableStore : the folder is missing.
+    UnusableStore : If the folder is missing.
     """
     if not place.is_dir():
         raise UnusableStore(
-            f"{place}: there is no such folder. Name the data folder with --data, check that its "
-            "disk is mounted, or restore a backup."
+            f"{place}: The folder does not exist. Specify the data folder with --data, check that "
+            "its disk is mounted, or restore a backup."
         )

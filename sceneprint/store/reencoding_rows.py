@@ -1,7 +1,8 @@
-"""Rows of a re-encoding: frames without a signature of the next model, their jobs, and the switch.
+"""Re-encoding of a map: frames without a signature of the next model, their jobs, and the switch.
 
-Until the switch, each frame's present signature is searched, and one of the next model is stored
-beside it. Signatures and jobs of models that a map does not use are removed in blocks.
+Until the switch, searches use the current signature of each frame, and the signature of the next
+model is stored beside it. Signatures and jobs of models that a map does not use are removed in
+blocks.
 """
 
 from __future__ import annotations
@@ -21,20 +22,20 @@ from sceneprint_client.api import FrameState, JobState
 #: Kind of the jobs that sign an indexed frame with the next model.
 REENCODE = "reencode"
 PRIORITY = UPKEEP
-#: Rows that one transaction changes, so that writers wait for tenths of a second at most.
+#: Numbers of rows that one transaction queues and removes; writers wait for less than a second.
 QUEUED_AT_ONCE, REMOVED_AT_ONCE = 2000, 50
 
 
 @dataclass(frozen=True)
 class SwitchProgress:
-    """The progress of a map's re-encoding, in frames.
+    """Progress of a map's re-encoding.
 
     Parameters
     ----------
-    done : signed with the next model
-    left : waiting for a signature
-    failed : without anything that the next model could sign; they are rejected at the switch
-    dead : with a dead job; the switch waits for them
+    done : number of frames that the next model has signed
+    left : number of frames that wait for a signature
+    failed : number of frames that the next model cannot sign, and that the switch will reject
+    dead : number of frames with a dead job, for which the switch waits
     """
 
     done: int
@@ -68,7 +69,7 @@ def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
     def over(state: JobState, *conditions: ColumnElement[bool]) -> int:
         ended = select(frames.c.number).join(jobs, jobs.c.frame_number == frames.c.number)
         own = ended.where(jobs.c.state == state, _for_next(row), lacks, *conditions).distinct()
-        return len(connection.execute(own).all())  # few rows, which an index finds by state
+        return len(connection.execute(own).all())  # an index selects these few rows by state
 
     every, lacking = count(_indexed(row)), count(lacks)
     failed = over(JobState.FAILED)
@@ -77,7 +78,7 @@ def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
 
 
 def is_pending(connection: Connection, row: MapRow) -> bool:
-    """Return whether a job for the next model of a map waits or runs; cheap if many do."""
+    """Return whether a job for the next model of a map is waiting or running."""
     statement = (
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
@@ -90,11 +91,11 @@ def is_pending(connection: Connection, row: MapRow) -> bool:
 def unqueued_frames(
     connection: Connection, row: MapRow, after: int, *, again: bool = False
 ) -> list[int]:
-    """Return the numbers of the next frames without a signature of the next model or a job for it.
+    """Return the numbers of frames without a signature of the next model and without a job for it.
 
     Parameters
     ----------
-    after : number of a frame
+    after : number of the last frame of the previous block
     again : whether to include frames with a dead job
     """
     states = (*PENDING, JobState.FAILED, *(() if again else (JobState.DEAD,)))
@@ -106,7 +107,7 @@ def unqueued_frames(
 
 
 def enqueue_all(connection: Connection, row: MapRow, numbers: list[int]) -> None:
-    """Queue the signing of frames with the next model of their map."""
+    """Queue jobs that sign frames with the next model of their map."""
     now = read_clock(connection)
     values = [
         {
@@ -130,7 +131,7 @@ def is_complete(connection: Connection, row: MapRow) -> bool:
 
 
 def frames_signed_by(connection: Connection, row: MapRow, revision: int) -> list[int]:
-    """Return the numbers of frames indexed by a revision with a signature of the next model."""
+    """Return the numbers of frames indexed up to a revision that the next model has signed."""
     statement = select(frames.c.number).where(
         _indexed(row), frames.c.revision <= revision, _signed(row.next_model_id)
     )
@@ -138,7 +139,7 @@ def frames_signed_by(connection: Connection, row: MapRow, revision: int) -> list
 
 
 def raise_revisions(connection: Connection, row: MapRow, numbers: list[int]) -> None:
-    """Give indexed frames the next revisions of their map, so that indexes read them again."""
+    """Assign the next revisions of the map to indexed frames, so that indexes read them again."""
     for number in numbers:
         revision = next_revision(connection, row.number)
         connection.execute(
@@ -147,7 +148,7 @@ def raise_revisions(connection: Connection, row: MapRow, numbers: list[int]) -> 
 
 
 def switch_model(connection: Connection, row: MapRow) -> list[str]:
-    """Let the next model replace the model of a map whose frames are complete.
+    """Replace the model of a map by the next model after all frames are signed.
 
     Frames with a failed job are rejected. Frames that the former model rejected are signed again.
 
@@ -170,7 +171,7 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
     rejected = {one.number: one for one in failed}
     for number, one in rejected.items():
         set_state(connection, number, FrameState.REJECTED, one.error)
-        # readers and indexes may hold the frame from when the map had this model before
+        # readers and indexes may have the frame from an earlier time when the map had this model
         raise_revisions(connection, row, [number])
         record_event(connection, "frame.rejected", row.name, one.id, one.job_id)
     for number, frame_id in former:
@@ -208,7 +209,7 @@ def _for_next(row: MapRow) -> ColumnElement[bool]:
 
 
 def _has_job(row: MapRow, states: tuple[JobState, ...]) -> ColumnElement[bool]:
-    own = jobs.alias("own")  # the surrounding query may use `jobs` as well
+    own = jobs.alias("own")  # the surrounding query may use `jobs` too
     return exists().where(
         own.c.frame_number == frames.c.number, own.c.kind == REENCODE,
         own.c.model_id == row.next_model_id, own.c.state.in_(states),

@@ -1,8 +1,8 @@
-"""How far stored bytes have been read to see that they are sound: one row for all workers.
+"""Progress of the scrub, which checks all stored bytes: one row for all workers.
 
-A pass reads all frames in the order of their numbers, a slice at a time. Whoever claims a slice
-keeps the others from it until it is due again, so that the rate is that of the store, however many
-workers it has; and a slice whose worker dies is read again.
+A pass reads all frames in the order of their numbers, in slices. A worker that claims a slice sets
+the time at which the next slice is due, which limits the rate for all workers together. If the
+worker dies, another one reads the slice again.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from sqlalchemy import Connection, insert, select, update
 from sceneprint.store.queue import read_clock
 from sceneprint.store.tables import frames, scrubs
 
-#: Seconds between two slices, and between the beginnings of two passes at least.
+#: Seconds between two slices, and minimum seconds between the starts of two passes.
 SLICE_S, PASS_S = 4.0, 86_400.0
 
 
 @dataclass(frozen=True)
 class ScrubRow:
-    """Where a scrub stands; fields as in the table."""
+    """Progress of a scrub; see the table for the fields."""
 
     number: int
     position: int
@@ -32,18 +32,18 @@ class ScrubRow:
     damaged: int
 
     def is_due(self, now: float) -> bool:
-        """Return whether somebody may go on, or the clock has been set back by more than a pass."""
+        """Return whether a slice is due, or the clock was set back by more than a pass."""
         return not now < self.next_at <= now + PASS_S
 
 
 def read_scrub(connection: Connection) -> ScrubRow | None:
-    """Return where the scrub stands; None: none has begun."""
+    """Return the progress of the scrub; None if it has never started."""
     row = connection.execute(select(scrubs)).mappings().first()
     return None if row is None else ScrubRow(**row)
 
 
 def claim_slice(connection: Connection) -> ScrubRow | None:
-    """Take the next slice, in a writing transaction; None where it is not due."""
+    """Claim the next slice in a writing transaction; return None if it is not due."""
     now, row = read_clock(connection), read_scrub(connection)
     if row is None:
         row = ScrubRow(1, 0, now + SLICE_S, now, None, 0, 0, 0)
@@ -51,26 +51,26 @@ def claim_slice(connection: Connection) -> ScrubRow | None:
         return row
     if not row.is_due(now):
         return None
-    if row.position == 0:  # a new pass
+    if row.position == 0:  # a new pass starts
         row = replace(row, began_at=now, blobs=0, bytes=0, damaged=0)
     row = replace(row, next_at=now + SLICE_S)
     connection.execute(update(scrubs).values(**asdict(row)))
     return row
 
 
-def frames_behind(connection: Connection, position: int, count: int) -> list[int]:
-    """Return the numbers of the next frames, at most so many."""
-    asked = select(frames.c.number).where(frames.c.number > position)
-    return list(connection.execute(asked.order_by(frames.c.number).limit(count)).scalars())
+def next_frames(connection: Connection, position: int, count: int) -> list[int]:
+    """Return the numbers of the next frames after a position, at most `count`."""
+    statement = select(frames.c.number).where(frames.c.number > position)
+    return list(connection.execute(statement.order_by(frames.c.number).limit(count)).scalars())
 
 
 def record_slice(connection: Connection, row: ScrubRow, *, finished: bool) -> None:
-    """Note what came of a slice, in a writing transaction.
+    """Record the result of a slice in a writing transaction.
 
     Parameters
     ----------
-    row : of `claim_slice`, with the position and the counts after the slice
-    finished : whether there are no more frames: the next pass begins when its time has come
+    row : row of `claim_slice` with the position and the counts after the slice
+    finished : whether there are no more frames; the next pass then starts when it is due
     """
     if finished:
         now = read_clock(connection)

@@ -1,4 +1,4 @@
-"""Signatures, and changes to the searched frames since a revision of the map."""
+"""Store and read signatures, and read changes to the searched frames since a map revision."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ from sceneprint_client.api import FrameState, JobState
 
 @dataclass(frozen=True)
 class StoredSignature:
-    """The results of signing a frame.
+    """Result of signing a frame.
 
     Parameters
     ----------
-    model_id : model that signed the frame
+    model_id : id of the model that signed the frame
     vector : bytes of the signature
     geometry : blob of the artifact
-    n_patches, n_pairs : counts per level
+    n_patches, n_pairs : numbers of patches and pairs per level
     """
 
     model_id: str
@@ -64,10 +64,10 @@ class StoredSignature:
 
 @dataclass(frozen=True)
 class SignatureChange:
-    """A frame that was indexed, or that is no longer searched.
+    """Change of a frame that was indexed, or is no longer searched.
 
     `vector` is None if the frame is not searched, or if its signature is damaged. `deleted` is True
-    for deleted frames, and for frames that a new model of the map rejected.
+    for deleted frames, and for frames that a new model of the map has rejected.
     """
 
     number: int
@@ -78,10 +78,10 @@ class SignatureChange:
 
 
 def index_frame(connection: Connection, frame: FrameRow, signature: StoredSignature) -> int:
-    """Store a signature and index its frame; return the map's revision."""
-    # a map that returns to a former model may still have its signature
+    """Store a signature, index its frame, and return the map's revision."""
+    # after a return to a former model, its signature may still exist
     _write_signature(connection, frame, signature)
-    mark_edited(connection, frame.number)  # it may have been indexed before
+    mark_edited(connection, frame.number)  # a surface may contain the frame
     revision = next_revision(connection, frame.map_number)
     moved = root_columns(connection, frame)
     if moved:
@@ -105,14 +105,14 @@ def index_claimed_frame(
     Parameters
     ----------
     connection : writing transaction of the frame's map
-    job : job as claimed, for the frame
+    job : claimed job of the frame
     frame, signature : see `index_frame`
     map_name : name of the frame's map
 
     Returns
     -------
-    done : False, and nothing was written, on SQLite, and if the job is no longer held, the map has
-        or gets another model, or the frame's parent frame is joined: the caller must check which
+    done : False if nothing was written: on SQLite, and if the job is no longer held, the map has or
+        gets another model, or the parent frame is joined. The caller must check the reason
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -173,10 +173,10 @@ def _index_claimed(events_name: str) -> TextClause:
 
 
 def replace_signature(connection: Connection, frame: FrameRow, signature: StoredSignature) -> bool:
-    """Replace a damaged or missing signature of an indexed frame, which stays searched meanwhile.
+    """Replace a damaged or missing signature of an indexed frame, which remains searchable.
 
-    If the bytes of the map's own signatures change, the frame gets the map's next revision, so that
-    readers and indexes read it again.
+    If a signature of the map's current model changes, the frame gets the map's next revision, so
+    that readers and indexes read it again.
 
     Returns
     -------
@@ -190,9 +190,9 @@ def replace_signature(connection: Connection, frame: FrameRow, signature: Stored
     _write_signature(connection, frame, signature)
     searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
     is_searched = connection.execute(searched).scalar_one() == signature.model_id
-    if is_searched:  # its artifact may have been lost
+    if is_searched:  # the artifact may have been lost
         note_edit(connection, frame.number, frame.map_number)
-    # readers skipped the frame if its checksum was wrong, whatever its bytes
+    # readers skip frames with a wrong checksum, so the checksum must be equal too
     if before is not None and tuple(before) == (signature.vector, crc32(signature.vector)):
         return False
     if is_searched:
@@ -204,7 +204,7 @@ def replace_signature(connection: Connection, frame: FrameRow, signature: Stored
 
 
 def _write_signature(connection: Connection, frame: FrameRow, signature: StoredSignature) -> None:
-    """Store a signature in place of the model's former one."""
+    """Insert or replace the signature of a frame for a model."""
     own = (signatures.c.frame_number == frame.number) & (
         signatures.c.model_id == signature.model_id
     )
@@ -213,7 +213,7 @@ def _write_signature(connection: Connection, frame: FrameRow, signature: StoredS
 
 
 def put_signatures(connection: Connection, new: Sequence[tuple[int, StoredSignature]]) -> None:
-    """Store signatures by the numbers of frames, which must have none of these models."""
+    """Store the signatures of frames, by number, that have no signatures of these models."""
     rows = [
         {
             "frame_number": number, "model_id": one.model_id, "vector": one.vector,
@@ -228,9 +228,7 @@ def put_signatures(connection: Connection, new: Sequence[tuple[int, StoredSignat
 def changes_since(
     connection: Connection, row: MapRow, revision: int, limit: int = 256
 ) -> Iterator[list[SignatureChange]]:
-    """Yield the frames that were indexed or deleted after a revision, in order, in blocks of
-    `limit`.
-    """
+    """Yield blocks of changes to frames after a revision, in order, of `limit` changes each."""
     while True:
         rows = connection.execute(
             select(frames.c.number, frames.c.id, frames.c.revision, frames.c.state,
@@ -263,7 +261,7 @@ def _change(
 def count_indexed(
     connection: Connection, map_number: int, revision: int, most: int | None = None
 ) -> int:
-    """Return the number of frames of a map that were indexed after a revision, at most `most`."""
+    """Return the number of a map's frames that were indexed after a revision, at most `most`."""
     newer = (
         select(frames.c.number)
         .where(
@@ -277,17 +275,17 @@ def count_indexed(
 
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:
-    """Return the numbers of frames of a map that ceased to be searched after a revision."""
-    gone = select(frames.c.number).where(*_gone(map_number, revision))
-    return frozenset(connection.execute(gone).scalars())
+    """Return the numbers of a map's frames that were removed from searches after a revision."""
+    statement = select(frames.c.number).where(*_deletion_conditions(map_number, revision))
+    return frozenset(connection.execute(statement).scalars())
 
 
 def count_gone(connection: Connection, map_number: int, revision: int) -> int:
-    """Return the number of frames of a map that ceased to be searched after a revision."""
-    return count_rows(connection, *_gone(map_number, revision))
+    """Return the count of a map's frames that were removed from searches after a revision."""
+    return count_rows(connection, *_deletion_conditions(map_number, revision))
 
 
-def _gone(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
+def _deletion_conditions(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
     return (
         frames.c.map_number == map_number,
         frames.c.revision > revision,
@@ -296,7 +294,7 @@ def _gone(map_number: int, revision: int) -> tuple[ColumnElement[bool], ...]:
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
-    """Return the signature of a frame, or None; raise DamagedSignature if the checksum is wrong."""
+    """Return the signature of a frame, or None. Raise DamagedSignature for a wrong checksum."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     statement = select(signatures.c.vector, signatures.c.checksum).where(own)
     row = connection.execute(statement).first()
@@ -304,8 +302,8 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
         return None
     if crc32(row.vector) != row.checksum:
         raise DamagedSignature(
-            "The signature of the frame is damaged: its checksum is wrong. A worker computes it "
-            "again from the upload; `sceneprint fsck` says whether that is possible."
+            "The signature of the frame is damaged: its checksum is wrong. A worker will compute "
+            "it again from the upload. Run `sceneprint fsck` to check whether this is possible."
         )
     return bytes(row.vector)
 
@@ -313,9 +311,7 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
 def patch_counts(
     connection: Connection, number: int, model_id: str
 ) -> tuple[list[int], list[int]] | None:
-    """Return the numbers of patches and ordered pairs per level, the finest first; None without
-    signature.
-    """
+    """Return the numbers of patches and of ordered pairs per level, the finest first, or None."""
     statement = select(signatures.c.n_patches, signatures.c.n_pairs).where(
         signatures.c.frame_number == number, signatures.c.model_id == model_id
     )
@@ -326,18 +322,18 @@ def patch_counts(
 def stored_signatures(
     connection: Connection, numbers: Iterable[int], model_id: str
 ) -> dict[int, bytes]:
-    """Return signatures by the numbers of frames, without missing or damaged ones."""
+    """Return the signatures of frames by number, except missing or damaged signatures."""
     statement = select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum)
     own = statement.where(signatures.c.model_id == model_id)
     rows = rows_among(connection, own, signatures.c.frame_number, numbers)
     return {n: bytes(vector) for n, vector, checksum in rows if crc32(vector) == checksum}
 
 
-# Signatures and jobs of models that a map neither has nor will have.
+# Signatures and jobs of models that are neither the current nor the next model of a map.
 
 
 def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tuple[int, str]]:
-    """Return frame and model of the next signatures that belong to neither of a map's models."""
+    """Return frame and model of signatures that belong to neither model of a map, after a frame."""
     rows = connection.execute(
         select(signatures.c.frame_number, signatures.c.model_id)
         .join(frames, frames.c.number == signatures.c.frame_number)
@@ -352,7 +348,7 @@ def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tu
 
 
 def remove_signature(connection: Connection, number: int, model_id: str) -> list[str]:
-    """Remove a model's signature of a frame; return the blobs that it referred to."""
+    """Remove the signature of a frame for a model, and return its blobs."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     blobs = list(connection.execute(select(signatures.c.geometry).where(own)).scalars())
     connection.execute(delete(signatures).where(own))
@@ -360,7 +356,7 @@ def remove_signature(connection: Connection, number: int, model_id: str) -> list
 
 
 def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
-    """Return the numbers of some unfinished jobs for a model that is neither of a map's models."""
+    """Return the numbers of some unfinished jobs for models that a map does not use."""
     numbers = connection.execute(
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)

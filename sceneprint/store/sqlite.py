@@ -1,4 +1,4 @@
-"""SQLite: how connections are configured, how transactions begin, and how writers wait."""
+"""Configure SQLite connections, begin transactions, and let writers wait."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from sqlalchemy.exc import ArgumentError, OperationalError
 from sceneprint.atomic_files import PRIVATE_FILE
 from sceneprint.errors import ReadOnlyStore, UnusableStore
 
-# A read-only SQLite file: on a read-only disk, or of another user.
+# Read-only SQLite files, which are on a read-only disk or belong to another user.
 #
-# SQLite reads a database with a log (`-wal`) only with the log's index (`-shm`), which it cannot
-# create here. Without a log, the file is complete and read without locks. Another process may still
-# write to it, such as through another mount, so the file is checked after every transaction.
+# SQLite reads a database with a log (`-wal`) only with the index of the log (`-shm`), which it
+# cannot create on a read-only disk. Without a log, the file is complete and is read without locks.
+# Another process may still write to it, for example through another mount, so the file is checked
+# after each transaction.
 
 
 def read_only_file(url: URL) -> Path | None:
-    """Return the file of a SQLite database if it exists, and it or its folder is read-only."""
+    """Return the file of a SQLite database if it exists and the file or its folder is read-only."""
     name = url.database or ""
     if url.get_backend_name() != "sqlite" or name in ("", ":memory:") or name.startswith("file:"):
         return None
@@ -36,7 +37,7 @@ def read_only_file(url: URL) -> Path | None:
 
 
 def is_read_only(url: str) -> bool:
-    """Return whether a URL is that of a read-only SQLite file."""
+    """Return whether a URL refers to a read-only SQLite file."""
     try:
         return read_only_file(make_url(url)) is not None
     except (ArgumentError, ValueError):
@@ -44,31 +45,31 @@ def is_read_only(url: str) -> bool:
 
 
 class ReadOnlyFile:
-    """Reads a read-only SQLite file."""
+    """Reader of a read-only SQLite file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def connect(self) -> sqlite3.Connection:
-        """Open the file, with or without locks as its log requires.
+        """Open the file with locks if it has a log, else without locks.
 
         Raises
         ------
-        UnusableStore : the file was not closed, and cannot be recovered without writing.
+        UnusableStore : If the file was not closed, so that it needs a recovery, which would write.
         """
         has_log, has_index = self._log(), self._beside("-shm").exists()
         if (has_log and not has_index) or self._beside("-journal").exists():
             raise UnusableStore(
-                f"{self._path} was not closed, and on a read-only disk it cannot be recovered. "
-                "Open the data folder once from a writable disk, or use a copy."
+                f"{self._path} was not closed, and cannot be recovered on a read-only disk. Open "
+                "the data folder once from a writable disk, or use a copy."
             )
         how = "mode=ro" if has_log else "mode=ro&immutable=1"
         return sqlite3.connect(f"{self._path.as_uri()}?{how}", uri=True, check_same_thread=False)
 
     def state(self) -> tuple[object, ...]:
-        """Return values that must be equal before and after a transaction."""
+        """Return values that change if another process writes during a transaction."""
         if self._log():
-            return ()  # SQLite's own locks tell one transaction from another
+            return ()  # the locks of SQLite protect the transaction
         try:
             status = self._path.stat()
         except OSError:
@@ -80,16 +81,15 @@ class ReadOnlyFile:
 
         Raises
         ------
-        UnusableStore : a process has.
+        UnusableStore : If a process has written to the file.
         """
         if self.state() != before:
             raise UnusableStore(
-                f"{self._path} was written by another process while it was read without locks. "
-                "Try again."
+                f"Another process wrote to {self._path} while it was read without locks. Try again."
             )
 
     def refusal(self) -> ReadOnlyStore:
-        """Return the error for writers."""
+        """Return the error for attempts to write."""
         return ReadOnlyStore(
             f"{self._path} or its folder is read-only, so nothing can be stored. Make both "
             "writable for this user, and start again."
@@ -107,11 +107,11 @@ class ReadOnlyFile:
         return self._path.with_name(self._path.name + end)
 
 
-#: Seconds that a writer waits for another, and that it waits after one has timed out.
+#: Seconds that a writer waits for another writer, and after another writer has timed out.
 BUSY_S, HELD_S = 10.0, 0.1
-#: Seconds between two attempts to take the lock, and maximum seconds in line for it.
+#: Seconds between two attempts to take the lock, and maximum seconds in the line for it.
 LOOK_S, LINE_S = 0.0005, 1.0
-#: Seconds that emptying the log waits for readers; writers wait for it meanwhile.
+#: Seconds that emptying the log waits for readers; writers wait meanwhile.
 SHRINKING_S = 0.5
 
 
@@ -120,7 +120,7 @@ def open_sqlite(url: URL) -> tuple[Engine, ReadOnlyFile | None]:
     path, sealed = read_only_file(url), None
     if path is not None:
         sealed = ReadOnlyFile(path)
-        # each transaction opens the file anew, with or without locks
+        # each transaction opens the file again, with or without locks
         engine = create_engine(url, creator=sealed.connect, poolclass=NullPool)
     else:
         # in WAL mode, readers never wait
@@ -132,26 +132,25 @@ def open_sqlite(url: URL) -> tuple[Engine, ReadOnlyFile | None]:
 
 
 def _create_file(_dialect: Any, _record: Any, arguments: list[Any], _named: Any) -> None:
-    """Create a missing file, as SQLite would make it readable for others; the log gets the same
-    mode.
+    """Create a missing file that only this user can read; SQLite copies the mode to the log.
 
-    It is not opened: closing it would release this process's locks on it.
+    The file is not opened, because closing it would release this process's locks on it.
     """
     path = arguments[0] if arguments else ""
     if path in ("", ":memory:") or path.startswith("file:"):
         return
-    with suppress(OSError):  # it exists, or SQLite reports that it cannot be created
+    with suppress(OSError):  # the file exists, or SQLite reports why it cannot be created
         os.mknod(path, stat.S_IFREG | PRIVATE_FILE)
 
 
 def configure_sqlite(connection: Any, _record: Any) -> None:
     """Configure a connection that may write."""
-    connection.isolation_level = None  # transactions begin where `begin_sqlite` says
+    connection.isolation_level = None  # `begin_sqlite` begins transactions
     for pragma in (
         "journal_mode = WAL",
         "synchronous = FULL",  # an acknowledged commit survives a power failure
         "foreign_keys = ON",
-        "secure_delete = ON",  # overwrites deleted data, in free pages as well
+        "secure_delete = ON",  # deleted data is overwritten, even in free pages
         f"busy_timeout = {_milliseconds(BUSY_S)}",
         "cache_size = -32000",
     ):
@@ -161,7 +160,7 @@ def configure_sqlite(connection: Any, _record: Any) -> None:
 def shrink_log(connection: Any) -> bool:
     """Empty the log after a checkpoint; return False if another process prevents it.
 
-    Otherwise former versions of pages stay in it until they are overwritten.
+    Without this, the log contains former versions of pages until they are overwritten.
     """
     connection.execute(f"PRAGMA busy_timeout = {_milliseconds(SHRINKING_S)}").close()
     try:
@@ -177,21 +176,21 @@ def configure_read_only(connection: Any, _record: Any) -> None:
 
 
 def begin_sqlite(connection: Connection) -> None:
-    """Begin a transaction; a writer takes the lock at once, or waits for it."""
+    """Begin a transaction; a writer takes the lock at the beginning, and waits for it."""
     wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
     if wait_s is None:
         connection.exec_driver_sql("BEGIN")
         return
     if connection.get_execution_options().get("sceneprint_unchecked"):
         connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # no effect within a transaction
-    # a transaction that reads first and writes later would fail if another wrote in between
+    # a transaction that reads first would fail if another process wrote before its first write
     line: WriterLine | None = connection.get_execution_options().get("sceneprint_line")
     with nullcontext() if line is None else line.first(min(wait_s, LINE_S)):
         _begin_immediate(connection, wait_s)
 
 
 def _begin_immediate(connection: Connection, wait_s: float) -> None:
-    """Take the lock. SQLite itself would try less and less often, up to 0.1 s apart."""
+    """Take the lock with frequent attempts; SQLite would wait up to 0.1 s between attempts."""
     until = time.monotonic() + wait_s
     connection.exec_driver_sql("PRAGMA busy_timeout = 0")
     try:
@@ -210,14 +209,14 @@ def _begin_immediate(connection: Connection, wait_s: float) -> None:
 
 
 class WriterLine:
-    """The line of processes that wait to write: only the first one waits for SQLite's lock.
+    """Line of processes that wait to write, of which only the first waits for SQLite's lock.
 
-    Otherwise a service that writes without a pause would usually get the lock, and a worker would
-    wait for seconds. Processes without a line are safe, but not fair.
+    Without the line, a service that writes continuously would usually get the lock, and a worker
+    would wait for seconds. Processes that do not use the line are safe, but not fair.
 
     Parameters
     ----------
-    folder : folder of the database; its lock is the first place in the line
+    folder : folder of the database, whose lock is the first place in the line
     """
 
     def __init__(self, folder: Path) -> None:
@@ -226,7 +225,7 @@ class WriterLine:
 
     @contextmanager
     def first(self, longest_s: float) -> Iterator[None]:
-        """Wait to be the first in line, or for `longest_s`: the first one may have been stopped."""
+        """Wait to be first in line, at most `longest_s`, since the first process may be stopped."""
         descriptor = self._open()
         if descriptor is None or not _locked(descriptor, longest_s):
             yield

@@ -1,4 +1,4 @@
-"""Counts over the whole store that are cheap enough for frequent calls, and processes' samples."""
+"""Counts over the whole store for frequent calls, and samples of the counts of processes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def count_maps(connection: Connection) -> int:
 def oldest_waiting(connection: Connection, map_number: int | None = None) -> dict[str, float]:
     """Return the creation time of the oldest queued job of each kind, seconds since 1970.
 
-    The oldest job has the least number. The index of claims contains state, kind and number.
+    The oldest job has the smallest number. The index of claims contains state, kind and number.
     """
     first = select(func.min(jobs.c.number)).where(jobs.c.state == JobState.QUEUED)
     if map_number is not None:
@@ -35,7 +35,7 @@ def oldest_waiting(connection: Connection, map_number: int | None = None) -> dic
 
 
 def running_jobs(connection: Connection, now: float) -> dict[str, str]:
-    """Return the id of the running job of each worker, by the worker's name."""
+    """Return the ids of running jobs by name of the worker."""
     rows = connection.execute(
         select(jobs.c.worker, jobs.c.id).where(
             jobs.c.state == JobState.RUNNING, jobs.c.leased_until >= now
@@ -52,14 +52,14 @@ def count_events(
 
     Parameters
     ----------
-    kinds : some of `KINDS` of the API
+    kinds : members of `KINDS` of the API
     at : start of the first interval, seconds since 1970
     width_s : length of an interval, seconds
-    map_name : only map; default: all maps
+    map_name : name of the map; default: all maps
 
     Returns
     -------
-    counts : counts by number of the interval and kind
+    counts : number of events by index of the interval and kind
     """
     interval = (events.c.at - at) // width_s
     statement = (
@@ -77,9 +77,9 @@ def count_events(
 
 
 def _first_since(connection: Connection, at: float) -> int:
-    """Return the number of the first event at or after a time, as events are sorted by time.
+    """Return the number of the first event at or after a time by a binary search.
 
-    A binary search needs no index of times.
+    Events are sorted by time, so no index of times is needed.
     """
     low = int(connection.execute(select(func.min(events.c.number))).scalar() or 0)
     high = int(connection.execute(select(func.max(events.c.number))).scalar() or 0) + 1
@@ -98,20 +98,20 @@ def _first_since(connection: Connection, at: float) -> int:
     return low
 
 
-# Samples: counts of each process over the last seconds, for a short history.
+# Samples, which contain the counts of a process over the last seconds, for a short history.
 
 #: Seconds after which samples are removed.
-KEPT_S = 7200.0
+SAMPLES_S = 7200.0
 
 
 @dataclass(frozen=True)
 class Sample:
-    """The counts of one process.
+    """Counts of one process.
 
     Parameters
     ----------
-    at : end of the counted interval, seconds since 1970
-    data : counts, by kind
+    at : end of the interval, seconds since 1970
+    data : counts by kind
     """
 
     at: float
@@ -123,10 +123,10 @@ def add_sample(connection: Connection, kind: str, process: str, data: dict[str, 
     now = time.time()
     old = (
         select(samples.c.number)
-        .where(samples.c.kind == kind, samples.c.at < now - KEPT_S)
+        .where(samples.c.kind == kind, samples.c.at < now - SAMPLES_S)
         .order_by(samples.c.number)
         .limit(100)
-        .with_for_update(skip_locked=True)  # writers of samples take no turns
+        .with_for_update(skip_locked=True)  # since writers of samples take no turns
     )
     connection.execute(delete(samples).where(samples.c.number.in_(old)))
     connection.execute(insert(samples).values(at=now, process=process, kind=kind, data=data))

@@ -1,7 +1,7 @@
-"""Surfaces of maps: their tiles, the frames fused in them, and pending work.
+"""Surfaces of maps, with their tiles, fused frames and pending work.
 
-A row links each frame to each tile that it touches. When a frame is deleted or edited, the tiles
-that it touches are rebuilt from the other frames that touch them.
+Rows link each frame to the tiles that it touches. When a frame is deleted or edited, these tiles
+are rebuilt from the other frames that touch them.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ from sceneprint_client.api import FrameState
 
 #: Scale of a tile that must be published again.
 NO_SCALE = -1
-#: Columns of a frame that its contribution to a surface depends on.
+#: Columns of a frame that affect its contribution to a surface.
 FUSED_COLUMNS = frozenset(("pose", "pose_parent", "session", "captured_at"))
 
 
 @dataclass(frozen=True)
 class SurfaceRow:
-    """A surface; fields as in the table."""
+    """Surface; see the table for the fields."""
 
     map_number: int
     model_id: str
@@ -73,7 +73,7 @@ class SurfaceRow:
     updated_at: float | None
 
     def is_current(self, row: MapRow) -> bool:
-        """Return whether the map is unchanged since the surface's last job ended."""
+        """Return whether the map has not changed since the end of the surface's last job."""
         return (
             self.revision == row.revision
             and self.edits == self.pose_edits
@@ -82,14 +82,14 @@ class SurfaceRow:
 
 
 def find_surface(connection: Connection, map_number: int) -> SurfaceRow | None:
-    """Return the surface of a map; None if none was ever started."""
+    """Return the surface of a map; None if none has ever been started."""
     statement = select(surfaces).where(surfaces.c.map_number == map_number)
     row = connection.execute(statement).mappings().first()
     return None if row is None else SurfaceRow(**row)
 
 
 def add_surface(connection: Connection, row: MapRow) -> SurfaceRow:
-    """Insert a surface without a model, which its first job sets."""
+    """Insert a surface without a model; its first job sets the model."""
     new = SurfaceRow(
         map_number=row.number, model_id="", cell_m=0.0, wanted=True, job_number=None,
         revision=-1, edits=0, pose_edits=0, scale=0, taken_from=None, taken_step_s=1.0,
@@ -107,13 +107,13 @@ def write_surface(connection: Connection, map_number: int, **values: object) -> 
 
 
 def note_edit(connection: Connection, frame_number: int, map_number: int) -> None:
-    """Mark a fused frame as edited, in the transaction of the edit, and count the edit."""
+    """Mark a fused frame as edited and count the edit, in the transaction of the edit."""
     mark_edited(connection, frame_number)
     _count_edit(connection, map_number)
 
 
 def note_edits(connection: Connection, numbers: Sequence[int], map_number: int) -> None:
-    """Mark many frames; see `note_edit`."""
+    """Mark several frames as edited; see `note_edit`."""
     for block in blocks(numbers):
         own = among(connection, surface_frames.c.frame_number, block)
         connection.execute(update(surface_frames).where(own).values(changed=True))
@@ -125,13 +125,13 @@ def _count_edit(connection: Connection, map_number: int) -> None:
 
 
 def mark_edited(connection: Connection, frame_number: int) -> None:
-    """Mark a frame that gets a new revision of its map; see `note_edit`."""
+    """Mark a frame with a new revision of its map as edited; see `note_edit`."""
     own = surface_frames.c.frame_number == frame_number
     connection.execute(update(surface_frames).where(own).values(changed=True))
 
 
 def maps_to_update(connection: Connection) -> list[tuple[MapRow, SurfaceRow | None]]:
-    """Return the maps without a surface, or with one that may be out of date."""
+    """Return the maps without a surface, and the maps whose surface may be outdated."""
     statement = (
         select(maps, surfaces)
         .join(surfaces, surfaces.c.map_number == maps.c.number, isouter=True)
@@ -164,11 +164,11 @@ def count_unfinished(connection: Connection, surface: SurfaceRow) -> int:
 
 @dataclass(frozen=True)
 class FusedFrame:
-    """A posed frame with the values that its contribution to a surface depends on.
+    """Posed frame with the values that affect its contribution to a surface.
 
     Parameters
     ----------
-    parent, pose : parent frame, and T_parent_sensor in 4 rows of 4
+    parent, pose : parent frame, and T_parent_sensor as 4 rows of 4
     session, captured_at : run and time, if known
     geometry : blob of the artifact
     """
@@ -182,7 +182,7 @@ class FusedFrame:
 
 
 def _posed(map_number: int, model_id: str) -> Select[Any]:
-    """Select the numbers of the frames that a surface contains."""
+    """Return the query of the numbers of the frames in a complete surface."""
     c = frames.c
     return (
         select(c.number)
@@ -202,7 +202,7 @@ def _unfused(surface: SurfaceRow) -> Select[Any]:
 
 
 def _outdated(surface: SurfaceRow) -> Select[Any]:
-    gone: ColumnElement[bool] = or_(
+    is_outdated: ColumnElement[bool] = or_(
         surface_frames.c.changed,
         frames.c.state != FrameState.INDEXED,
         frames.c.pose_x.is_(None),
@@ -210,12 +210,12 @@ def _outdated(surface: SurfaceRow) -> Select[Any]:
     return (
         select(surface_frames.c.frame_number)
         .join(frames, frames.c.number == surface_frames.c.frame_number)
-        .where(surface_frames.c.map_number == surface.map_number, gone)
+        .where(surface_frames.c.map_number == surface.map_number, is_outdated)
     )
 
 
 def count_posed(connection: Connection, row: MapRow) -> int:
-    """Return the number of frames of a map that a surface would contain."""
+    """Return the number of frames of a map in a complete surface."""
     return _count(connection, _posed(row.number, row.model_id))
 
 
@@ -238,7 +238,7 @@ def count_left(connection: Connection, surface: SurfaceRow) -> int:
 def frames_to_fuse(
     connection: Connection, surface: SurfaceRow, after: int, limit: int
 ) -> list[FusedFrame]:
-    """Return the next frames to add, after a number."""
+    """Return the next frames to add after a number."""
     unfused = _unfused(surface).where(frames.c.number > after)
     numbers = connection.execute(unfused.order_by(frames.c.number).limit(limit)).scalars().all()
     return fused_frames(connection, surface, numbers)
@@ -253,7 +253,7 @@ def frames_to_remove(connection: Connection, surface: SurfaceRow, limit: int) ->
 def fused_frames(
     connection: Connection, surface: SurfaceRow, numbers: Iterable[int]
 ) -> list[FusedFrame]:
-    """Return frames by their numbers, in order, without those that lack a pose or an artifact."""
+    """Return the frames with these numbers, in order, except frames without pose or artifact."""
     c = frames.c
     statement = (
         _posed(surface.map_number, surface.model_id)
@@ -266,7 +266,7 @@ def fused_frames(
 
 
 def add_fused(connection: Connection, surface: SurfaceRow, fused: Sequence[FusedFrame]) -> None:
-    """Record frames as fused, and mark those that were edited since they were read."""
+    """Record frames as fused, and mark frames that were edited after they were read."""
     now = {
         one.number: one for one in fused_frames(connection, surface, [one.number for one in fused])
     }
@@ -279,7 +279,7 @@ def add_fused(connection: Connection, surface: SurfaceRow, fused: Sequence[Fused
         connection.execute(insert(surface_frames), rows)
 
 
-def taken_range(connection: Connection, surface: SurfaceRow) -> tuple[float, float] | None:
+def capture_range(connection: Connection, surface: SurfaceRow) -> tuple[float, float] | None:
     """Return the first and last capture time of a surface's frames, fused or not."""
     at, posed = frames.c.captured_at, _posed(surface.map_number, surface.model_id)
     first, last = connection.execute(posed.with_only_columns(func.min(at), func.max(at))).one()
@@ -309,7 +309,7 @@ def spread_fused(connection: Connection, map_number: int, parent: str, most: int
 
 @dataclass(frozen=True)
 class TileRow:
-    """A tile; fields as in the table."""
+    """Tile; see the table for the fields."""
 
     number: int
     map_number: int
@@ -340,9 +340,9 @@ class TileRow:
 def tiles_at(
     connection: Connection, map_number: int, parent: str, level: int, places: Iterable[TilePlace]
 ) -> dict[TilePlace, TileRow]:
-    """Return existing tiles of a parent frame and level by their places."""
+    """Return existing tiles of a parent frame and level by place."""
     c = surface_tiles.c
-    # one statement per row and floor, as lists of many tuples are slow
+    # one statement per row and floor is faster than a list of many tuples
     columns: dict[tuple[int, int], list[int]] = {}
     for x, y, z in sorted(set(places)):
         columns.setdefault((y, z), []).append(x)
@@ -361,20 +361,20 @@ def _tiles(connection: Connection, statement: Select[Any]) -> list[TileRow]:
 
 
 def tile_of_digest(connection: Connection, map_number: int, digest: str) -> TileRow | None:
-    """Return a published tile by its digest, or None."""
+    """Return the published tile with a digest, or None."""
     c = surface_tiles.c
     own = c.map_number == map_number, c.digest == digest, c.blob.is_not(None)
     return next(iter(_tiles(connection, select(surface_tiles).where(*own).limit(1))), None)
 
 
 def tile_of_number(connection: Connection, number: int) -> TileRow | None:
-    """Return a tile by its number; None if it was removed."""
+    """Return the tile with a number; None if it was removed."""
     own = surface_tiles.c.number == number
     return next(iter(_tiles(connection, select(surface_tiles).where(own))), None)
 
 
 def schedule_rebuild(connection: Connection, tile: TileRow) -> None:
-    """Schedule the rebuilding of a tile whose bytes are lost, from frames or finer tiles."""
+    """Schedule a tile whose bytes are lost for rebuilding from frames or finer tiles."""
     own = surface_tiles.c.number == tile.number
     doom(connection, [blob for blob in (tile.blob, tile.draft) if blob])
     if tile.level == 0:
@@ -390,7 +390,7 @@ def list_tiles(
     connection: Connection, map_number: int, parent: str, level: int,
     beyond: TilePlace | None = None, limit: int | None = None,
 ) -> list[TileRow]:  # fmt: skip
-    """Return published tiles by column, row and floor, after a place."""
+    """Return published tiles after a place, sorted by column, row and floor."""
     c = surface_tiles.c
     place = (c.tile_x, c.tile_y, c.tile_z)
     statement = select(surface_tiles).where(
@@ -403,9 +403,7 @@ def list_tiles(
 
 @dataclass(frozen=True)
 class LevelTotals:
-    """Totals of the tiles of a parent frame and level; low and high: (3,) corners of the cells'
-    box.
-    """
+    """Totals of the tiles of a parent frame and level; `low` and `high` bound the cells, (3,)."""
 
     parent: str
     level: int
@@ -433,7 +431,7 @@ def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
 
 
 def tiles_to_rebuild(connection: Connection, map_number: int, most: int) -> list[TileRow]:
-    """Return tiles under reconstruction with equal progress, those with the most progress first."""
+    """Return tiles under reconstruction that have the same, most advanced progress."""
     c = surface_tiles.c
     own = c.map_number == map_number, c.rebuilt_to.is_not(None)
     statement = select(surface_tiles).where(*own).order_by(c.rebuilt_to.desc(), c.number)
@@ -442,7 +440,7 @@ def tiles_to_rebuild(connection: Connection, map_number: int, most: int) -> list
 
 
 def tiles_of_other_scale(connection: Connection, surface: SurfaceRow, most: int) -> list[TileRow]:
-    """Return some tiles of the finest level that were published with another scale of time."""
+    """Return some tiles of the finest level that were published with a different time scale."""
     c = surface_tiles.c
     statement = select(surface_tiles).where(
         c.map_number == surface.map_number, c.level == 0, c.scale != surface.scale,
@@ -454,7 +452,7 @@ def tiles_of_other_scale(connection: Connection, surface: SurfaceRow, most: int)
 def forget_scale(
     connection: Connection, map_number: int, parent: str, place: TilePlace, factor: int
 ) -> None:
-    """Schedule publishing of the finest tiles within a lost coarser one.
+    """Schedule the finest tiles within a lost coarser tile for publication.
 
     Parameters
     ----------
@@ -480,7 +478,7 @@ def write_tile(
     Returns
     -------
     number : number of the tile
-    blobs : blobs that it no longer refers to
+    blobs : blobs to which the tile no longer refers
     """
     c = surface_tiles.c
     before = tiles_at(connection, map_number, parent, level, [place]).get(place)
@@ -499,7 +497,7 @@ def write_tile(
 
 
 def remove_tiles(connection: Connection, tiles: Sequence[TileRow]) -> list[str]:
-    """Remove tiles and their links to frames; return the blobs that they referred to."""
+    """Remove tiles and their links to frames, and return the blobs of the tiles."""
     for block in blocks(tile.number for tile in tiles):
         touches = among(connection, surface_touches.c.tile_number, block)
         connection.execute(delete(surface_touches).where(touches))
@@ -509,7 +507,7 @@ def remove_tiles(connection: Connection, tiles: Sequence[TileRow]) -> list[str]:
 
 
 def add_touches(connection: Connection, touches: Iterable[tuple[int, int]]) -> None:
-    """Link frames to tiles, by the numbers of tile and frame."""
+    """Insert links of (number of the tile, number of the frame)."""
     rows = [{"tile_number": tile, "frame_number": frame} for tile, frame in sorted(touches)]
     if rows:
         connection.execute(insert(surface_touches), rows)
@@ -518,7 +516,7 @@ def add_touches(connection: Connection, touches: Iterable[tuple[int, int]]) -> N
 def frames_touching(
     connection: Connection, tiles: Sequence[int], after: int, limit: int
 ) -> list[int]:
-    """Return the numbers of frames that touch any of some tiles, in order, after a number."""
+    """Return the numbers of frames that touch any of the tiles, in order, after a number."""
     c = surface_touches.c
     statement = (
         select(c.frame_number)
@@ -543,7 +541,7 @@ def remove_fused(connection: Connection, numbers: Sequence[int]) -> None:
     connection.execute(delete(surface_frames).where(fused))
 
 
-#: Tiles to remove in one commit, and a tenth of the frames.
+#: Number of tiles that one commit removes; it removes ten times as many frames.
 _AT_ONCE = 50
 
 
@@ -552,8 +550,8 @@ def remove_block(connection: Connection, map_number: int) -> tuple[list[str], bo
 
     Returns
     -------
-    blobs : doomed blobs; sweep them after the commit
-    over : whether nothing is left
+    blobs : doomed blobs, to sweep after the commit
+    over : whether no tiles and frames remain
     """
     c = surface_tiles.c
     own = c.map_number == map_number
@@ -570,14 +568,12 @@ def remove_block(connection: Connection, map_number: int) -> tuple[list[str], bo
     return blobs, len(numbers) < 10 * _AT_ONCE
 
 
-# Frames by their position, or by the tiles that they touch.
+# Frames by position, or by the tiles that they touch.
 
 
 @dataclass(frozen=True)
 class SightingFrame:
-    """A frame of a list of sightings; `square` is its squared distance from the spot, square
-    metres.
-    """
+    """Frame in a list of sightings; `square` is its squared distance from the spot, metres^2."""
 
     number: int
     id: str
@@ -595,13 +591,13 @@ def frames_seeing(
     connection: Connection, surface: SurfaceRow, parent: str, places: Iterable[TilePlace],
     spot: Sequence[float], beyond: tuple[float, int] | None, limit: int,
 ) -> list[SightingFrame]:  # fmt: skip
-    """Return frames that touch any of some tiles, the nearest to a spot first.
+    """Return frames that touch at least one of some tiles, the nearest to a spot first.
 
     Parameters
     ----------
     surface, parent : surface and parent frame
     places : places of tiles of the finest level
-    spot : x, y, z, metres
+    spot : x, y, z of the spot, metres
     beyond : squared distance and number of the last frame of the previous page
     limit : maximum number of frames
     """
@@ -615,13 +611,11 @@ def frames_seeing(
     )  # fmt: skip
 
 
-def frames_taken_in(
+def frames_captured_in(
     connection: Connection, surface: SurfaceRow, parent: str, low: Sequence[float],
     high: Sequence[float], beyond: tuple[float, int] | None, limit: int,
 ) -> list[SightingFrame]:  # fmt: skip
-    """Return frames taken in a box, the nearest to its centre first; parameters as in
-    `frames_seeing`.
-    """
+    """Return frames captured in a box, the nearest to its centre first; see `frames_seeing`."""
     sides = [
         getattr(frames.c, f"pose_{axis}").between(a, b)
         for axis, a, b in zip("xyz", low, high, strict=True)
@@ -657,11 +651,11 @@ def _sightings(
 
 
 def living_surface(connection: Connection, name: str) -> tuple[MapRow, SurfaceRow | None]:
-    """Return a map and its surface; None if it was never started, or was deleted.
+    """Return a map and its surface; None for a surface that was never started or was deleted.
 
     Raises
     ------
-    UnknownMap : the map does not exist.
+    UnknownMap : If the map does not exist.
     """
     row = find_map(connection, name)
     surface = find_surface(connection, row.number)

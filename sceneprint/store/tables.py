@@ -1,7 +1,7 @@
-"""The tables and the types of their rows. `create_schema` in `database` creates them.
+"""Tables of the database, and the types of their rows. `create_schema` in `database` creates them.
 
-Times are seconds since 1970. `number` is in the order of insertion and never reused; `id` is
-public.
+Times are seconds since 1970. Values of `number` are in the order of insertion and never reused;
+`id` is public.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ from sceneprint.process import current_actor, current_tenant, request_id
 from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.api.frames import Kind
 
-#: Integers of 64 bits. SQLite's always are, and only its type INTEGER can number rows.
+#: Type of 64-bit integers. In SQLite, all integers have 64 bits, and only INTEGER can number rows.
 WHOLE = BigInteger().with_variant(Integer, "sqlite")
-#: Texts that sort by code points, as in SQLite, whatever the server's language.
+#: Type of texts that are sorted by code points, as in SQLite, independent of the server's locale.
 TEXT = Text().with_variant(Text(collation="C"), "postgresql")
 
 
@@ -85,17 +85,17 @@ maps = Table(
     Column("name", _string(63), nullable=False, unique=True),
     Column("title", _string(200)),
     Column("model_id", _string(64), ForeignKey("models.id"), nullable=False),
-    Column("next_model_id", _string(64)),  # of a re-encoding
-    # number of changes to the searched frames; a frame gets it when it is indexed or deleted
+    Column("next_model_id", _string(64)),  # next model during a re-encoding
+    # number of changes to the searched frames; an indexed or deleted frame gets the current value
     Column("revision", WHOLE, nullable=False),
     Column("created_at", Float, nullable=False),
     Column("quota_frames", BigInteger),  # null: unlimited
-    Column("quota_bytes", BigInteger),  # of uploads
+    Column("quota_bytes", BigInteger),  # maximum bytes of uploads
     Column("retention_days", Float),  # age at which frames are deleted; null: never
-    # use: frames that are neither deleted nor redundant, and bytes of their uploads
+    # usage: frames that are neither deleted nor redundant, and bytes of their uploads
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
-    Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: learnt
+    Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: estimated
     # greatest revision of a removed row: readers behind it must start again
     Column("pruned_revision", WHOLE, nullable=False, server_default="0"),
     sqlite_autoincrement=True,
@@ -105,14 +105,14 @@ frames = Table(
     "frames",
     metadata,
     Column("number", WHOLE, primary_key=True),
-    Column("id", _string(64), nullable=False),  # a deleted frame may lose it to another
+    Column("id", _string(64), nullable=False),  # a new frame may take the id of a deleted one
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("state", _string(16), nullable=False),
     Column("reason", TEXT),
     Column("content_id", _string(64)),  # null when deleted: the content may be uploaded again
     Column("blob", _string(64), nullable=False),
     Column("bytes", WHOLE, nullable=False),
-    Column("intrinsics", JSON, nullable=False),  # JSON's null of a cloud
+    Column("intrinsics", JSON, nullable=False),  # null of JSON for a cloud
     Column("depth_scale", Float, nullable=False),
     Column("depth_along_ray", Boolean, nullable=False),
     Column("robot", _string(128)),
@@ -124,7 +124,7 @@ frames = Table(
     Column("pose_x", Float),  # translation of the pose, metres
     Column("pose_y", Float),
     Column("pose_z", Float),
-    # parent frame and pose as sent, if a join moved the pose
+    # uploaded parent frame and pose, if a join transformed the pose
     Column("sent_parent", _string(128)),
     Column("sent_pose", JSON(none_as_null=True)),
     Column("base_frame", _string(128)),
@@ -135,19 +135,19 @@ frames = Table(
     Column("revision", WHOLE),
     Column("cloud", JSON(none_as_null=True)),  # description of the points; null: a depth image
     Column("up", JSON(none_as_null=True)),  # unit vector in the sensor's axes
-    Column("name", _string(255)),  # of the original file or message; a label, never a path
+    Column("name", _string(255)),  # name of the original file or message; never used as a path
     Column("sequence", WHOLE),  # position within the session
-    Column("samples", JSON(none_as_null=True)),  # ranges of the samples, and whether trusted
-    Column("ended_at", Float),  # time of the deletion, or when the frame became redundant
-    # of a tombstone, a deleted frame that can be restored: the first revision of its deletion
+    Column("samples", JSON(none_as_null=True)),  # ranges of the samples, and `trust_depth`
+    Column("ended_at", Float),  # time at which the frame was deleted, rejected or redundant
+    # first revision of its deletion, for a deleted frame that can be restored (tombstone)
     Column("deletion", WHOLE),
-    Column("deleted_from", _string(16)),  # state before; null: another frame has the id now
-    Column("deleted_content", _string(64)),  # content_id before
+    Column("deleted_from", _string(16)),  # former state; null: another frame has the id now
+    Column("deleted_content", _string(64)),  # former content_id
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
     Index(None, "map_number", "number"),
-    Index(  # covers filters, so that they read no rows
+    Index(  # this covers filters, which then read no rows
         "ix_frames_searched",
         "map_number",
         "state",
@@ -176,8 +176,8 @@ Index(
     sqlite_where=frames.c.state != "deleted", postgresql_where=frames.c.state != "deleted",
 )  # fmt: skip
 
-#: Condition of frames whose rows are removed in the end. The values are literals, as planners do
-#: not match bound values to a partial index.
+#: Condition for frames whose rows are removed after some days. The values are literals, because
+#: planners do not match bound values to a partial index.
 ENDED: ColumnElement[bool] = frames.c.state.in_(
     [literal_column("'deleted'"), literal_column("'redundant'")]
 )
@@ -186,7 +186,8 @@ Index(
     sqlite_where=ENDED, postgresql_where=ENDED,
 )  # fmt: skip
 
-#: Joins of parent frames: poses sent in `parent` are stored in the root where its joins end.
+#: Joins of parent frames. Poses that were uploaded in `parent` are stored in the root, where its
+#: joins end.
 parent_joins = Table(
     "parent_joins",
     metadata,
@@ -194,14 +195,14 @@ parent_joins = Table(
     Column("parent", _string(128), primary_key=True),
     Column(
         "towards", _string(128), primary_key=True
-    ),  # a root when joined, which may be joined itself since
+    ),  # root at the time of the join, which may have been joined later
     Column("transform", JSON, nullable=False),  # T_towards_parent, 4 rows of 4
-    Column("job_id", _string(32), nullable=False),  # association that proposed it
+    Column("job_id", _string(32), nullable=False),  # association that proposed the join
     Column("joined_at", Float, nullable=False),
-    Column("undone_at", Float),  # null: in effect, the only one of `parent`
+    Column("undone_at", Float),  # null: the join is in effect; at most one per `parent`
 )
 
-#: `frames.tags` as rows, for searches.
+#: Values of `frames.tags` as rows for searches.
 frame_tags = Table(
     "frame_tags",
     metadata,
@@ -217,7 +218,7 @@ signatures = Table(
     Column("model_id", _string(64), ForeignKey("models.id"), primary_key=True),
     Column("vector", LargeBinary, nullable=False),
     Column("checksum", BigInteger, nullable=False),  # CRC-32 of the vector
-    Column("geometry", _string(64), nullable=False),  # blob of the artifact
+    Column("geometry", _string(64), nullable=False),  # blob of the geometry artifact
     Column("n_patches", JSON, nullable=False),
     Column("n_pairs", JSON, nullable=False),
     Index(None, "geometry"),
@@ -233,12 +234,12 @@ jobs = Table(
     Column("map_number", WHOLE, ForeignKey("maps.number")),  # null: not about a map
     Column("model_id", _string(64)),  # model to sign with; null: the map's own
     Column("data", JSON(none_as_null=True)),  # parameters, by kind
-    Column("progress", JSON(none_as_null=True)),  # done, total, and state of the next slice
-    Column("result", JSON(none_as_null=True)),  # summary
+    Column("progress", JSON(none_as_null=True)),  # done, total, and state for the next slice
+    Column("result", JSON(none_as_null=True)),  # summary of the results
     Column("state", _string(16), nullable=False),
     Column("priority", WHOLE, nullable=False),
     Column("attempts", WHOLE, nullable=False),
-    Column("failures", WHOLE, nullable=False),  # failed attempts
+    Column("failures", WHOLE, nullable=False),  # number of failed attempts
     Column("token", WHOLE, nullable=False),  # fencing token: grows with every claim
     Column("run_after", Float, nullable=False),
     Column("leased_until", Float),
@@ -248,7 +249,7 @@ jobs = Table(
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("finished_at", Float),
-    Column("tenant", _string(128), nullable=False, server_default=""),  # requester; "": none
+    Column("tenant", _string(128), nullable=False, server_default=""),  # requester, or ""
     Column("turn", WHOLE),  # number of the latest claim, which increases across all jobs
     Index(None, "state", "run_after"),
     Index(None, "frame_number"),
@@ -263,7 +264,7 @@ Index(
     jobs.c.number, jobs.c.kind,
 )  # fmt: skip
 
-#: Results of a long job, appended slice by slice.
+#: Results of long jobs, which slices append.
 job_items = Table(
     "job_items",
     metadata,
@@ -272,7 +273,7 @@ job_items = Table(
     Column("data", JSON, nullable=False),
 )
 
-#: Inputs and outputs of a job.
+#: Input and output files of jobs.
 job_files = Table(
     "job_files",
     metadata,
@@ -284,7 +285,7 @@ job_files = Table(
     Index(None, "blob"),
 )
 
-#: Name of the uploaded archive of an import; it counts against the quota of the map.
+#: Name of the uploaded archive of an import, which counts against the quota of the map.
 ARCHIVE = "archive"
 
 keys = Table(
@@ -297,20 +298,20 @@ keys = Table(
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
     Column("tenant", _string(128), nullable=False, server_default=""),
-    # of the secret before the last rotation, which is valid until `previous_until`
+    # SHA-256 of the secret before the last rotation, which is valid until `previous_until`
     Column("previous_digest", _string(64), index=True),
     Column("previous_until", Float),
     Column("last_used_at", Float),
     Index(None, "tenant"),
 )
 
-#: Owners of keys, who pay.
+#: Owners of keys.
 tenants = Table(
     "tenants",
     metadata,
     Column("name", _string(128), primary_key=True),
     Column("created_at", Float, nullable=False),
-    Column("turn", WHOLE, nullable=False, server_default="0"),  # the latest of removed jobs
+    Column("turn", WHOLE, nullable=False, server_default="0"),  # latest turn of removed jobs
 )
 
 
@@ -331,8 +332,8 @@ def _event_table(name: str, *indexes: Index) -> Table:
 
 
 events = _event_table("events", Index(None, "map", "number"))
-#: Events of writers of single maps on PostgreSQL, which commit in any order: `number_events` moves
-#: them into `events`, with numbers in commit order.
+#: Events of writers of single maps on PostgreSQL, which commit in any order. `number_events` moves
+#: them to `events`, with numbers in commit order.
 pending_events = _event_table("pending_events")
 #: Last events of former maps.
 Index(
@@ -340,13 +341,13 @@ Index(
     sqlite_where=events.c.kind == "map.deleted", postgresql_where=events.c.kind == "map.deleted",
 )  # fmt: skip
 
-#: Results of requests with an `Idempotency-Key`, for a day.
+#: Results of requests with an `Idempotency-Key`, which are stored for a day.
 idempotency = Table(
     "idempotency",
     metadata,
     Column("actor", _string(128), primary_key=True),  # name of the caller's key, or ""
     Column("key", _string(255), primary_key=True),
-    Column("fingerprint", _string(64), nullable=False),  # of route and payload
+    Column("fingerprint", _string(64), nullable=False),  # hash of route and payload
     Column("data", JSON, nullable=False),  # ids of the result
     Column("created_at", Float, nullable=False),
     Index(None, "created_at"),
@@ -358,7 +359,7 @@ audit = Table(
     metadata,
     Column("number", WHOLE, primary_key=True),
     Column("at", Float, nullable=False),
-    Column("actor", _string(128), nullable=False),  # name of the key; "" where none is required
+    Column("actor", _string(128), nullable=False),  # name of the key; "" if none is required
     Column("address", _string(64)),
     Column("tenant", _string(128), nullable=False),
     Column("action", _string(32), nullable=False),
@@ -370,28 +371,28 @@ audit = Table(
     sqlite_autoincrement=True,
 )
 
-#: One row: the oldest revision whose processes may write to this schema.
+#: Single row with the oldest revision whose processes may write to this schema.
 schema_range = Table(
     "schema_range",
     metadata,
     Column("least_revision", _string(32), primary_key=True),
 )
 
-#: One row: progress of the scrub, which reads stored bytes to check them.
+#: Single row with the progress of the scrub, which checks stored bytes.
 scrubs = Table(
     "scrubs",
     metadata,
     Column("number", WHOLE, primary_key=True, autoincrement=False),
-    Column("position", WHOLE, nullable=False),  # number of the last read frame
-    Column("next_at", Float, nullable=False),  # earliest time to continue, by the database's clock
-    Column("began_at", Float, nullable=False),  # of this pass
-    Column("finished_at", Float),  # of the last whole pass; null: there was none
-    Column("blobs", BigInteger, nullable=False),  # counts of this pass, or the last
+    Column("position", WHOLE, nullable=False),  # number of the last checked frame
+    Column("next_at", Float, nullable=False),  # earliest time of the next slice, database clock
+    Column("began_at", Float, nullable=False),  # start of this pass
+    Column("finished_at", Float),  # end of the last complete pass; null: there was none
+    Column("blobs", BigInteger, nullable=False),  # counts of this pass, or the last one
     Column("bytes", BigInteger, nullable=False),
     Column("damaged", BigInteger, nullable=False),
 )
 
-#: Counts of processes, a few times a minute, for two hours.
+#: Counts of processes, which are written a few times per minute and stored for two hours.
 samples = Table(
     "samples",
     metadata,
@@ -404,23 +405,24 @@ samples = Table(
     sqlite_autoincrement=True,
 )
 
-#: Former maps: last event, and quota for the next map with the name.
+#: Former maps with their last events, and their quotas for the next map with the name.
 former_maps = Table(
     "former_maps",
     metadata,
     Column("name", _string(63), primary_key=True),
-    Column("number", BigInteger, nullable=False),  # of the event
+    Column("number", BigInteger, nullable=False),  # number of the event
     Column("quota_frames", BigInteger),
     Column("quota_bytes", BigInteger),
     Index(None, "number"),
 )
 
-#: Queries and their outcomes for some time, and their answers while there is room.
+#: Queries and their outcomes, which are stored for some time, and their answers while space
+#: permits.
 queries = Table(
     "queries",
     metadata,
     Column("number", WHOLE, primary_key=True),
-    Column("id", _string(32), nullable=False, unique=True),  # of the answer
+    Column("id", _string(32), nullable=False, unique=True),  # id of the answer
     Column("at", Float, nullable=False),  # arrival of the query
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("maps", JSON(none_as_null=True)),  # names of all searched maps; null: only this one
@@ -437,21 +439,21 @@ queries = Table(
     Column("alternatives", WHOLE, nullable=False),
     Column("milliseconds", Float, nullable=False),
     Column("kind", _string(8)),
-    Column("frame_map", _string(63)),  # the stored frame that was the query
+    Column("frame_map", _string(63)),  # map of the query frame, if it is a stored frame
     Column("frame_id", _string(64)),
     Column("listed", Boolean, nullable=False),  # false: stored only to view its answer
-    Column("kept_at", Float),  # time since which the answer is kept; null: it expires
-    Column("title", _string(200)),  # of a kept answer
-    Column("shown", JSON(none_as_null=True)),  # numbers of the frames that the answer shows
-    Column("bytes", BigInteger, nullable=False),  # of the answer; 0: it is not stored
-    Column("answer", LargeBinary),  # of a kept one; others are files, see `answer_files`
+    Column("kept_at", Float),  # time at which the answer was marked as kept; null: it expires
+    Column("title", _string(200)),  # title of a kept answer
+    Column("shown", JSON(none_as_null=True)),  # numbers of the frames in the answer
+    Column("bytes", BigInteger, nullable=False),  # size of the answer; 0: it is not stored
+    Column("answer", LargeBinary),  # kept answer; others are files, see `answer_files`
     Index(None, "at", "number"),
     Index(None, "map_number", "at", "number"),
     Index(None, "map_number", "status", "at", "number"),
     Index(None, "robot", "at", "number"),
     sqlite_autoincrement=True,
 )
-#: Stored answers by age, and kept ones: few among many rows.
+#: Stored answers by age, and kept answers, which are few among many rows.
 Index(
     "ix_queries_stored", queries.c.at, queries.c.number, queries.c.bytes,
     sqlite_where=literal_column("bytes > 0"), postgresql_where=literal_column("bytes > 0"),
@@ -462,20 +464,20 @@ Index(
     postgresql_where=literal_column("kept_at IS NOT NULL"),
 )  # fmt: skip
 
-#: The fused surface of a map, and its progress.
+#: Fused surfaces of maps, and their progress.
 surfaces = Table(
     "surfaces",
     metadata,
     Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
     Column("model_id", _string(64), nullable=False),  # model of the fused artifacts
-    Column("cell_m", Float, nullable=False),  # of the finest level
-    Column("wanted", Boolean, nullable=False),  # false: it was deleted
+    Column("cell_m", Float, nullable=False),  # cell size of the finest level
+    Column("wanted", Boolean, nullable=False),  # false: the surface was deleted
     Column("job_number", WHOLE),  # latest job, which may have been removed since
     # revision and edits of the map that the surface includes
     Column("revision", WHOLE, nullable=False),
     Column("edits", WHOLE, nullable=False),
     Column("pose_edits", WHOLE, nullable=False),  # number of edits of fused frames
-    # scale of times in published tiles; `scale` counts its changes
+    # time scale in published tiles; `scale` counts its changes
     Column("scale", WHOLE, nullable=False),
     Column("taken_from", Float),
     Column("taken_step_s", Float, nullable=False),
@@ -501,9 +503,9 @@ surface_tiles = Table(
     Column("tile_z", WHOLE, nullable=False),
     Column("cells", WHOLE, nullable=False),
     Column("blob", _string(64)),  # sums of the finest level, cells of the others; null: none yet
-    Column("digest", _string(64), nullable=False),  # of the published cells
-    Column("scale", WHOLE, nullable=False),  # scale of its times
-    # of a tile under reconstruction: the last frame in `draft`, 0 at first; null: it is up to date
+    Column("digest", _string(64), nullable=False),  # digest of the published cells
+    Column("scale", WHOLE, nullable=False),  # number of its time scale
+    # last frame in `draft` during a reconstruction, initially 0; null: the tile is up to date
     Column("rebuilt_to", WHOLE),
     Column("draft", _string(64)),
     Column("low_x", Float, nullable=False),  # box of its cells, metres
@@ -529,7 +531,7 @@ surface_frames = Table(
     Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("parent", _string(128), nullable=False),
-    Column("changed", Boolean, nullable=False),  # edited since: must be removed, and fused again
+    Column("changed", Boolean, nullable=False),  # edited afterwards: must be fused again
     Index(None, "map_number", "parent", "changed"),
 )
 
@@ -550,7 +552,7 @@ doomed = Table(
     Column("at", Float, nullable=False),
 )
 
-#: Secrets of the database, which never leave it: see `opaque_ids`.
+#: Secrets that never leave the database; see `opaque_ids`.
 secrets = Table(
     "secrets",
     metadata,
@@ -559,14 +561,14 @@ secrets = Table(
 )
 
 
-# Statements: counts, and rows of many numbers.
+# Statements that count rows, or select rows by many numbers.
 
-#: Maximum length of a list of numbers: SQLite allows 32,766 parameters.
+#: Maximum length of a list of numbers; SQLite allows 32,766 parameters.
 MOST_ROWS = 10_000
 
 
 def count_rows(connection: Connection, *conditions: ColumnElement[bool]) -> int:
-    """Return the number of rows that meet some conditions."""
+    """Return the number of rows that satisfy the conditions."""
     return int(connection.execute(select(func.count()).where(*conditions)).scalar_one())
 
 
@@ -580,9 +582,10 @@ def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
 def among(
     connection: Connection, column: Column[int], numbers: Sequence[int]
 ) -> ColumnElement[bool]:
-    """Return the condition that a column is one of some numbers.
+    """Return the condition that the value of a column is one of `numbers`.
 
-    PostgreSQL gets them as one array: 10,000 parameters would take ten times as long.
+    PostgreSQL gets the numbers as one array, because 10,000 parameters would take ten times as
+    long.
     """
     if connection.dialect.name == "postgresql":
         return column == any_(literal(list(numbers), ARRAY(BigInteger)))
@@ -592,7 +595,7 @@ def among(
 def rows_among(
     connection: Connection, statement: Select[Any], column: Column[int], numbers: Iterable[int]
 ) -> Iterator[Any]:
-    """Yield the rows of a statement whose column is one of some numbers, however many."""
+    """Yield the rows of a statement for which the value of a column is one of `numbers`."""
     for block in blocks(numbers):
         yield from connection.execute(statement.where(among(connection, column, block)))
 
@@ -605,8 +608,8 @@ def rows_of_statement(
 
     Parameters
     ----------
-    statement : function that returns the cached statement of a dialect, with `among_numbers`
-    numbers : numbers, however many
+    statement : function that returns the cached statement for a dialect, with `among_numbers`
+    numbers : numbers of any count
     values : other parameters of the statement
     """
     cached = statement(connection.dialect.name)
@@ -622,13 +625,13 @@ def among_numbers(dialect: str, column: Column[int]) -> ColumnElement[bool]:
 
 
 def dialect_insert(connection: Connection, table: Table) -> Any:
-    """Return an INSERT of the database's dialect, which can resolve conflicts."""
+    """Return an INSERT of the database's dialect, which supports ON CONFLICT."""
     return (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(table)
 
 
 @dataclass(frozen=True)
 class MapRow:
-    """A map; fields as in the table."""
+    """Map; see the table for the fields."""
 
     number: int
     name: str
@@ -648,7 +651,7 @@ class MapRow:
 
 @dataclass(frozen=True)
 class FrameRow:
-    """A frame; fields as in the table."""
+    """Frame; see the table for the fields."""
 
     number: int
     id: str
@@ -690,13 +693,13 @@ class FrameRow:
 
     @property
     def kind(self) -> Kind:
-        """Whether the frame is a depth image or a point cloud."""
+        """Kind of the frame: depth image or point cloud."""
         return "depth" if self.cloud is None else "cloud"
 
 
 @dataclass(frozen=True)
 class JobRow:
-    """A job; fields as in the table."""
+    """Job; see the table for the fields."""
 
     number: int
     id: str
@@ -732,17 +735,17 @@ class JobRow:
 
 
 def map_row(row: RowMapping) -> MapRow:
-    """Return a row of the table `maps`."""
+    """Convert a row of the table `maps`."""
     return MapRow(**row)
 
 
 def frame_row(row: RowMapping) -> FrameRow:
-    """Return a row of the table `frames`."""
+    """Convert a row of the table `frames`."""
     return FrameRow(**{**row, "state": FrameState(row["state"])})
 
 
 def frame_rows(selected: Iterable[Row[Any]]) -> list[FrameRow]:
-    """Return rows of `FRAME_COLUMNS`, by position, which costs a third of `frame_row`."""
+    """Convert rows of `FRAME_COLUMNS` by position, in a third of the time of `frame_row`."""
     rows = []
     for row in selected:
         values = list(row)
@@ -752,12 +755,12 @@ def frame_rows(selected: Iterable[Row[Any]]) -> list[FrameRow]:
 
 
 def job_row(row: RowMapping) -> JobRow:
-    """Return a row of the table `jobs`."""
+    """Convert a row of the table `jobs`."""
     return JobRow(**{**row, "state": JobState(row["state"])})
 
 
 def job_of_columns(row: Sequence[Any]) -> JobRow:
-    """Return a job from a row that begins with `JOB_COLUMNS`."""
+    """Convert the first columns of a row, which are `JOB_COLUMNS`, to a job."""
     values = list(row[: len(JOB_COLUMNS)])
     values[_JOB_STATE] = JobState(values[_JOB_STATE])
     return JobRow(*values)
@@ -771,11 +774,11 @@ _FRAME_STATE = [column.name for column in FRAME_COLUMNS].index("state")
 _JOB_STATE = [column.name for column in JOB_COLUMNS].index("state")
 
 
-# The clock of leases and jobs is that of the database, as the clocks of hosts differ. A SQLite file
-# has one host.
+# Leases and jobs use the clock of the database, because the clocks of hosts differ. A SQLite file
+# has only one host.
 
-#: Start of a PostgreSQL statement, seconds since 1970: the transaction may have waited for its turn
-#: since it began, and clock_timestamp() differs by row, so that no index could be used.
+#: Start of a PostgreSQL statement, seconds since 1970. The transaction may have waited for its turn
+#: after it began, and clock_timestamp() differs by row, which would prevent the use of an index.
 STATEMENT_TIME: ColumnElement[float] = cast(extract("epoch", func.statement_timestamp()), Float(53))
 
 
@@ -790,7 +793,7 @@ def job_values(
     connection: Connection, kind: str, priority: int, model_id: str | None = None,
     data: dict[str, Any] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the columns of a job that is queued now, except its subject: see `enqueue`."""
+    """Return the columns of a job that is queued now, except its subject; see `enqueue`."""
     at = now(connection)
     return {
         "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id,
@@ -801,10 +804,10 @@ def job_values(
 
 
 def request_data() -> dict[str, Any] | None:
-    """Return the data of a job from the request that queues it; None outside a request."""
+    """Return the data of a job from the current request; None outside a request."""
     if request_id() is None:
         return None
-    return {"request_id": request_id()}  # the worker's log lines name it
+    return {"request_id": request_id()}  # log lines of the worker contain it
 
 
 def audit_values(
@@ -812,7 +815,7 @@ def audit_values(
 ) -> dict[str, Any] | None:
     """Return the columns of an audit line for a change by the current actor.
 
-    None for a worker: a line records the request that it carries out.
+    Return None for a worker, since the request that queued its job has a line.
     """
     actor = current_actor()
     if actor is None:

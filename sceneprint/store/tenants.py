@@ -1,4 +1,4 @@
-"""Tenants, who pay. Keys belong to tenants, and so do the jobs that are queued with these keys."""
+"""Tenants, which own keys and the jobs that are queued with these keys."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sceneprint.store.tables import jobs, keys, tenants
 
 @dataclass(frozen=True)
 class TenantRow:
-    """A tenant.
+    """Tenant.
 
     Parameters
     ----------
@@ -43,36 +43,36 @@ def has_tenant(connection: Connection, name: str) -> bool:
 
 
 def create_tenant(connection: Connection, name: str) -> None:
-    """Create a tenant without keys; raise Conflict if the name is in use."""
+    """Create a tenant without keys. Raise Conflict if the name is in use."""
     if has_tenant(connection, name):
-        raise Conflict(f"There is a tenant named {name!r:.80}. Choose another name.")
+        raise Conflict(f"A tenant named {name!r:.80} already exists. Choose another name.")
     connection.execute(insert(tenants).values(name=name, created_at=time.time()))
 
 
 def delete_tenant(connection: Connection, name: str) -> None:
-    """Delete a tenant without keys; its queued jobs keep their place.
+    """Delete a tenant without keys; its queued jobs keep their places.
 
     Raises
     ------
-    UnknownTenant : the tenant does not exist.
-    Conflict : the tenant has a key.
+    UnknownTenant : If the tenant does not exist.
+    Conflict : If the tenant has a key.
     """
     if not has_tenant(connection, name):
         raise unknown_tenant(name)
     if _first_key(connection, name) is not None:
         raise Conflict(
-            f"The tenant {name!r:.80} has keys. Revoke them with `sceneprint keys --revoke`, then "
-            "delete it."
+            f"The tenant {name!r:.80} has keys. Revoke them with `sceneprint keys --revoke` before "
+            "you delete the tenant."
         )
     connection.execute(delete(tenants).where(tenants.c.name == name))
 
 
 def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> str:
-    """Return the tenant of a new key: the named one, or one with the key's own name.
+    """Return the tenant of a new key: `tenant`, or a new tenant with the name of the key.
 
     Raises
     ------
-    UnknownTenant : the named tenant does not exist.
+    UnknownTenant : If `tenant` does not exist.
     """
     if tenant is not None:
         if not has_tenant(connection, tenant):
@@ -84,7 +84,7 @@ def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> st
 
 
 def leave_tenant(connection: Connection, key_name: str, tenant: str) -> None:
-    """Delete the tenant that was created with a revoked key, if it has no other key."""
+    """Delete the tenant that was created with a revoked key, if the tenant has no other key."""
     if tenant == key_name and _first_key(connection, tenant) is None:
         delete_tenant(connection, tenant)
 
@@ -92,16 +92,16 @@ def leave_tenant(connection: Connection, key_name: str, tenant: str) -> None:
 def unknown_tenant(name: str) -> UnknownTenant:
     """Return the error for a tenant that does not exist."""
     return UnknownTenant(
-        f"There is no tenant named {name!r:.80}. Create it with `sceneprint keys --create-tenant "
-        "NAME`; list them with `sceneprint keys --list-tenants`."
+        f"There is no tenant named {name!r:.80}. List the tenants with `sceneprint keys "
+        "--list-tenants`, or create the tenant with `sceneprint keys --create-tenant NAME`."
     )
 
 
 def save_turns(connection: Connection, *names: str) -> None:
-    """Store the latest turns of some tenants, or of all, in the table of tenants.
+    """Store the latest turns of some tenants, or of all tenants, in the table of tenants.
 
-    Call this before jobs are removed: otherwise a tenant that deletes its maps would always be
-    served first.
+    Call this before removing jobs; otherwise a tenant that deletes its maps would always be served
+    first.
     """
     last = (
         select(func.max(jobs.c.turn))

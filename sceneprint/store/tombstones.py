@@ -1,7 +1,7 @@
-"""Tombstones: deleted frames that can be restored as they were.
+"""Tombstones, which are deleted frames that can be restored unchanged.
 
 delete_frames  -->  tombstones  --list_deletions-->  Deletion, ...
-tombstones  --restore_frame-->  frames that queries find again at once
+tombstones  --restore_frame-->  frames that queries find immediately
 tombstones  --purge_frames-->  bare rows
 """
 
@@ -23,12 +23,12 @@ _SEARCHED = (FrameState.INDEXED, FrameState.RECEIVED, FrameState.SIGNING)
 
 @dataclass(frozen=True)
 class Deletion:
-    """The restorable frames of a map that one call deleted.
+    """Restorable frames of a map that a single call deleted.
 
     Parameters
     ----------
-    number : revision of the map at which the deletion began
-    at : start of the deletion, seconds since 1970, by the clock of the database
+    number : first revision of the deletion
+    at : start of the deletion by the clock of the database, seconds since 1970
     frames : number of restorable frames
     """
 
@@ -40,7 +40,7 @@ class Deletion:
 def _restorable(
     connection: Connection, map_number: int, seconds: float
 ) -> list[ColumnElement[bool]]:
-    """Return the conditions of the tombstones that can be restored for so many seconds."""
+    """Return the conditions for tombstones that are younger than `seconds`."""
     c = frames.c
     return [
         c.map_number == map_number, c.deletion.is_not(None), c.deleted_from.is_not(None),
@@ -56,7 +56,7 @@ def list_deletions(
     Parameters
     ----------
     seconds : period after a deletion in which frames can be restored
-    limit : maximum number
+    limit : maximum number of deletions
     before : number of the last deletion of the previous page
     """
     c = frames.c
@@ -72,7 +72,7 @@ def list_deletions(
 def find_deletion(
     connection: Connection, map_number: int, seconds: float, number: int
 ) -> Deletion | None:
-    """Return a deletion if it can be undone; parameters as in `list_deletions`."""
+    """Return the deletion with a number if it can be undone; see `list_deletions`."""
     deletions = list_deletions(connection, map_number, seconds, 1, number + 1)
     return next((one for one in deletions if one.number == number), None)
 
@@ -80,7 +80,7 @@ def find_deletion(
 def tombstones_of(
     connection: Connection, map_number: int, seconds: float, deletion: int, after: int, limit: int
 ) -> list[FrameRow]:
-    """Return the restorable tombstones of a deletion, in the order in which they were received.
+    """Return the restorable tombstones of a deletion, in upload order.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def successor_of(connection: Connection, frame: FrameRow) -> str | None:
 
 
 def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
-    """Turn a tombstone back into its frame; it is signed only if the map's model has changed.
+    """Restore the frame of a tombstone; it is signed again only if the map's model has changed.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
 
     Raises
     ------
-    QuotaExceeded : the map may hold no more frames.
+    QuotaExceeded : If the quota of the map does not allow another frame.
     """
     require_room(connection, row, 0)
     add_usage(connection, row.number, 1, 0)
@@ -145,6 +145,6 @@ def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
             job = enqueue(connection, "sign", frame.number)
             values |= {"state": FrameState.RECEIVED, "reason": None, "indexed_at": None}
             if frame.deleted_from == FrameState.INDEXED:
-                values["novelty"] = None  # the map has accepted the frame before
+                values["novelty"] = None  # the map has already accepted the frame
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**values))
     record_event(connection, "frame.restored", row.name, frame.id, None if job is None else job.id)

@@ -1,8 +1,8 @@
-"""Wake waiting workers when a job is committed: through FIFOs beside SQLite, NOTIFY on PostgreSQL.
+"""Wake waiting workers after a job is committed, through FIFOs with SQLite or NOTIFY of PostgreSQL.
 
-Each waiting worker creates a FIFO in a folder, and a ring writes one byte to each. Rings are only
-hints: workers also poll, as a FIFO may be impossible, or the other process on another machine. So
-nothing here raises errors, and no upload fails for it.
+Each waiting worker creates a FIFO in a folder, and a ring writes a byte to each FIFO. Rings are
+only hints: workers also poll, because a file system may not support FIFOs, or a process may be on
+another machine. Functions of this module therefore raise no errors.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ if TYPE_CHECKING:
     import psycopg
 
 
-#: Seconds after which an abandoned FIFO is removed, and interval at which a FIFO in use is touched.
+#: Seconds after which an abandoned FIFO is removed, and interval at which used FIFOs are touched.
 STALE_S, ALIVE_S = 300.0, 60.0
 #: Longest wait of a worker without a FIFO, seconds.
 DEAF_S = 0.25
 #: Longest timeout of poll(2), milliseconds.
 MOST_MS = 2**31 - 1
-#: Number of last characters of the host in a process's name: servers cut names of connections, and
-#: hosts in clouds often differ only at the end.
+#: Number of last characters of the host in the name of a process. Servers truncate the names of
+#: connections, and hosts in clouds often differ only at the end.
 HOST = 44
 
 
 class Listening(Protocol):
-    """A process that waits for rings."""
+    """Process that waits for rings."""
 
     def wait(self, timeout_s: float, *others: int) -> bool:
-        """Wait for a ring, for one of other descriptors to be readable, or for the timeout.
+        """Wait for a ring, for a readable descriptor of `others`, or for the timeout.
 
         Returns
         -------
-        rung : whether it rang, or may have rung while this was disconnected
+        rung : whether there was a ring, or may have been one during a disconnection
         """
 
     def close(self) -> None:
@@ -57,12 +57,12 @@ class Listening(Protocol):
 
 
 def process_name() -> str:
-    """Return the name of this process among those of all hosts: `host:pid`."""
+    """Return the name of this process, `host:pid`, which is unique among all hosts."""
     return f"{socket.gethostname()[-HOST:]}:{os.getpid()}"
 
 
 def wait_for(timeout_s: float, *descriptors: int) -> set[int]:
-    """Return the descriptors that are readable within the timeout; negative ones are ignored."""
+    """Return the descriptors that become readable within the timeout; ignore negative ones."""
     waiting = select.poll()
     for descriptor in descriptors:
         if descriptor >= 0:
@@ -72,32 +72,27 @@ def wait_for(timeout_s: float, *descriptors: int) -> set[int]:
 
 
 class Wakeup:
-    """Wake workers of this machine through a folder of FIFOs.
+    """Signal to workers of this machine through a folder of FIFOs.
 
     Parameters
     ----------
-    folder : folder that the first listener creates
+    folder : folder, which the first listener creates
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def ring(self) -> None:
-        """Wake waiting workers; call it after the commit, so that they see the change."""
+        """Wake waiting workers. Call this after the commit, so that they see the change."""
         try:
             names = os.listdir(self._folder)  # noqa: PTH208  (a path for each would cost)
         except OSError:
-            return  # no process has ever listened
+            return  # no process has listened so far
         for name in names:
             self._ring(self._folder / name)
 
     def listeners(self, _connection: Connection | None = None) -> list[str]:
-        """Return `host:pid` of every listening process of this machine.
-
-        Parameters
-        ----------
-        _connection : connection to the database, which PostgreSQL's subclass uses
-        """
+        """Return `host:pid` of each listening process of this machine."""
         try:
             names = sorted(os.listdir(self._folder))  # noqa: PTH208
         except OSError:
@@ -106,14 +101,14 @@ class Wakeup:
         return [":".join(name.rsplit("-", 2)[:2]) for name in read]
 
     def listen(self) -> AbstractContextManager[Listening]:
-        """Listen for rings; one that arrives before the wait ends the wait at once."""
+        """Listen for rings. A ring before the wait ends the wait immediately."""
         return closing(Listener(self._folder))
 
     def close(self) -> None:
         """Stop ringing."""
 
     def _is_read(self, path: Path) -> bool:
-        """Return whether a process has a FIFO open for reading: else opening it fails."""
+        """Return whether a process reads a FIFO; otherwise, opening the FIFO fails."""
         with suppress(OSError), _opened(path) as descriptor:
             return stat.S_ISFIFO(os.fstat(descriptor).st_mode)
         return False
@@ -122,9 +117,9 @@ class Wakeup:
         try:
             with _opened(path) as descriptor:
                 if stat.S_ISFIFO(os.fstat(descriptor).st_mode):
-                    with suppress(OSError):  # full: its reader is about to wake
+                    with suppress(OSError):  # a full FIFO will wake its reader anyway
                         os.write(descriptor, b"!")
-        except OSError:  # no reader: the FIFO is new, or its process died
+        except OSError:  # the FIFO has no reader, since it is new or its process has died
             with suppress(OSError):
                 if path.is_fifo() and time.time() - path.stat().st_mtime > STALE_S:
                     path.unlink()
@@ -140,7 +135,7 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 class Listener:
-    """An open FIFO; see `Wakeup.listen`."""
+    """Open FIFO; see `Wakeup.listen`."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / f"{process_name().replace(':', '-')}-{uuid.uuid4().hex[:8]}"
@@ -174,13 +169,13 @@ class Listener:
         try:
             make_folder(self._path.parent)
             os.mkfifo(self._path, 0o600)
-            # opened for writing as well: without a writer it would be at its end, thus readable
+            # without a writer, the FIFO would be at its end and thus readable
             self._fifo = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
         except OSError:
             self._fifo = -1
 
     def _refresh(self) -> None:
-        """Show that the FIFO is in use; create it again if it was removed."""
+        """Touch the FIFO to show that it is in use; create it again if it was removed."""
         self._alive = time.monotonic()
         try:
             os.utime(self._path)
@@ -189,7 +184,7 @@ class Listener:
             self._open()
 
 
-# Rings through PostgreSQL, for several hosts. They are hints as well: if the server is away, or a
+# Rings through PostgreSQL for several hosts. They are hints too: if the server is unreachable, or a
 # pooler drops listeners, workers poll.
 
 log = logging.getLogger(__name__)
@@ -197,16 +192,16 @@ log = logging.getLogger(__name__)
 CHANNEL = "sceneprint"
 #: Prefix of the names of listening connections, before the name of the process.
 LISTENS = "sceneprint "
-#: Seconds between two rings, as one is enough for many uploads.
+#: Minimum seconds between two rings, since one ring suffices for many uploads.
 REST_S = 0.02
-#: Seconds that closing waits for a ring in progress: the server may not answer.
+#: Maximum seconds that `close` waits for a ring in progress, since the server may not answer.
 CLOSING_S = 2.0
 #: Seconds between two attempts to connect.
 AGAIN_S = 2.0
 
 
 class Notices(Wakeup):
-    """Wake workers of all hosts through NOTIFY and LISTEN of PostgreSQL."""
+    """Signal to workers of all hosts through NOTIFY and LISTEN of PostgreSQL."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -215,7 +210,7 @@ class Notices(Wakeup):
         self._ringer: threading.Thread | None = None
 
     def ring(self) -> None:
-        """Wake waiting workers on every host, from another thread."""
+        """Wake waiting workers on all hosts, from another thread."""
         with self._lock:
             if self._ringer is None and not self._closed:
                 self._ringer = threading.Thread(
@@ -225,7 +220,7 @@ class Notices(Wakeup):
         self._rung.set()
 
     def listeners(self, connection: Connection | None = None) -> list[str]:
-        """Return `host:pid` of every listening process, on every host."""
+        """Return `host:pid` of each listening process on all hosts."""
         if connection is None:
             with self._database.read() as own:
                 return self.listeners(own)
@@ -254,11 +249,11 @@ class Notices(Wakeup):
         connection: psycopg.Connection[Any] | None = None
         while self._rung.wait() and not self._closed:
             self._rung.clear()
-            for _ in range(2):  # the server may have closed the connection since the last ring
+            for _ in range(2):  # the server may have closed the connection after the last ring
                 try:
                     if connection is None:
                         connection = self._database.driver_connection()
-                        # a ring may be lost, so it need not wait for disk and standby
+                        # rings may be lost, so they need not wait for the disk and the standby
                         connection.execute("SET synchronous_commit = off")
                     with self._database.explained():
                         connection.execute(f"NOTIFY {CHANNEL}")
@@ -272,7 +267,7 @@ class Notices(Wakeup):
 
 
 class NoticeListener:
-    """A connection that listens; see `Notices.listen`."""
+    """Listening connection; see `Notices.listen`."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -317,7 +312,7 @@ class NoticeListener:
         self._connection, self._missed = connection, True
 
     def _has_rung(self) -> bool:
-        """Return whether the input is a ring, and not the end of the connection."""
+        """Return whether the input is a ring rather than the end of the connection."""
         if self._connection is None:
             return False
         rung = False
@@ -329,7 +324,7 @@ class NoticeListener:
         except SceneprintError as error:
             log.debug("wakeup unavailable", extra={"error": str(error)})
             self.close()
-            self._again_at = time.monotonic()  # another server may have taken over
+            self._again_at = time.monotonic()  # another server may be the primary now
         return rung
 
 

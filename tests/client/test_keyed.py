@@ -178,7 +178,7 @@ def test_keys_are_made_listed_and_revoked_alike(request: pytest.FixtureRequest, 
     found = client.keys()
     (listed,) = [key for key in found if key.name == "cart 9"]
     assert listed.model_dump() == made.model_dump(exclude={"secret"})
-    with pytest.raises(Conflict, match="There is a key named 'cart 9'"):
+    with pytest.raises(Conflict, match="A key named 'cart 9' already exists"):
         client.create_key("cart 9", {"*": "read"})
     with pytest.raises(InvalidRequest, match="grants"):
         client.create_key("empty", {})

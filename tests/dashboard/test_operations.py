@@ -122,7 +122,7 @@ def test_dead_jobs_are_shown_with_their_tracebacks_and_tried_again(
     until(lambda: failures.count() == 3)  # as they die, without a reload
     first = failures.first
     assert first.locator(".badge").inner_text() == "dead"
-    assert "is damaged: its content has another hash" in first.inner_text()
+    assert "is damaged: its content has a different hash" in first.inner_text()
     trace = first.get_by_role("region", name="Traceback")
     assert not trace.is_visible()
     first.get_by_text("Traceback of the last attempt").click()

@@ -254,7 +254,7 @@ def test_requests_are_remembered_for_a_day_and_their_keys_then_removed(make_engi
         left = connection.execute(select(idempotency.c.key).order_by(idempotency.c.key)).scalars()
         assert list(left) == ["key 0", "key 1"]
         assert asked[0].stored_result(connection) == {"job_id": "again"}
-        with pytest.raises(IdempotencyConflict, match="'key 1' was sent with another request"):
+        with pytest.raises(IdempotencyConflict, match="'key 1' was used for another request"):
             asked[1].stored_result(connection)
 
 

@@ -63,7 +63,7 @@ def test_bytes_are_those_of_uploads(empty, uploads):
     a, b, *_ = uploads
     limit(empty, quota_bytes=len(a.data) + len(b.data) - 1)
     empty.add_frame("hall", a.data, a.meta)
-    with pytest.raises(QuotaExceeded, match=f"holds {len(a.data)} bytes of uploads of the"):
+    with pytest.raises(QuotaExceeded, match=f"has {len(a.data)} bytes of uploads, and its quota"):
         empty.add_frame("hall", b.data, b.meta)
     limit(empty, quota_bytes=len(a.data) + len(b.data))
     empty.add_frame("hall", b.data, b.meta)

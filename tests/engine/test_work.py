@@ -226,7 +226,7 @@ def test_a_job_that_silences_every_worker_is_given_up(
     assert claimed.frame.id == good.frame_id
     frame, job = empty.get_frame("hall", bad.frame_id), empty.get_job(bad.job_id)
     assert (frame.state, job.state) == (FrameState.FAILED, JobState.DEAD)
-    assert frame.reason == job.error == "its worker fell silent in the last of 10 attempts"
+    assert frame.reason == job.error == "its worker stopped responding in the last of 10 attempts"
     assert told(empty) == ["map.created", "frame.received", "frame.received", "frame.failed"]
 
 

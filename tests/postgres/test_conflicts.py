@@ -130,7 +130,7 @@ def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
 def test_a_prepared_statement_that_is_gone_is_told(server_store: Store) -> None:
     """As behind a pooler that gives one connection to several clients."""
     with (
-        pytest.raises(StoreLocked, match="A prepared statement is gone"),
+        pytest.raises(StoreLocked, match="A prepared statement no longer exists"),
         server_store.database.read() as connection,
     ):
         connection.exec_driver_sql("EXECUTE nothing")

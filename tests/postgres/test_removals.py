@@ -391,7 +391,7 @@ def test_what_a_killed_remover_leaves(
     assert doomed_in(engine) == sorted([digest, OTHER])
     held.drop()  # what it had asked for is not carried out
     if dies == "before":
-        with pytest.raises(StoreLocked, match="lost its connection, and may still remove them"):
+        with pytest.raises(StoreLocked, match="lost its connection, and may still remove the blob"):
             alone(engine, small)  # nobody can tell whether it is dead, or cut off
         grow_old(engine)
     alone(engine, small)  # who is dead is not waited for
@@ -443,7 +443,7 @@ def test_what_is_removed_one_by_one_ends_in_time(tmp_path: Path) -> None:
 
 def test_a_snapshot_defers_a_removal(engine: Engine) -> None:
     digest = engine.store.blobs.put(b"of another frame")
-    with engine.store.blobs.kept():
+    with engine.store.blobs.block_removals():
         collect_blobs(engine.store, [digest])
         assert engine.store.blobs.holds(digest)
         assert doomed_in(engine) == [digest]
@@ -479,7 +479,7 @@ def test_another_removal_does_not_hide_that_of_who_was_cut_off(
     removing = removal(digest)
     end_sessions(engine, "objid = 2 AND mode = 'ExclusiveLock'")
     for _ in range(2):
-        with pytest.raises(StoreLocked, match="lost its connection, and may still remove them"):
+        with pytest.raises(StoreLocked, match="lost its connection, and may still remove the blob"):
             alone(engine, small)
         collect_blobs(engine.store, [other])
     assert doomed_in(engine) == sorted([digest, other])

@@ -243,7 +243,7 @@ def test_points_without_coordinates(tmp_path: Path, ros: SimpleNamespace) -> Non
     [
         (b"", "PNG and"), (b"\x00" * 12, "PNG and"), (b"\x00" * 12 + b"\xff\xd8\xff", "PNG and"),
         (b"\x00" * 80 + b"\x89PNG\r\n\x1a\n", "PNG and"),
-        (b"\x00" * 12 + b"\x89PNG\r\n\x1a\n", "ends early"),
+        (b"\x00" * 12 + b"\x89PNG\r\n\x1a\n", "truncated"),
     ],
 )  # fmt: skip
 def test_compressed_images_that_are_none(

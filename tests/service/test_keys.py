@@ -119,7 +119,9 @@ def test_a_name_is_given_once(wide, secret, capsys):
     assert main(["keys", "--create", "robot 7", "--data", str(wide.folder)]) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err == ("sceneprint keys: There is a key named 'robot 7'. Choose another name.\n")
+    assert said.err == (
+        "sceneprint keys: A key named 'robot 7' already exists. Choose another name.\n"
+    )
     headers = {"Authorization": f"Bearer {secret}"}
     assert wide.client.get("/v1/maps", headers=headers).status_code == 200
 

@@ -151,8 +151,8 @@ def test_the_newest_lines_of_each_tenant_are_kept(store: Store) -> None:
         )
     add_lines(store, {"tenant": "quiet"}, {"tenant": ""}, *[{"tenant": "noisy"}] * 9)
     with store.database.write() as connection:
-        assert surplus_lines(connection, 0.0, 99, kept=99) == []
-        assert surplus_lines(connection, 0.0, 2, kept=4) == [3, 4]  # the oldest first
-        spent = surplus_lines(connection, 0.0, 99, kept=4)
+        assert surplus_lines(connection, 0.0, 99, most_lines=99) == []
+        assert surplus_lines(connection, 0.0, 2, most_lines=4) == [3, 4]  # the oldest first
+        spent = surplus_lines(connection, 0.0, 99, most_lines=4)
         remove_lines(connection, spent)
     assert [one.number for one in lines_of(store)] == [1, 2, 8, 9, 10, 11]

@@ -137,7 +137,7 @@ def test_putting_the_bytes_again_mends_a_damaged_blob(kept: Kept, left: bytes) -
 
 
 def test_a_missing_blob_is_said(kept: Kept) -> None:
-    with pytest.raises(DamagedBlob, match=r"cannot be read .No such.*upload it again"):
+    with pytest.raises(DamagedBlob, match=r"(does not exist|No such file).*upload it again"):
         kept.blobs.get(DIGEST)
     with pytest.raises(FileNotFoundError):
         kept.blobs.open(DIGEST)
@@ -200,7 +200,7 @@ def test_what_others_leave_there_is_no_blob(kept: Kept) -> None:
 
 
 def test_who_needs_blobs_keeps_others_from_removing_them(kept: Kept) -> None:
-    with kept.blobs.kept(), kept.blobs.kept(), kept.blobs.removing() as allowed:
+    with kept.blobs.block_removals(), kept.blobs.block_removals(), kept.blobs.removing() as allowed:
         assert not allowed
     with kept.blobs.removing() as allowed, kept.blobs.removing() as also:
         assert (allowed, also) == (True, False)
@@ -225,7 +225,7 @@ def test_a_full_disk_leaves_nothing_and_hurts_nothing(tmp_path: Path) -> None:
     told = done.stdout.splitlines()
     assert len(told) == 4
     for line in (*told[:2], told[3]):
-        assert "a blob cannot be written (File too large)" in line
+        assert "A blob cannot be written (File too large)" in line
     assert told[2] == "True"
     kept = hashlib.sha256(b"s" * 65536).hexdigest()
     assert files(tmp_path) == [f"blobs/{kept[:2]}/{kept}"]
@@ -237,7 +237,7 @@ def test_a_file_where_a_folder_should_be_is_said(tmp_path: Path) -> None:
     place.write_bytes(b"")  # a file where the folder should be
     with pytest.raises(UnusableStore, match="Check the folder and its permissions"):
         blobs.put(b"depth")
-    with pytest.raises(UnusableStore, match=r"the folder cannot be created \(Not a directory\)"):
+    with pytest.raises(UnusableStore, match=r"The folder cannot be created \(Not a directory\)"):
         FolderBlobs(place / "below")
 
 
@@ -272,9 +272,9 @@ def test_a_blob_may_be_put_and_removed_at_once(blobs: FolderBlobs, tmp_path: Pat
 @pytest.mark.parametrize(
     ("number", "kind", "advice"),
     [
-        (errno.ENOSPC, StoreFull, "The disk is full: free some space."),
-        (errno.EDQUOT, StoreFull, "The disk is full: free some space."),
-        (errno.EROFS, ReadOnlyStore, "It is read-only: make it writable, or name another folder."),
+        (errno.ENOSPC, StoreFull, "The disk is full. Free some space."),
+        (errno.EDQUOT, StoreFull, "The disk is full. Free some space."),
+        (errno.EROFS, ReadOnlyStore, "It is read-only. Make it writable, or use another folder."),
         (errno.EIO, UnusableStore, "Check the folder and its permissions."),
     ],
 )

@@ -15,7 +15,7 @@ from sqlalchemy import Connection, update
 
 from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
-    TakenPosition,
+    CapturePosition,
     count_run,
     list_frames,
     list_runs,
@@ -130,8 +130,8 @@ def some_listing(rng: np.random.Generator) -> FrameListing:
     return FrameListing.model_validate({**given, "order": rng.choice(orders)})
 
 
-def position(one: FrameRow) -> TakenPosition:
-    return TakenPosition(one.number, one.captured_at, one.sequence)
+def position(one: FrameRow) -> CapturePosition:
+    return CapturePosition(one.number, one.captured_at, one.sequence)
 
 
 def test_every_list_is_that_of_plain_python(
@@ -299,7 +299,7 @@ def test_each_list_takes_the_index_that_is_meant_for_it(
         ({"session": "s", "order": "taken"},
          f"{SEARCHED} (map_number=? AND state=? AND session=?"),
     ]  # fmt: skip
-    for (wanted, way), beyond in product(ways, (None, TakenPosition(7, 1.0, None))):
+    for (wanted, way), beyond in product(ways, (None, CapturePosition(7, 1.0, None))):
         listing = FrameListing.model_validate(wanted)
         with store.database.read() as connection, plans(connection) as told:
             list_frames(connection, hall.number, beyond, 9, listing)

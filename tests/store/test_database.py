@@ -129,7 +129,7 @@ def test_a_database_of_a_later_version_is_left_as_it_is(url: str, tmp_path: Path
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
         connection.execute("UPDATE schema_range SET least_revision = '9999'")
     before = path.read_bytes()
-    with pytest.raises(NewerSchema, match="has schema 9999, which this version"):
+    with pytest.raises(NewerSchema, match="has schema 9999 of a later version"):
         open_database(url)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["truth.db"]
@@ -175,7 +175,7 @@ def test_a_folder_that_may_not_be_written_says_so() -> None:
         assert sorted(p.name for p in folder.rglob("*")) == ["other", "there.db"]
     told = done.stdout.splitlines()
     assert len(told) == 3
-    assert "the folder cannot be created (Permission denied)" in told[0]
+    assert "The folder cannot be created (Permission denied)" in told[0]
     assert "unable to open database file" in told[1]
     assert told[2] == "opened"  # to be read
 
@@ -257,7 +257,7 @@ def test_a_schema_that_finds_no_room_changes_nothing(tmp_path: Path) -> None:
         [sys.executable, "-c", OPENS, url], capture_output=True, text=True, check=True,
         preexec_fn=narrow,
     )  # fmt: skip
-    assert "that the disk has room" in done.stdout
+    assert "that the disk has free space" in done.stdout
     assert schema(path) == found
     open_database(url).close()  # and with room it goes on
     assert len(schema(path)) > len(found)

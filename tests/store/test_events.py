@@ -136,7 +136,7 @@ def test_every_kind_that_is_told_is_declared():
 
 
 def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -> None:
-    """Nor is it told of one that was deleted before it was made, and of which there is no other."""
+    """Nor is it told of one that is already deleted it was made, and of which there is no other."""
 
     def told(since: float | None, *names: str) -> list[tuple[str, str | None]]:
         wanted = EventFilter(frozenset(names), since=since)

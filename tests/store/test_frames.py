@@ -173,7 +173,7 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(
         assert not stored.refers_to(connection, artifact)
         told = connection.execute(select(events).where(events.c.kind == "frame.deleted")).all()
         assert [(each.map, each.frame_id) for each in told] == [("hall", frame.id)]
-    with pytest.raises(UnknownFrame, match="was deleted before"):
+    with pytest.raises(UnknownFrame, match="is already deleted"):
         delete(store, hall, frame)
     with store.database.write() as connection:
         stored.set_state(connection, frame.number, FrameState.FAILED, "late")
@@ -192,7 +192,7 @@ def test_pages_follow_the_order_of_arrival(
         rest = frame_queries.list_frames(
             connection,
             hall.number,
-            frame_queries.TakenPosition(first[-1].number, None, None),
+            frame_queries.CapturePosition(first[-1].number, None, None),
             9,
             FrameListing(),
         )
@@ -245,7 +245,7 @@ def test_a_key_is_shown_once_and_kept_as_a_hash(store: Store) -> None:
         other = stored_keys.create_key(connection, "dashboard", {"hall": "read"}, 5.0)
     assert secret.startswith("sp_")
     assert len(secret) == 46
-    with pytest.raises(Conflict, match="a key named 'fleet'"), store.database.write() as connection:
+    with pytest.raises(Conflict, match="A key named 'fleet'"), store.database.write() as connection:
         stored_keys.create_key(connection, "fleet", {"*": "admin"})
     with store.database.read() as connection:
         assert [key.name for key in stored_keys.list_keys(connection)] == ["dashboard", "fleet"]

@@ -122,7 +122,7 @@ def test_a_log_that_was_left_is_read_or_refused(folder: Path, reader: Reader) ->
     (folder / "a.db-shm").unlink()
     told = reader.ask()  # the row in the log must not be overlooked
     assert told.startswith("UnusableStore: ")
-    assert "was not closed, and on a read-only disk it cannot be recovered" in told
+    assert "was not closed, and cannot be recovered on a read-only disk" in told
     (folder / "a.db-wal").write_bytes(b"")
     assert reader.ask() == "1 ['a.db', 'a.db-wal']"  # all that the file itself holds
 
@@ -140,7 +140,7 @@ def test_a_file_that_changes_while_it_is_read_is_not_believed(folder: Path) -> N
             return int(connection.execute(text("SELECT sum(number) FROM events")).scalar_one())
 
     assert total(lambda: None) == 1
-    with pytest.raises(UnusableStore, match=r"was written by another process.*Try again"):
+    with pytest.raises(UnusableStore, match=r"Another process wrote to.*Try again"):
         total(lambda: add(folder))
     database.close()  # who asks again, has it opened again
     assert total(lambda: None) == 3
@@ -178,7 +178,7 @@ def test_a_later_schema_on_a_read_only_folder_is_left_alone(folder: Path) -> Non
         [sys.executable, "-c", OPENS, str(folder)], capture_output=True, text=True, check=True,
         preexec_fn=without_rights if os.getuid() == 0 else None,
     )  # fmt: skip
-    said = f"NewerSchema: sqlite:///{folder}/a.db has schema 9999, which this version"
+    said = f"NewerSchema: sqlite:///{folder}/a.db has schema 9999 of a later version"
     assert done.stdout.startswith(said)
     assert (folder / "a.db").read_bytes() == before
     assert [path.name for path in folder.iterdir()] == ["a.db"]
@@ -244,6 +244,6 @@ def test_a_disk_that_turns_read_only_is_said(tmp_path: Path) -> None:
     before, blobs, put, again, all_of_it, fault = done.stdout.splitlines()
     assert (before, blobs, again, all_of_it) == ("False", "True False", "False", "True")
     assert put.endswith(
-        "(Read-only file system). It is read-only: make it writable, or name another folder."
+        "(Read-only file system). It is read-only. Make it writable, or use another folder."
     )
-    assert "disk I/O error. Its disk is mounted read-only" in fault
+    assert "disk I/O error. The disk is mounted read-only" in fault

@@ -97,7 +97,7 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
         (buried,) = queue.dead_letter(connection)
     assert buried == hand.row(silent)
     assert (buried.state, buried.leased_until) == (JobState.DEAD, None)
-    assert buried.error == "its worker fell silent in the last of 10 attempts"
+    assert buried.error == "its worker stopped responding in the last of 10 attempts"
     assert buried.finished_at is not None
     assert not hand.due()
     with pytest.raises(LostLease), store.database.write() as connection:

@@ -99,7 +99,7 @@ def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
         lambda c: queue.renew(c, first, 9.0),
         lambda c: queue.release_job(c, first),
     ):
-        lost = pytest.raises(LostLease, match=f"{job.id} is no longer held")
+        lost = pytest.raises(LostLease, match=f"no longer holds job {job.id}")
         with lost, store.database.write() as connection:
             late(connection)
         assert hand.row(job) == second

@@ -121,16 +121,18 @@ def test_an_old_process_writes_as_long_as_the_schema_allows_it(
     for turn in ("turn", "none"):
         answer = write("third", turn)
         assert answer.startswith("NewerSchema: ")
-        assert f"was brought to schema 0099 of a later version of sceneprint while this process " \
-            f"ran, and this process works with {own}. Nothing was stored. Stop this process, " \
-            "and start the version that the others run." in answer  # fmt: skip
+        assert (
+            "was migrated to schema 0099 of a later version of sceneprint while this process, "
+            f"which needs {own}, was running. Nothing was stored. Stop this process, and start the "
+            "version of the other processes."
+        ) in answer
     assert _names(url) == ["first", "second"]
 
 
 def test_a_store_of_a_later_version_cannot_be_opened(url: str, store: Store) -> None:
     assert store.database.dialect in url
     _set_schema(url, "9999", "9998")
-    with pytest.raises(NewerSchema, match="schema 9999, which this version of sceneprint does"):
+    with pytest.raises(NewerSchema, match="schema 9999 of a later version of sceneprint"):
         open_database(url)
 
 
@@ -214,4 +216,4 @@ def test_the_command_makes_the_schema_once(
     assert (code, said.endswith("schema 9999")) == (0, True)
     _set_schema(url, "9999", "9998")
     code, _, error = migrate_command(url, data)
-    assert (code, "a later one wrote it" in error) == (2, True)
+    assert (code, "of a later version of sceneprint" in error) == (2, True)

@@ -122,7 +122,7 @@ def test_a_turn_that_another_process_keeps_is_said(
     monkeypatch.setattr(postgres, "HELD_S", 0.2)
     for _ in range(2):  # the second, who comes after one that waited in vain, waits less
         with (
-            pytest.raises(StoreLocked, match=r"nothing was stored\. Try again.*pg_stat_activity"),
+            pytest.raises(StoreLocked, match=r"Nothing was stored\. Try again.*pg_stat_activity"),
             served.write(),
         ):
             pytest.fail("it is not our turn")
@@ -192,10 +192,10 @@ def test_a_commit_is_never_acknowledged_before_it_is_on_disk(
 def test_more_readers_than_connections_are_told_so(
     postgres_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value in (("KEPT", 1), ("MOST", 2), ("BUSY_S", 0.1)):
+    for name, value in (("IDLE_CONNECTIONS", 1), ("MOST", 2), ("BUSY_S", 0.1)):
         monkeypatch.setattr(postgres, name, value)
     few = reach_database(postgres_url)
-    with few.read(), few.read(), pytest.raises(StoreLocked, match="all connections"), few.read():
+    with few.read(), few.read(), pytest.raises(StoreLocked, match="All connections"), few.read():
         pytest.fail("there are two")
     with few.read() as connection:
         assert list_maps(connection) == []

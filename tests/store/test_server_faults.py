@@ -27,10 +27,10 @@ def served(postgres_url: str) -> Iterator[Database]:
     ("state", "kind", "said"),
     [
         ("55P03", errors.StoreLocked, "Another process has been writing for too long"),
-        ("40001", errors.StoreLocked, "Another transaction was in the way"),
-        ("40P01", errors.StoreLocked, "Another transaction was in the way"),
+        ("40001", errors.StoreLocked, "The transaction conflicted with another"),
+        ("40P01", errors.StoreLocked, "The transaction conflicted with another"),
         ("53100", errors.StoreFull, "Free some space on the disk of the server"),
-        ("53200", errors.UnusableStore, "Look into its log"),
+        ("53200", errors.UnusableStore, "Check its log"),
         ("53300", errors.StoreAway, "max_connections"),
         ("25006", errors.ReadOnlyStore, "target_session_attrs=read-write"),
         ("25P03", errors.UnusableStore, "was idle for too long"),
@@ -38,7 +38,7 @@ def served(postgres_url: str) -> Iterator[Database]:
         ("57P01", errors.StoreAway, "service tries again"),
         ("08006", errors.StoreAway, "service tries again"),
         ("28P01", errors.UnusableStore, "Check user and password"),
-        ("42501", errors.UnusableStore, "grant the ownership"),
+        ("42501", errors.UnusableStore, "Make it their owner"),
         ("58030", errors.UnusableStore, "cannot use its files"),
         ("XX001", errors.UnusableStore, "Restore a bundle"),
     ],
@@ -144,7 +144,7 @@ def test_a_table_that_is_changed_elsewhere_costs_one_try(
             assert [one.execute(asked).all(), other.execute(asked).all()] == [[], []]
     postgres.execute("ALTER TABLE changing ALTER a TYPE bigint", name)
     with (
-        pytest.raises(errors.StoreLocked, match="Tables were changed meanwhile, and nothing was"),
+        pytest.raises(errors.StoreLocked, match="The tables were changed meanwhile"),
         served.write(turn=False) as one,
     ):
         one.execute(asked)

@@ -27,7 +27,7 @@ from sceneprint.models import parse_model
 from sceneprint.store import Store
 from sceneprint.store.copy_rows import (
     COLUMNS,
-    COPIED,
+    COPIED_COLUMNS,
     CopiedFrame,
     add_copied,
     copied_rows,
@@ -298,7 +298,7 @@ def _write(
     before = {name: row for part in pull.own.values() for name, row in part.items()}
     written = [_copied(head, row) for name, row in rows.items() if before.get(name) != row]
     blobs: list[str] = []
-    with store.blobs.kept(), store.database.write() as connection:
+    with store.blobs.block_removals(), store.database.write() as connection:
         store_model(connection, head.model_id, head.model, model)
         row = _prepare_map(store, connection, head, blobs)
         existing = living_rows(connection, row)
@@ -311,9 +311,10 @@ def _write(
             blobs += delete_frames(connection, row, some)
         remaining = existing.keys() - {one.id for one in renewed}
         for one in written:
-            if not store.blobs.holds(one.made.geometry):
+            if not store.blobs.holds(one.signature.geometry):
                 raise DamagedBlob(
-                    f"The artifact {one.made.geometry[:12]} was just removed. Pull the map again."
+                    f"The artifact {one.signature.geometry[:12]} was just removed. Pull the map "
+                    "again."
                 )
             if one.id in remaining:
                 edit_copied(connection, row, existing[one.id], one)
@@ -333,7 +334,7 @@ def _copied(head: MapCopy, row: Row) -> CopiedFrame:
     }
     own = (values[one] for one in ("vector", "geometry", "n_patches", "n_pairs"))
     signature = StoredSignature(head.model_id, *own)
-    return CopiedFrame(name, {one: values[one] for one in COPIED}, signature)
+    return CopiedFrame(name, {one: values[one] for one in COPIED_COLUMNS}, signature)
 
 
 def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:

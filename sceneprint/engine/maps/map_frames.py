@@ -32,8 +32,8 @@ from sceneprint.pictures import (
 from sceneprint.signing import hierarchy_of, see
 from sceneprint.store import Store, frame_queries
 from sceneprint.store.frame_queries import (
+    CapturePosition,
     RunSummary,
-    TakenPosition,
     count_run,
     list_runs,
     poses_of_run,
@@ -168,13 +168,13 @@ def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
     return f"{sealed}~{_packed([last.captured_at, last.sequence])}"
 
 
-def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> TakenPosition | None:
+def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> CapturePosition | None:
     """Return the position in a cursor; raise InvalidRequest if the service did not issue it."""
     if cursor is None:
         return None
     if wanted.order != "taken":
         number = store.seals.row("frame", cursor)
-        return None if number is None else TakenPosition(number, None, None)
+        return None if number is None else CapturePosition(number, None, None)
     sealed, _, values = cursor.partition("~")
     number = store.seals.row("frame", sealed)
     try:
@@ -187,7 +187,7 @@ def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> Take
         is_time = is_place = False
     if number is None or not (is_time and is_place):
         raise invalid_cursor(cursor)
-    return TakenPosition(number, at, sequence)
+    return CapturePosition(number, at, sequence)
 
 
 def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:

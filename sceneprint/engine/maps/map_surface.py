@@ -261,7 +261,7 @@ class MapSurfaces:
             name = _parent_name(surface, parent)
             if surface is None or name is None:
                 return Page[SurfaceSighting](items=[])
-            rows = stored.frames_taken_in(
+            rows = stored.frames_captured_in(
                 connection, surface, name, ends[0], ends[1], beyond, limit + 1
             )
         last = rows[limit - 1] if len(rows) > limit else None

@@ -21,7 +21,7 @@ from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import InvalidRequest, UnknownSession
 from sceneprint.store import Store
 from sceneprint.store.deletion import delete_frames
-from sceneprint.store.frame_queries import TakenPosition, count_listed, list_frames
+from sceneprint.store.frame_queries import CapturePosition, count_listed, list_frames
 from sceneprint.store.frames import write_frame
 from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
@@ -156,7 +156,7 @@ def _selected(
 ) -> list[FrameRow]:
     """Return the next selected frames in the order of uploads."""
     if selection.filter is not None:
-        beyond = TakenPosition(after, None, None)
+        beyond = CapturePosition(after, None, None)
         return list_frames(connection, row.number, beyond, limit, _in_order(selection))
     statement = select(frames).where(
         frames.c.map_number == row.number, frames.c.id.in_(selection.frame_ids or []),

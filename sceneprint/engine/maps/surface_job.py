@@ -302,7 +302,7 @@ class SurfaceHandler:
         """Extend the time scale of a surface to frames outside of its range."""
 
         def write(connection: Connection) -> Collection[str]:
-            times = stored.taken_range(connection, surface)
+            times = stored.capture_range(connection, surface)
             if times is not None:
                 scale = time_scale(*times)
                 stored.write_surface(

@@ -1,1 +1,1 @@
-"""Content-addressed bytes in a folder or an object store."""
+"""Storage of content-addressed bytes in a folder or an object store."""

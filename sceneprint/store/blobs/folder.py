@@ -1,4 +1,4 @@
-"""Blobs: their interface, and blobs in a folder that survive a power failure."""
+"""Interface of blob storage, and durable storage in a folder."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ from sceneprint.atomic_files import (
 from sceneprint.errors import DamagedBlob, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import unusable
 
-# One lock for all processes that share the blobs: shared by those that need them, exclusive for
-# removals. The lock of a process that dies is released at once, by the kernel or the server.
+# All processes that share the blobs use one lock: shared while they need the blobs, exclusive for
+# removals. The kernel or the server releases the lock of a process that dies.
 
-#: Seconds to wait for the end of a removal: with a turn to write, and without one.
+#: Time limits for the end of a removal, with and without a turn to write, seconds.
 TURN_S, REMOVAL_S = 5.0, 25.0
-#: Seconds after which a removal has ended, even of a dead process: it sends no request after
-#: REMOVAL_S, and each ends within `object_client.TRIED_S` and `SMALL_S`.
+#: Seconds after which each removal has ended, even that of a dead process: it sends no request
+#: after REMOVAL_S, and each request ends within `object_client.TRIED_S` and `SMALL_S`.
 LONGEST_S = 90.0
 #: Seconds between two attempts to take the lock of a folder.
 _LOOK_S = 0.01
 
 
 class Locks(ABC):
-    """The lock of some blobs; see `Blobs.kept` and `Blobs.removing`."""
+    """Lock of a blob storage; see `Blobs.block_removals` and `Blobs.removing`."""
 
     @abstractmethod
-    def kept(self) -> AbstractContextManager[None]:
-        """Hold the lock with other processes that need all blobs."""
+    def block_removals(self) -> AbstractContextManager[None]:
+        """Hold the lock together with other processes that need all blobs."""
 
     @abstractmethod
     def removing(self) -> AbstractContextManager[bool]:
-        """Hold the lock exclusively, if it is free at once."""
+        """Hold the lock exclusively if it is free, and yield whether it is."""
 
     @property
     def outlast_turns(self) -> bool:
@@ -56,24 +56,24 @@ class Locks(ABC):
         return False
 
     def removals(self) -> int | None:
-        """Return a number that every removal changes; None if unknown, or during a removal."""
+        """Return a number that each removal changes; None if unknown, or during a removal."""
         return None
 
     def mark_uncertain(self) -> None:  # noqa: B027  (removals from a folder end at once)
-        """Leave this thread's removal unfinished: its requests may still be carried out."""
+        """Mark this thread's removal as unfinished, since its requests may still be executed."""
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: B027  (most have none)
-        """Wait for the end of a removal whose turn is over, unless its process died.
+        """Wait for the end of a removal whose turn is over, unless its process has died.
 
         Parameters
         ----------
-        digest : the only blob to wait for; None: any
-        seconds : maximum seconds to wait
+        digest : blob whose removal to wait for; None waits for all removals
+        seconds : maximum duration of the wait
 
         Raises
         ------
-        StoreLocked : the removal takes longer.
-        UnusableStore : the state of the removal is unknown.
+        StoreLocked : If the removal takes longer.
+        UnusableStore : If the state of the removal is unknown.
         """
 
     def close(self) -> None:  # noqa: B027  (most hold nothing)
@@ -81,7 +81,7 @@ class Locks(ABC):
 
 
 class FileLocks(Locks):
-    """The lock of the processes of one machine, on a folder or on a file.
+    """Lock for the processes of one machine, on a folder or a file.
 
     Parameters
     ----------
@@ -93,15 +93,15 @@ class FileLocks(Locks):
         self._flags = os.O_RDWR | os.O_CREAT if make else os.O_RDONLY | os.O_DIRECTORY
 
     @contextmanager
-    def kept(self) -> Iterator[None]:
-        """See `Locks`; raise UnusableStore if the lock cannot be taken."""
+    def block_removals(self) -> Iterator[None]:
+        """See `Locks`. Raise UnusableStore if the lock cannot be taken."""
         try:
             descriptor = self._lock(fcntl.LOCK_SH)
         except OSError as error:
             kind = "folder" if self._flags & os.O_DIRECTORY else "file"
             raise UnusableStore(
-                f"{self._path}: the {kind} cannot be locked ({error.strerror}). Stop the "
-                "service and copy the data folder as it is."
+                f"{self._path}: The {kind} cannot be locked ({error.strerror}). Stop the "
+                "service, and copy the data folder."
             ) from error
         try:
             yield
@@ -113,7 +113,7 @@ class FileLocks(Locks):
         """See `Locks`."""
         try:
             descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # in use, or the file system has no locks: remaining blobs do no harm
+        except OSError:  # the lock is in use or not supported, and remaining blobs are harmless
             yield False
             return
         try:
@@ -122,26 +122,26 @@ class FileLocks(Locks):
             os.close(descriptor)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
-        """See `Locks`: a removal within a turn may outlast it if a server ends the turn early."""
+        """See `Locks`. A removal outlasts its turn if a server ends the turn early."""
         until = time.monotonic() + seconds
         while True:
             try:
                 os.close(self._lock(fcntl.LOCK_SH | fcntl.LOCK_NB))
             except BlockingIOError:
                 pass
-            except OSError:  # the file system has no locks, so there are no removals
+            except OSError:  # without locks in the file system, there are no removals
                 return
             else:
                 return
             if time.monotonic() > until:
                 raise StoreLocked(
-                    f"{self._path}: another process has been removing blobs for longer than "
-                    f"{seconds:.0f} s, and nothing was stored. Try again later."
+                    f"{self._path}: Another process has been removing blobs for more than "
+                    f"{seconds:.0f} s. Nothing was stored. Try again later."
                 )
             time.sleep(_LOOK_S)
 
     def _lock(self, how: int) -> int:
-        # a descriptor for each call: flock then excludes other threads as well
+        # flock excludes other threads only with a separate descriptor for each call
         descriptor = os.open(self._path, self._flags | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(descriptor, how)
@@ -151,33 +151,33 @@ class FileLocks(Locks):
         return descriptor
 
 
-# Blobs: bytes under the SHA-256 of their content, durable before anything refers to them, in a
-# folder (folder.py) or an object store (object_store.py).
+# Blobs are bytes under the SHA-256 of their content, in a folder (folder.py) or an object store
+# (object_store.py). They are durable before a row refers to them.
 #
 # bytes  --put-->  digest  --get-->  the same bytes, or an error
 
 
 class IncomingBlob:
-    """A blob written in parts; see `Blobs.incoming`.
+    """Blob that is written in parts; see `Blobs.incoming`.
 
     Parameters
     ----------
     file : file to write to
-    what : text of errors
+    what : beginning of error messages
     keep : function that makes the file durable under its digest
     """
 
     def __init__(self, file: BinaryIO | FileIO, what: str, keep: Callable[[str], None]) -> None:
         self._file, self._what, self._keep = file, what, keep
         self._hashed = hashlib.sha256()
-        #: Bytes written so far.
+        #: Number of written bytes.
         self.size = 0
 
     def write(self, data: bytes) -> None:
         """Append bytes."""
         try:
             left = memoryview(data)
-            while left:  # an unbuffered file may write only a part
+            while left:  # an unbuffered file may write only a part of the data
                 left = left[self._file.write(left) or 0 :]
         except OSError as error:
             raise unusable(self._what, error) from error
@@ -196,7 +196,7 @@ class IncomingBlob:
 
 Condition = Literal["sound", "missing", "damaged"]
 DIGEST = re.compile(r"[0-9a-f]{64}")
-#: Name of the file that names the owner of the blobs; see `object_store.BucketOwner`.
+#: Name of the file that states the owner of the blobs; see `object_store.BucketOwner`.
 MARK = "sceneprint.json"
 
 
@@ -206,21 +206,21 @@ def is_digest(value: object) -> bool:
 
 
 def require_digest(text: str) -> None:
-    """Raise ValueError unless a text is a digest, as it becomes part of a path or a key."""
+    """Raise ValueError unless a text is a digest, since it becomes part of a path or a key."""
     if not DIGEST.fullmatch(text):
         raise ValueError(f"{text!r} is not a digest")
 
 
 @dataclass(frozen=True)
 class BlobEntry:
-    """A file or object where blobs are stored.
+    """File or object in the blob storage.
 
     Parameters
     ----------
     place : path or URL for messages
-    digest : digest of the blob; None if it is none
-    changed_at : seconds since 1970
-    unfinished : whether a writer is writing it, or abandoned it
+    digest : digest of the blob; None for other files
+    changed_at : time of modification, seconds since 1970
+    unfinished : whether a writer is writing the file, or has abandoned it
     """
 
     place: str
@@ -230,7 +230,7 @@ class BlobEntry:
 
 
 class Blobs(ABC):
-    """Storage of blobs; safe to share between threads."""
+    """Storage of blobs, which threads may share."""
 
     def __init__(self, locks: Locks) -> None:
         self._locks = locks
@@ -245,86 +245,88 @@ class Blobs(ABC):
 
         Raises
         ------
-        StoreFull : the disk is full; nothing is left behind.
-        UnusableStore : the storage is missing or not writable.
+        StoreFull : If the disk is full; nothing is left behind.
+        UnusableStore : If the storage is missing or not writable.
         """
 
     @abstractmethod
     def incoming(self) -> AbstractContextManager[IncomingBlob]:
-        """Store a blob in parts, such as one that does not fit into memory.
+        """Store a blob in parts, for example if it does not fit into memory.
 
-        Unless `keep` is called, it is removed at the end.
+        The blob is removed at the end unless `keep` has been called.
 
         Raises
         ------
-        StoreFull, UnusableStore : see `put`; `write` and `keep` raise them as well.
+        StoreFull, UnusableStore : If the blob cannot be stored; see `put`. `write` and `keep` raise
+            them too.
         """
 
     @abstractmethod
     def get(self, digest: str) -> bytes:
-        """Return the bytes of a digest, checked against it.
+        """Return the verified bytes of a blob.
 
         Raises
         ------
-        DamagedBlob : the blob is missing or damaged.
-        UnusableStore : the storage is unreachable.
+        DamagedBlob : If the blob is missing or damaged.
+        UnusableStore : If the storage is unreachable.
         """
 
     @abstractmethod
     def open(self, digest: str) -> BinaryIO:
-        """Return a blob as a seekable file, unchecked; raise FileNotFoundError if it is missing.
+        """Return an unverified blob as a seekable file.
 
         Raises
         ------
-        OSError, UnusableStore : the blob cannot be read; reading may raise them as well.
+        FileNotFoundError : If the blob is missing.
+        OSError, UnusableStore : If the blob cannot be read. Reading the file may raise them too.
         """
 
     @abstractmethod
     def holds(self, digest: str) -> bool:
-        """Return whether a blob exists, and will for the caller's reference to it.
+        """Return whether a blob exists and will not be removed before the caller refers to it.
 
-        Call it in the transaction that writes the reference: no removal begins before the commit,
-        and this waits for the end of one that outlasts its turn.
+        Call this in the transaction that writes the reference: no removal begins before the commit,
+        and the call waits for the end of a removal that outlasts its turn.
 
         Raises
         ------
-        StoreLocked : such a removal takes too long.
-        UnusableStore : the storage is unreachable.
+        StoreLocked : If such a removal takes too long.
+        UnusableStore : If the storage is unreachable.
         """
 
     def ensure(self, digest: str, data: bytes) -> None:
-        """Store a blob again if a removal took it before the commit of a reference to it.
+        """Store a blob again if it was removed before a reference to it was committed.
 
-        No removal that begins after that commit takes it.
+        Removals that begin after that commit spare the blob.
 
         Raises
         ------
-        StoreLocked, UnusableStore : see `holds` and `put`.
+        StoreLocked, UnusableStore : If `holds` or `put` raises the error.
         """
         if not self.holds(digest):
             self.put(data)
 
     @abstractmethod
     def size(self, digest: str) -> int | None:
-        """Return the size of a blob, unchecked; None if it is missing."""
+        """Return the size of an unverified blob, bytes; None if it is missing."""
 
-    def kept(self) -> AbstractContextManager[None]:
-        """Prevent removals of blobs; wait for one in progress.
+    def block_removals(self) -> AbstractContextManager[None]:
+        """Prevent removals of blobs, after waiting for a removal in progress.
 
         The lock of a process that dies is released at once.
 
         Raises
         ------
-        UnusableStore : the lock cannot be taken.
+        UnusableStore : If the lock cannot be taken.
         """
-        return self._locks.kept()
+        return self._locks.block_removals()
 
     def removing(self) -> AbstractContextManager[bool]:
         """Hold the right to remove blobs; yield False if another process needs or removes some.
 
         Call it within a writing transaction: removals then run one at a time, and leave room for
-        processes that wait in `kept`. Hold it beyond that transaction only if `outlast_turns`, and
-        for blobs that the transaction doomed.
+        processes that wait in `block_removals`. Hold it beyond that transaction only if
+        `outlast_turns`, and for blobs that the transaction doomed.
         """
         return self._locks.removing()
 
@@ -348,22 +350,24 @@ class Blobs(ABC):
 
         Parameters
         ----------
-        digest : text; one that is not a digest counts as missing
+        digest : digest; other texts count as missing
         quick : whether to check only that the blob exists
 
         Raises
         ------
-        UnusableStore : this user may not read the blob, or the storage is unreachable.
+        UnusableStore : If this user may not read the blob, or the storage is unreachable.
         """
 
     @abstractmethod
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Move a damaged blob away durably, and return its new path; None if it is missing.
+        """Durably move a damaged blob, and return its new path; None if the blob is missing.
+
+        Call this within `removing`.
 
         Parameters
         ----------
-        digest : blob; call this within `removing`
-        folder : destination, created if missing
+        digest : digest of the blob
+        folder : destination, which is created if missing
         """
 
     @abstractmethod
@@ -372,11 +376,11 @@ class Blobs(ABC):
 
     @abstractmethod
     def digests(self) -> Iterator[str]:
-        """Yield the digests of all blobs, in no order."""
+        """Yield the digests of all blobs in arbitrary order."""
 
     @abstractmethod
     def entries(self) -> Iterator[BlobEntry]:
-        """Yield everything where blobs are stored, in no order."""
+        """Yield all files or objects in the blob storage in arbitrary order."""
 
     @property
     def read_only(self) -> bool:
@@ -384,11 +388,11 @@ class Blobs(ABC):
         return False
 
     def check(self) -> None:  # noqa: B027
-        """Check that a network storage answers, or did two seconds ago; do nothing for a folder.
+        """Check that a network storage is reachable, or was so two seconds ago.
 
         Raises
         ------
-        UnusableStore : it does not answer.
+        UnusableStore : If the storage does not answer.
         """
 
     def close(self) -> None:
@@ -396,37 +400,37 @@ class Blobs(ABC):
         self._locks.close()
 
 
-#: Names of unfinished files, which killed writers leave behind.
+#: Pattern of the names of unfinished files, which remain if a writer is killed.
 PART = re.compile(r"\.[0-9a-f]{12}\.part")
 
 
 class FolderBlobs(Blobs):
-    """Blobs in 256 subfolders of a folder, named by their first two digits.
+    """Blobs in 256 subfolders of a folder, named by the first two digits of the digests.
 
     Parameters
     ----------
-    folder : folder
-    make : whether to create it if it is missing
+    folder : parent of the subfolders
+    make : whether to create a missing folder
 
     Raises
     ------
-    UnusableStore : the folder cannot be created.
+    UnusableStore : If the folder cannot be created.
     """
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
-        # the folder itself is the lock, so there is no file to create or remove
+        # the folder itself is the lock, so no lock file is needed
         super().__init__(FileLocks(folder))
         self._folder = folder
-        self._durable: set[str] = set()  # subfolders that are durable
+        self._durable: set[str] = set()  # names of subfolders that are known to be durable
         try:
             if make:
                 make_folder(folder)
         except OSError as error:
-            raise unusable(f"{folder}: the folder cannot be created", error) from error
+            raise unusable(f"{folder}: The folder cannot be created", error) from error
 
     @property
     def read_only(self) -> bool:
-        """Whether the folder exists and is not writable, such as on a remounted disk."""
+        """Whether the folder exists and is not writable, for example on a remounted disk."""
         return self._folder.is_dir() and not os.access(self._folder, os.W_OK)
 
     def put(self, data: bytes) -> str:
@@ -437,7 +441,7 @@ class FolderBlobs(Blobs):
             new = self._ensure_folder(path.parent)
             write_durable(path, data, folder_is_new=new)
         except OSError as error:
-            raise unusable(f"{self._folder}: a blob cannot be written", error) from error
+            raise unusable(f"{self._folder}: A blob cannot be written", error) from error
         self._durable.add(path.parent.name)
         return digest
 
@@ -445,7 +449,7 @@ class FolderBlobs(Blobs):
     def incoming(self) -> Iterator[IncomingBlob]:
         """See `Blobs.incoming`."""
         part = self._folder / f".{secrets.token_hex(6)}.part"
-        what = f"{self._folder}: a blob cannot be written"
+        what = f"{self._folder}: A blob cannot be written"
         try:
             file = FileIO(create_private(part), "wb")
         except OSError as error:
@@ -467,7 +471,7 @@ class FolderBlobs(Blobs):
         sync_folder(self._folder)
 
     def _ensure_folder(self, folder: Path) -> bool:
-        """Create a folder if missing; return whether it may not be durable yet."""
+        """Create a missing folder, and return whether it may not be durable yet."""
         try:
             folder.mkdir(PRIVATE_FOLDER)
         except FileExistsError:
@@ -485,14 +489,14 @@ class FolderBlobs(Blobs):
             ) from error
         if hashlib.sha256(data).hexdigest() != digest:
             raise DamagedBlob(
-                f"The blob {digest[:12]} is damaged: its content has another hash. Restore the "
+                f"The blob {digest[:12]} is damaged: its content has a different hash. Restore the "
                 "data folder from a copy, or delete the frame and upload it again."
             )
         return data
 
     def holds(self, digest: str) -> bool:
         """See `Blobs.holds`."""
-        self._locks.wait(digest, TURN_S)  # a removal may continue although its turn was lost
+        self._locks.wait(digest, TURN_S)  # a removal may continue after it lost its turn
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:
@@ -523,10 +527,10 @@ class FolderBlobs(Blobs):
             return "missing"
         except PermissionError as error:
             raise UnusableStore(
-                f"{self.path(digest)}: this user may not read the blob. Run the command as the "
+                f"{self.path(digest)}: This user may not read the blob. Run the command as the "
                 "user who owns the data folder."
             ) from error
-        except OSError:  # a disk error, or a folder with its name
+        except OSError:  # a disk error, or a folder with the name of the blob
             pass
         return "damaged"
 
@@ -560,7 +564,7 @@ class FolderBlobs(Blobs):
                         yield name
 
     def entries(self) -> Iterator[BlobEntry]:
-        """See `Blobs.entries`; files that vanish meanwhile are skipped."""
+        """See `Blobs.entries`. Files that are removed meanwhile are skipped."""
         folders = [self._folder]
         while folders:
             with os.scandir(folders.pop()) as entries:
@@ -580,6 +584,6 @@ class FolderBlobs(Blobs):
                     yield BlobEntry(entry.path, entry.name if own else None, changed_at, part)
 
     def path(self, digest: str) -> Path:
-        """Return the path of a blob; raise ValueError for a text that is not a digest."""
+        """Return the path of a blob. Raise ValueError for a text that is not a digest."""
         require_digest(digest)
         return self._folder / digest[:2] / digest

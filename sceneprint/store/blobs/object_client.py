@@ -1,11 +1,11 @@
-"""Object stores by URL: bytes under keys, in a store of another operator.
+"""Client for object stores: bytes under keys, below a URL.
 
-    URL  --open_objects-->  Objects  --put | get | list | delete-->  a store
+    URL  --open_objects-->  Objects  --put | get | list | delete-->  object store
 
-Every call ends: each request has a time limit, and so have all its attempts together. After a store
-was found unreachable, calls fail at once for a moment. Large objects are sent in parts, so that
-memory is bounded. Messages contain the store and its error, never a key or a token, which the
-library's own messages may contain.
+There are time limits for each request and for all its attempts together. After a store was
+unreachable, calls fail immediately for a moment. Large objects are sent in parts to limit memory.
+Error messages contain the URL and the reason, but no credentials, which messages of the library may
+contain.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
 
-#: Minimum number of bytes to fetch at once.
+#: Minimum number of bytes that are fetched at once.
 AHEAD = 1 << 20
 
 
 class RangeFile(io.RawIOBase):
-    """A remote file that is read in ranges; see `buffered`.
+    """Remote file that is read in ranges; see `buffered`.
 
     Parameters
     ----------
-    size : size in bytes
-    fetch : function that returns a number of bytes from a position
+    size : size of the file, bytes
+    fetch : function that takes a position and a number of bytes, and returns these bytes
     """
 
     def __init__(self, size: int, fetch: Callable[[int, int], bytes]) -> None:
@@ -49,7 +49,7 @@ class RangeFile(io.RawIOBase):
 
     @classmethod
     def buffered(cls, size: int, fetch: Callable[[int, int], bytes]) -> BinaryIO:
-        """Return a file with a buffer, so that small reads send no request each."""
+        """Return a buffered file, which combines small reads into one request."""
         return cast("BinaryIO", io.BufferedReader(cls(size, fetch), AHEAD))
 
     def readable(self) -> bool:
@@ -61,10 +61,10 @@ class RangeFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Move the position, possibly beyond the end."""
+        """Set the position, which may be beyond the end, and return it."""
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size}[whence]
         if base + offset < 0:
-            raise ValueError("before the beginning")
+            raise ValueError("the position is negative")
         self._place = base + offset
         return self._place
 
@@ -83,13 +83,14 @@ class RangeFile(io.RawIOBase):
         return length
 
 
-#: Maximum bytes of a request, above which objects are sent in parts, and concurrent parts.
+#: Maximum size of a request, beyond which objects are sent in parts, bytes; and number of
+#: concurrent parts.
 PART, AT_ONCE = 8 << 20, 3
 #: Maximum number of parts of an object.
 MOST_PARTS = 9_000
 #: Maximum number of keys in one request to remove objects.
 MOST_KEYS = 500
-#: Seconds for which calls fail at once after a store was found unreachable.
+#: Seconds for which calls fail immediately after a store was unreachable.
 AWAY_S = 1.0
 _REFUSED = ("PermissionDeniedError", "UnauthenticatedError")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
@@ -103,13 +104,13 @@ _REASON = re.compile(
 
 @dataclass(frozen=True)
 class ListedObject:
-    """An object in a store's list.
+    """Object in a list of a store.
 
     Parameters
     ----------
-    key : key within the store's prefix
-    size : bytes
-    changed_at : seconds since 1970, by the store's clock
+    key : key below the store's prefix
+    size : size of the object, bytes
+    changed_at : time of modification by the store's clock, seconds since 1970
     """
 
     key: str
@@ -118,18 +119,18 @@ class ListedObject:
 
 
 class Objects:
-    """Bytes under keys, below the prefix of a URL; safe to share between threads.
+    """Bytes under keys below the prefix of a URL, which threads may share.
+
+    All methods raise UnusableStore if the store is unreachable or refuses the request, and
+    StoreFull if the store is full.
 
     Parameters
     ----------
     small, large : clients for requests of few and of many bytes
     once : client for requests that must not be repeated
     url : URL for messages
-    variables : environment variables of its configuration, for messages
-    folder : folder, if the store is one
-
-    Every method raises UnusableStore if the store is unreachable or refuses the request, and
-    StoreFull if it is full.
+    variables : names of the environment variables that configure the store, for messages
+    folder : path of the store if it is a folder
     """
 
     def __init__(
@@ -140,20 +141,20 @@ class Objects:
         self._variables = variables
         #: URL for messages, without credentials.
         self.url = url
-        self._away = (0.0, "")  # end of the pause, and the store's message
+        self._away = (0.0, "")  # end of the pause after a failure, and the reason of the failure
 
     def put(self, key: str, data: bytes, *, create: bool = False) -> bool:
-        """Store bytes under a key; the store has acknowledged them on return.
+        """Store bytes under a key, and return after the store has acknowledged them.
 
         Parameters
         ----------
-        key : key within the prefix
-        data : bytes, which replace those under the key
-        create : whether to store them only if the key is new
+        key : key below the prefix
+        data : bytes, which replace an existing object
+        create : whether to store the bytes only if no object exists
 
         Returns
         -------
-        done : False if `create` found an object
+        done : False if `create` is set and an object exists
         """
         import obstore
         from obstore.exceptions import AlreadyExistsError
@@ -173,12 +174,12 @@ class Objects:
         return True
 
     def put_file(self, key: str, file: Path | BinaryIO) -> None:
-        """Store a file under a key, in parts; the object appears whole or not at all.
+        """Store a file under a key in parts; the object appears completely or not at all.
 
         Parameters
         ----------
-        key : key within the prefix
-        file : file, read from its position to its end
+        key : key below the prefix
+        file : path, or open file that is read from its position to its end
         """
         import obstore
 
@@ -197,7 +198,7 @@ class Objects:
             self._make_durable(key)
 
     def get(self, key: str) -> bytes:
-        """Return the bytes under a key; raise FileNotFoundError if there are none."""
+        """Return the bytes under a key. Raise FileNotFoundError if there is no object."""
         import obstore
 
         with self._explained(f"{key} cannot be read"):
@@ -205,16 +206,16 @@ class Objects:
             size = answer.meta["size"]
             if size <= 1 << 20:
                 return bytes(answer.bytes())
-            del answer  # each part gets a request of its own, with its own time limit
+            del answer  # each part is requested separately, with its own time limit
         return b"".join(self.chunks(key, size))
 
     def read_range(self, key: str, start: int, length: int) -> bytes:
-        """Return a range of an object; raise FileNotFoundError if it does not exist.
+        """Return a range of an object. Raise FileNotFoundError if it does not exist.
 
         Parameters
         ----------
-        key : key within the prefix
-        start, length : range within the object; `length` is positive
+        key : key below the prefix
+        start, length : range within the object, bytes; `length` must be positive
         """
         import obstore
 
@@ -222,18 +223,18 @@ class Objects:
             data = obstore.get_range(self._large, key, start=start, length=length)
         if len(data) != length:
             raise UnusableStore(
-                f"{self.url}: {key} cannot be read (it ended early). Another program changed it "
-                "meanwhile: try again."
+                f"{self.url}: {key} cannot be read, because another program changed it meanwhile. "
+                "Try again."
             )
         return bytes(data)
 
     def chunks(self, key: str, size: int | None = None) -> Iterator[bytes]:
-        """Yield the parts of an object in order; raise FileNotFoundError if it does not exist.
+        """Yield the parts of an object in order. Raise FileNotFoundError if it does not exist.
 
         Parameters
         ----------
-        key : key within the prefix
-        size : size of the object, if known
+        key : key below the prefix
+        size : size of the object, bytes, if known
         """
         total = self.size(key) if size is None else size
         if total is None:
@@ -242,13 +243,13 @@ class Objects:
             yield self.read_range(key, start, min(PART, total - start))
 
     def get_file(self, key: str, path: Path) -> None:
-        """Write an object to a new file; raise FileNotFoundError if it does not exist."""
+        """Write an object to a new file. Raise FileNotFoundError if the object does not exist."""
         with os.fdopen(create_private(path), "wb") as file:
             for chunk in self.chunks(key):
                 file.write(chunk)
 
     def open(self, key: str) -> BinaryIO:
-        """Return an object as a seekable file; raise FileNotFoundError if it does not exist."""
+        """Return an object as a seekable file. Raise FileNotFoundError if it does not exist."""
         size = self.size(key)
         if size is None:
             raise FileNotFoundError(key)
@@ -268,12 +269,12 @@ class Objects:
         return ListedObject(key, one["size"], one["last_modified"].timestamp())
 
     def size(self, key: str) -> int | None:
-        """Return the bytes of an object; None if it does not exist."""
+        """Return the size of an object, bytes; None if it does not exist."""
         listed = self.head(key)
         return None if listed is None else listed.size
 
     def list(self, prefix: str) -> Iterator[ListedObject]:
-        """Yield the objects whose keys begin with a prefix, by pages, in the store's order."""
+        """Yield the objects whose keys start with a prefix, page by page, in the store's order."""
         import obstore
 
         pages = iter(obstore.list(self._small, prefix, chunk_size=1000))
@@ -286,14 +287,14 @@ class Objects:
                 yield ListedObject(one["path"], one["size"], one["last_modified"].timestamp())
 
     def delete(self, *keys: str, seconds: float = math.inf, once: bool = False) -> None:
-        """Remove objects; ignore missing ones.
+        """Remove objects, and ignore missing objects.
 
         Parameters
         ----------
-        keys : keys within the prefix
-        seconds : time after which no request is sent; StoreAway is raised if keys are left
-        once : whether not to repeat failed requests: an unanswered one may be carried out after its
-            repetition, unnoticed
+        keys : keys below the prefix
+        seconds : time limit; StoreAway is raised if keys remain
+        once : whether to send each request only once, because a store may execute an unanswered
+            request after its repetition
         """
         import obstore
 
@@ -308,14 +309,14 @@ class Objects:
                 except FileNotFoundError as error:
                     if _NO_BUCKET.search(str(error)):
                         raise
-                    if len(block) > 1:  # the store stopped at the first missing object
+                    if len(block) > 1:  # the store stops at the first missing object
                         for key in block:
                             if time.monotonic() > until:
                                 raise self._error(key, "too slow", StoreAway) from None
                             self.delete(key, once=once)
 
     def _make_durable(self, key: str) -> None:
-        """Sync an object in a folder, as the library does not."""
+        """Sync an object in a folder, which the library does not do."""
         if self._folder is None:
             return
         path = self._folder / key
@@ -349,12 +350,12 @@ class Objects:
             reason = error.strerror
         refused = type(error).__name__ in _REFUSED or re.search(r"\b40[13]\b", reason)
         if _FULL.search(text):
-            return StoreFull(f"{self.url}: {what} ({reason}). The store is full: free some space.")
+            return StoreFull(f"{self.url}: {what} ({reason}). The store is full. Free some space.")
         if refused:
             return UnusableStore(
-                f"{self.url}: {what} ({reason}). The store refuses access: check that the "
-                f"credentials in the environment ({self._variables}) allow to read, write, list "
-                "and delete."
+                f"{self.url}: {what} ({reason}). The store denies access. Check that the "
+                f"credentials in the environment ({self._variables}) allow reading, writing, "
+                "listing and deleting."
             )
         if not re.match(r"4\d\d ", reason) and self._folder is None:
             self._away = (time.monotonic() + AWAY_S, reason)
@@ -365,18 +366,18 @@ class Objects:
         self, what: str, reason: str, kind: type[UnusableStore] = UnusableStore
     ) -> UnusableStore:
         return kind(
-            f"{self.url}: {what} ({reason}). Check that the store exists and can be reached from "
-            f"here, and its settings in the environment ({self._variables})."
+            f"{self.url}: {what} ({reason}). Check that the store exists and is reachable from "
+            f"this machine, and check its settings in the environment ({self._variables})."
         )
 
 
-# Opening a store. Credentials and settings come from the environment only.
+# Access to a store. Credentials and settings come only from the environment.
 
-#: Time limits of connections, small requests, parts, and of repetitions, seconds.
+#: Time limits for connections, small requests, parts, and all repetitions, seconds.
 CONNECT_S, SMALL_S, PART_S, TRIED_S = 3, 10, 60, 8
 #: Maximum number of repetitions of a request.
 RETRIES = 8
-#: Schemes of URLs, and the prefixes of the environment variables that configure the store.
+#: Prefix of the environment variables that configure a store, by scheme of its URL.
 VARIABLES = {
     "s3": "AWS_", "s3a": "AWS_", "gs": "GOOGLE_", "az": "AZURE_", "azure": "AZURE_",
     "abfs": "AZURE_", "abfss": "AZURE_", "file": "", "memory": "",
@@ -385,16 +386,16 @@ _ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 
 
 def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
-    """Check that a URL names an object store, without credentials.
+    """Check that a URL is that of an object store, and contains no credentials.
 
     Parameters
     ----------
     url : URL such as s3://bucket/prefix
-    setting : name of the setting, for messages, which omit the URL: it may contain a password
+    setting : name of the setting for messages, which omit the URL since it may contain a password
 
     Raises
     ------
-    UnusableStore : the URL is not valid.
+    UnusableStore : If the URL is not valid.
     """
     try:
         parts = urlsplit(url)
@@ -403,8 +404,8 @@ def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
         named, netloc, parts = "", "", urlsplit("")
     if "@" in netloc or parts.query or parts.fragment:
         raise UnusableStore(
-            f"{setting} holds a user, a password or a query. Credentials are read only from the "
-            "environment (AWS_..., GOOGLE_..., AZURE_...): leave them out of it."
+            f"{setting} contains a user, a password or a query. Set credentials only in the "
+            "environment (AWS_..., GOOGLE_..., AZURE_...)."
         )
     steps = unquote(parts.path).split("/")
     wrong = any(one in (".", "..") for one in steps) or not unquote(parts.path).isprintable()
@@ -413,8 +414,9 @@ def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
         named in lacking and netloc
     ):  # fmt: skip
         raise UnusableStore(
-            f"{setting} names no object store. Set it to s3://bucket/prefix, gs://bucket/prefix, "
-            "az://account/container/prefix, file:///folder, or memory:/// to try."
+            f"{setting} is not the URL of an object store. Set it to s3://bucket/prefix, "
+            "gs://bucket/prefix, az://account/container/prefix, file:///folder, or memory:/// for "
+            "a test."
         )
 
 
@@ -429,7 +431,7 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
 
     Raises
     ------
-    UnusableStore : the URL is not valid, or the store cannot be opened with this environment.
+    UnusableStore : If the URL is not valid, or the store cannot be opened with this environment.
     """
     check_url(url, setting)
     try:
@@ -437,15 +439,15 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
         from obstore.store import LocalStore, MemoryStore, from_url
     except ImportError as error:
         raise UnusableStore(
-            f"{setting} needs obstore, which cannot be imported here ({error}). Install it: "
+            f"{setting} requires obstore, which cannot be imported ({error}). Install it: "
             "pip install obstore"
         ) from error
     kind, url = url.partition(":")[0].lower(), url.rstrip("/")
     plain = [name for name in _ENDPOINTS if os.environ.get(name, "").startswith("http://")]
     if kind.startswith("s3") and plain and not _allows_http():
         raise UnusableStore(
-            f"{plain[0]} names a server without TLS. Set AWS_ALLOW_HTTP=true if the network is "
-            "trusted, or use https://."
+            f"{plain[0]} is the URL of a server without TLS. Use https://, or set "
+            "AWS_ALLOW_HTTP=true if the network is trusted."
         )
     if kind == "memory":
         memory = MemoryStore()
@@ -456,7 +458,7 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
             make_folder(folder)
         except OSError as error:
             raise UnusableStore(
-                f"{folder}: the folder cannot be created ({error.strerror}). Check its permissions."
+                f"{folder}: The folder cannot be created ({error.strerror}). Check its permissions."
             ) from error
         local = LocalStore(folder)
         return Objects(local, local, local, url, folder=folder)
@@ -468,15 +470,15 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
     except (BaseError, ValueError) as error:
         reason = str(error).partition("\n")[0]
         raise UnusableStore(
-            f"{url}: the store cannot be opened ({reason:.200}). Check {setting} and the variables "
-            f"{VARIABLES[kind]}... of the environment."
+            f"{url}: The store cannot be opened ({reason:.200}). Check {setting} and the "
+            f"environment variables {VARIABLES[kind]}..."
         ) from None
     return Objects(small, large, once, url, f"{VARIABLES[kind]}...")
 
 
 def _client(seconds: int) -> ClientConfig:
     return {
-        "allow_http": _allows_http(),  # overrides the library's own setting
+        "allow_http": _allows_http(),  # this overrides the setting of the library
         "connect_timeout": timedelta(seconds=CONNECT_S),
         "timeout": timedelta(seconds=seconds),
         "user_agent": "sceneprint",
@@ -496,11 +498,11 @@ def _retries(most: int) -> RetryConfig:
 
 
 def check_objects(objects: Objects) -> float:
-    """Write, read and remove a small object; return the seconds it took.
+    """Write, read and remove a small object, and return the duration, seconds.
 
     Raises
     ------
-    UnusableStore : an operation failed, or returned other bytes.
+    UnusableStore : If an operation fails, or returns different bytes.
     """
     key, data = f"check/{os.urandom(8).hex()}", os.urandom(64)
     begun = time.perf_counter()
@@ -513,7 +515,7 @@ def check_objects(objects: Objects) -> float:
         objects.delete(key)
     if not same:
         raise UnusableStore(
-            f"{objects.url}: an object that was read after it was written has other bytes. Use a "
-            "store that is strongly consistent, such as S3, GCS and Azure."
+            f"{objects.url}: An object that was just written returned different bytes. Use a "
+            "strongly consistent store, such as S3, GCS or Azure."
         )
     return time.perf_counter() - begun

@@ -1,10 +1,10 @@
-"""Blobs in an object store that a fleet shares.
+"""Storage of blobs in an object store that a fleet shares.
 
-    PREFIX/blobs/ab/abcdef...   a blob under its digest
-    PREFIX/sceneprint.json      the database that the blobs belong to
+    PREFIX/blobs/ab/abcdef...   blob under its digest
+    PREFIX/sceneprint.json      name of the store that owns the blobs
 
-A blob appears whole or not at all, even if it is sent in parts. It is also sent if one exists,
-which may be damaged, or about to be removed.
+A blob appears completely or not at all, even if it is sent in parts. A blob is also sent if it
+exists, because the existing object may be damaged or about to be removed.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from sceneprint.store.blobs.folder import (
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.database_errors import unusable
 
-# The owner of a prefix, or of a fleet's folder: two databases on one would remove each other's
-# blobs.
+# Owner of a prefix, or of a fleet's folder. Two databases with the same prefix would remove each
+# other's blobs.
 #
 #     PREFIX/sceneprint.json   {"store": its name, "restoring": true during a restore}
 #
-# The name comes from the database's secret, so a restored store has the name of its original. A
-# restore therefore refuses a prefix in use, even one with the same name.
+# The name is derived from the database's secret, so a restored store has the name of the original.
+# A restore therefore refuses a prefix in use even if it has the same name.
 
 
 class BucketOwner:
-    """The owner's mark of a prefix.
+    """Mark that states the owner of a prefix.
 
-    Every method raises UnusableStore if the prefix belongs to another database or cannot be used.
+    All methods raise UnusableStore if the prefix belongs to another database or cannot be used.
     """
 
     def __init__(self, objects: Objects) -> None:
@@ -60,18 +60,18 @@ class BucketOwner:
 
     @classmethod
     def of_folder(cls, folder: Path) -> BucketOwner:
-        """Return the mark of a folder of blobs."""
+        """Return the mark for a folder of blobs."""
         return cls(open_objects(f"file://{quote(str(folder.absolute()))}"))
 
     def claim(self, owner: str, *, anew: bool) -> bool:
-        """Check that the prefix belongs to a store; return whether it is marked now.
+        """Check that the prefix belongs to a store, and return whether it is marked.
 
         Parameters
         ----------
         owner : name of the store
         anew : whether to mark an unclaimed prefix
         """
-        for _ in range(2):  # another process may be the first
+        for _ in range(2):  # another process may claim the prefix first
             mark = self._read()
             if mark is None:
                 if not anew:
@@ -85,23 +85,23 @@ class BucketOwner:
         return False
 
     def begin(self, owner: str, before: str) -> None:
-        """Claim the prefix for a store that is to be restored there.
+        """Claim the prefix for a store before its restore.
 
         Parameters
         ----------
         owner : name of the store
-        before : name of the empty database that it is restored to: a service may have claimed the
-            prefix with it, without using it
+        before : name of the empty database that receives the store; a service may have claimed the
+            prefix with it without using the prefix
         """
         mark = self._read()
         free = mark is not None and before != owner and mark.get("store") == before
         if mark is None or free:
             if not self._put(owner, create=mark is None, restoring=True):
-                raise self._conflict("another database")  # which claimed it at the same time
+                raise self._conflict("another database")  # it claimed the prefix at the same time
         elif mark.get("store") != owner:
             raise self._conflict("another database")
         elif mark.get("restoring") is not True:
-            raise self._conflict("the store that the snapshot was taken of, or its copy")
+            raise self._conflict("the store of the snapshot, or to a copy of it")
 
     def end(self, owner: str) -> None:
         """Record the end of the restore."""
@@ -124,26 +124,26 @@ class BucketOwner:
 
     def _conflict(self, other: str) -> UnusableStore:
         return UnusableStore(
-            f"{self._objects.url}: the blobs there belong to {other}, which would lose them to "
-            "this one. Give each database a prefix of its own in SCENEPRINT_BLOB_URL. If that "
-            f"database no longer exists, remove {MARK} there."
+            f"{self._objects.url}: The blobs belong to {other}, and this database would remove "
+            "them. Set SCENEPRINT_BLOB_URL to a different prefix for each database. If the other "
+            f"database no longer exists, remove {MARK} from the prefix."
         )
 
 
 #: Key prefix of the blobs.
 FOLDER = "blobs/"
-#: Number of stored blobs to remember, of which it is known whether any was removed since.
+#: Number of stored blobs for which this process remembers the number of earlier removals.
 _REMEMBERED = 4_096
 #: Seconds for which `check` repeats its last result.
 CHECK_S = 2.0
 
 
 class ObjectBlobs(Blobs):
-    """Blobs under the prefix of an object store.
+    """Blobs below the prefix of an object store.
 
     Parameters
     ----------
-    objects : objects under the prefix
+    objects : objects below the prefix
     locks : lock of all processes that share the prefix
     owner : function that returns the name of the blobs' store
     """
@@ -153,7 +153,7 @@ class ObjectBlobs(Blobs):
         self.objects = objects
         self._owner = owner
         self._claimed = False
-        self._put: OrderedDict[str, int] = OrderedDict()  # number of removals before, by digest
+        self._put: OrderedDict[str, int] = OrderedDict()  # number of earlier removals, by digest
         self._lock = threading.Lock()
         self._checking = threading.Lock()
         self._wrong: UnusableStore | None = None
@@ -164,7 +164,8 @@ class ObjectBlobs(Blobs):
 
         Raises
         ------
-        UnusableStore : the prefix belongs to another database, or the object store cannot be used.
+        UnusableStore : If the prefix belongs to another database, or the object store cannot be
+            used.
         """
         if not self._claimed:
             self._claimed = BucketOwner(self.objects).claim(self._owner(), anew=anew)
@@ -180,11 +181,11 @@ class ObjectBlobs(Blobs):
     def incoming(self) -> Iterator[IncomingBlob]:
         """See `Blobs.incoming`.
 
-        The blob is a temporary file without a name until its digest is known, as stores do not copy
-        objects above 5 GB from one key to another.
+        The blob is a temporary file without a name until its digest is known, because stores cannot
+        copy objects above 5 GB from one key to another.
         """
         place = tempfile.gettempdir()
-        what = f"{place}: a blob cannot be written"
+        what = f"{place}: A blob cannot be written"
         with ExitStack() as stack:
             try:
                 file = stack.enter_context(tempfile.TemporaryFile())
@@ -217,12 +218,12 @@ class ObjectBlobs(Blobs):
             data = self.objects.get(_key(digest))
         except FileNotFoundError as error:
             raise DamagedBlob(
-                f"The blob {digest[:12]} cannot be read (No such object). Restore it from a copy, "
-                "or delete the frame and upload it again."
+                f"The blob {digest[:12]} does not exist. Restore it from a copy, or delete the "
+                "frame and upload it again."
             ) from error
         if hashlib.sha256(data).hexdigest() != digest:
             raise DamagedBlob(
-                f"The blob {digest[:12]} is damaged: its content has another hash. Restore it "
+                f"The blob {digest[:12]} is damaged: its content has a different hash. Restore it "
                 "from a copy, or delete the frame and upload it again."
             )
         return data
@@ -235,8 +236,8 @@ class ObjectBlobs(Blobs):
     def holds(self, digest: str) -> bool:
         """See `Blobs.holds`.
 
-        Writing transactions call this while others wait. If this process stored the blob, and none
-        was removed since, only the database is queried.
+        Writing transactions call this while others wait. If this process stored the blob and no
+        blob was removed afterwards, this queries only the database.
         """
         return self._holds(digest, TURN_S)
 
@@ -252,7 +253,7 @@ class ObjectBlobs(Blobs):
         now = self._locks.removals()
         if before is not None and before == now:
             return True
-        if now is None:  # a removal may be about to take the blob
+        if now is None:  # a removal in progress may remove the blob
             self._locks.wait(digest, seconds)
         return self.objects.size(_key(digest)) is not None
 
@@ -287,12 +288,12 @@ class ObjectBlobs(Blobs):
         try:
             for chunk in self.objects.chunks(_key(digest), size):
                 hashed.update(chunk)
-        except FileNotFoundError:  # removed meanwhile
+        except FileNotFoundError:  # the blob was removed meanwhile
             return "missing"
         return "sound" if hashed.hexdigest() == digest else "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Move a damaged blob to a folder of this machine, durably; see `Blobs.quarantine`."""
+        """Durably move a damaged blob to a folder of this machine; see `Blobs.quarantine`."""
         require_digest(digest)
         place = folder / f"blob-{digest}"
         make_folder(folder)
@@ -319,10 +320,10 @@ class ObjectBlobs(Blobs):
         return (one.digest for one in self.entries() if one.digest is not None)
 
     def entries(self) -> Iterator[BlobEntry]:
-        """Yield all objects where blobs are stored, by pages.
+        """Yield all objects of the blob storage, page by page.
 
-        Stores do not list unfinished objects of killed writers. Let the bucket's lifecycle abort
-        incomplete uploads after a day.
+        Stores do not list unfinished objects of killed writers. Configure the lifecycle of the
+        bucket to abort incomplete uploads after a day.
         """
         for one in self.objects.list(FOLDER):
             name = one.key.rpartition("/")[2]
@@ -332,7 +333,7 @@ class ObjectBlobs(Blobs):
 
     def check(self) -> None:
         """See `Blobs.check`."""
-        if self._checking.acquire(blocking=False):  # else another thread is checking
+        if self._checking.acquire(blocking=False):  # only one thread checks
             try:
                 if time.monotonic() - self._answered > CHECK_S:
                     self._wrong = self._look()
@@ -346,8 +347,8 @@ class ObjectBlobs(Blobs):
         try:
             if self.objects.head(MARK) is None and self._claimed:
                 return UnusableStore(
-                    f"{self.objects.url}: {MARK} has disappeared: the bucket was emptied or "
-                    "replaced. Restore its objects."
+                    f"{self.objects.url}: {MARK} is missing: the bucket was emptied or replaced. "
+                    "Restore its objects."
                 )
         except UnusableStore as error:
             return error

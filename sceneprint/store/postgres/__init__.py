@@ -1,1 +1,1 @@
-"""What only a PostgreSQL server has: connections and locks."""
+"""Connections and locks of PostgreSQL servers."""

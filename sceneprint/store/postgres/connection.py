@@ -1,12 +1,12 @@
-"""PostgreSQL: how connections are configured, and how writers take turns.
+"""Configure connections to PostgreSQL, and let writers take turns.
 
-Writers take turns as in SQLite: each transaction begins with an advisory lock of the database, held
-until its commit. So a transaction's reads stay true until it writes, and its numbers are in commit
-order.
+Writers take turns as in SQLite: each transaction begins with an advisory lock of the database,
+which it holds until the commit. A transaction's reads are therefore valid until it writes, and its
+numbers are in commit order.
 
-Writers of a single map share that lock and lock their map exclusively, so that writers of other
-maps run at the same time. Their reads of the map stay true, and its revisions are in commit order.
-Their events get numbers after the commit (see `events`).
+Writers of a single map share that lock and lock their map exclusively, so writers of other maps run
+concurrently. Their reads of the map remain valid, and its revisions are in commit order. Their
+events get numbers after the commit (see `events`).
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.database_errors import database_label, is_of_old_plan
 from sceneprint.store.sqlite import BUSY_S
 
-#: First number of the advisory locks; the second is one of the next.
+#: First number of the advisory locks; the second is TURN or EVENTS.
 LOCKS = 0x5CE7E
 #: Lock of the writers' turns.
 TURN = 1
 #: Lock of the process that numbers events (see `events`).
 EVENTS = 8
 _EVENT = "at, kind, map, frame_id, job_id, data"
-#: Functions and a trigger of the schema: `number_pending_events` holds its lock until the commit,
-#: so that numbers are in commit order. It also runs before other events are inserted, so that the
-#: events of a map stay in order.
+#: Functions and a trigger of the schema. `number_pending_events` holds its lock until the commit,
+#: so that numbers are in commit order. It also runs before other events are inserted, which
+#: preserves the order of a map's events.
 NUMBERING = (
     f"""
     CREATE FUNCTION number_pending_events() RETURNS void LANGUAGE plpgsql AS $$
@@ -62,24 +62,24 @@ NUMBERING = (
 )
 #: First number of the locks of single maps; the second is the map's.
 MAP_LOCKS = 0x5CE7F
-#: Bits of a map's number in its lock; maps with equal bits share one.
+#: Mask of the bits of a map's number in its lock. Maps with equal bits share a lock.
 LOCK_BITS = 0x7FFFFFFF
-#: Time limits of a statement, and of an idle transaction, seconds: a silent client must not keep
-#: the turn.
+#: Time limits of a statement and of an idle transaction, seconds, so that a silent client loses its
+#: turn.
 STATEMENT_S, IDLE_S = 60.0, 30.0
-#: Seconds that a migration waits for its turn: another process may be migrating.
+#: Seconds that a migration waits for its turn, since another process may be migrating.
 MIGRATION_S = 600.0
-#: Seconds that a writer waits after another has timed out. The whole fleet is in one queue: writers
-#: that leave it too early, and start at its end again, would never succeed.
+#: Seconds that a writer waits after another writer has timed out. The whole fleet waits in one
+#: queue, and writers that leave it early and join again at its end might never succeed.
 HELD_S = 2.0
-#: Minimum and maximum number of pooled connections of a process.
-KEPT, MOST = 8, 32
-#: Seconds without use after which a connection is tested, which costs a round trip. Connections
-#: that the server closed are noticed at once.
+#: Number of connections that a process keeps open, and maximum number of its connections.
+IDLE_CONNECTIONS, MOST = 8, 32
+#: Idle seconds after which a connection is tested, which takes a round trip. Connections that the
+#: server has closed are detected without a test.
 UNTRIED_S = 1.0
 #: Seconds after which a connection is replaced, so that new servers get their share.
 _OLD_S = 1800
-#: Defaults of libpq's options: an unreachable server is noticed within ten seconds.
+#: Defaults of libpq options, with which an unreachable server is detected within ten seconds.
 _CONNECT = {
     "connect_timeout": "3",
     "application_name": "sceneprint",
@@ -89,24 +89,24 @@ _CONNECT = {
     "keepalives_count": "3",
     "tcp_user_timeout": "9000",
 }
-#: Oldest supported version.
+#: Oldest supported version of PostgreSQL.
 _OLDEST = 14
 _WARNED, _USED = "sceneprint_warned", "sceneprint_used"
-#: Option of a connection: its only statement is a whole transaction.
+#: Option of a connection whose single statement is a complete transaction.
 SINGLE = "sceneprint_single"
-#: Option of a statement: it consists of several, the last of which returns the rows.
+#: Option of a message with several statements, the last of which returns the rows.
 _MESSAGE = "sceneprint_message"
 
 
 def open_postgres(url: URL) -> Engine:
-    """Return an engine with configured connections, none of which is open yet."""
+    """Return an engine whose connections are configured; none is open yet."""
     engine = create_engine(
         url,
         connect_args=connect_options(url),
-        isolation_level="READ COMMITTED",  # a writer's statements see all commits
+        isolation_level="READ COMMITTED",  # statements of a writer see all commits
         pool_recycle=_OLD_S,
-        pool_size=KEPT,
-        max_overflow=MOST - KEPT,
+        pool_size=IDLE_CONNECTIONS,
+        max_overflow=MOST - IDLE_CONNECTIONS,
         pool_timeout=BUSY_S,
     )
     event.listen(engine, "connect", configure)
@@ -122,23 +122,23 @@ def open_postgres(url: URL) -> Engine:
 
 
 def connect_options(url: URL) -> dict[str, str]:
-    """Return the options of libpq that a URL does not set."""
+    """Return the libpq options that a URL does not set."""
     return {name: value for name, value in _CONNECT.items() if name not in url.query}
 
 
 def configure(connection: Any, _record: object = None) -> None:
-    """Configure a connection of psycopg.
+    """Configure a psycopg connection.
 
     Raises
     ------
-    UnusableStore : the server is too old, or the encoding of its database is not UTF-8.
+    UnusableStore : If the server is too old, or the encoding of the database is not UTF-8.
     """
     version = connection.info.server_version // 10_000
     encoding = connection.info.parameter_status("server_encoding")
     if version < _OLDEST or encoding != "UTF8":
         connection.close()
         raise UnusableStore(
-            f"The server is PostgreSQL {version}, and its database has the encoding {encoding}. "
+            f"The server is PostgreSQL {version}, and the database has the encoding {encoding}. "
             f"Use version {_OLDEST} or later, and a database created with ENCODING 'UTF8'."
         )
     connection.adapters.register_dumper(str, _texts())
@@ -148,13 +148,13 @@ def configure(connection: Any, _record: object = None) -> None:
         "SELECT set_config('default_transaction_isolation', 'read committed', false),"
         " set_config('lock_timeout', %s, false), set_config('statement_timeout', %s, false),"
         " set_config('idle_in_transaction_session_timeout', %s, false),"
-        # the server notices an unreachable client as fast as the reverse: locks of its session
-        # would otherwise stay for hours
+        # the server must detect unreachable clients quickly; otherwise the locks of their sessions
+        # would remain for hours
         " set_config('tcp_keepalives_idle', %s, false),"
         " set_config('tcp_keepalives_interval', %s, false),"
         " set_config('tcp_keepalives_count', %s, false),"
-        # an acknowledged commit survives a power failure, and with a synchronous standby the loss
-        # of the server: values stronger than `on` stay
+        # an acknowledged commit survives a power failure and, with a synchronous standby, the loss
+        # of the server; values stronger than `on` are not changed
         " set_config('synchronous_commit', CASE current_setting('synchronous_commit')"
         " WHEN 'off' THEN 'on' ELSE current_setting('synchronous_commit') END, false)",
         [
@@ -166,7 +166,7 @@ def configure(connection: Any, _record: object = None) -> None:
 
 
 def timeline_of(connection: Any) -> str | None:
-    """Return the timeline of the server of a psycopg connection; None of a standby."""
+    """Return the timeline of the server of a psycopg connection; None for a standby."""
     before, connection.autocommit = connection.autocommit, True
     row = connection.execute(
         "SELECT CASE WHEN pg_is_in_recovery() THEN NULL"
@@ -178,15 +178,15 @@ def timeline_of(connection: Any) -> str | None:
 
 @cache
 def _texts() -> type[Any]:
-    """Return the dumper of texts, which replaces NUL: PostgreSQL stores none.
+    """Return the dumper of texts, which replaces NUL, since PostgreSQL cannot store it.
 
-    The API refuses NUL in stored texts; unchecked ones, such as those of the audit log, may contain
-    it.
+    The API refuses NUL in stored texts, but unchecked texts, such as those of the audit log, may
+    contain it.
     """
     from psycopg.types.string import StrDumperUnknown
 
     class Texts(StrDumperUnknown):
-        """Texts without NUL."""
+        """Dumper that replaces NUL in texts."""
 
         def dump(self, obj: str) -> Any:
             """As bytes."""
@@ -196,7 +196,7 @@ def _texts() -> type[Any]:
 
 
 def allow(connection: Connection, seconds: float) -> None:
-    """Set the time limits of this transaction's statements and pauses, seconds; 0: none."""
+    """Set the time limits of this transaction's statements and pauses, seconds; 0 for no limit."""
     if connection.dialect.name == "postgresql":
         for name in ("statement_timeout", "idle_in_transaction_session_timeout"):
             connection.execute(
@@ -206,18 +206,17 @@ def allow(connection: Connection, seconds: float) -> None:
 
 
 def begin(connection: Connection, *statements: str) -> Any:
-    """Begin a transaction, in one message with its first statements, each of which sees earlier
-    commits.
+    """Begin a transaction in one message with its first statements, which see earlier commits.
 
     Parameters
     ----------
-    connection : connection that commits each statement at once (`isolation_level`): beginning a
-        transaction separately would take a round trip
+    connection : connection that commits each statement immediately (`isolation_level`), because a
+        separate BEGIN would take a round trip
     statements : statements without parameters
 
     Returns
     -------
-    row : first row of the last statement; None without rows
+    row : first row of the last statement; None if there is none
     """
     message = "; ".join(("BEGIN", *statements))
     answer = connection.exec_driver_sql(message, execution_options={_MESSAGE: True})
@@ -225,24 +224,23 @@ def begin(connection: Connection, *statements: str) -> Any:
 
 
 class MapsInUse(Exception):
-    """Another transaction held a map for longer than the wait; nothing was written."""
+    """Error if another transaction uses a map for too long; nothing was written."""
 
 
 @dataclass(eq=False)
 class SingleStatement:
-    """A transaction of one statement that waits for its turn, executes and commits in one round
-    trip.
+    """Transaction of one statement that waits for its turn, executes and commits in one round trip.
 
-    Other writers of its maps wait only for that long, wherever the client is. It sees the commits
-    before its turn.
+    Other writers of its maps therefore do not wait for a distant client. The statement sees the
+    commits before its turn.
 
     Parameters
     ----------
-    map_numbers : numbers of the only maps that it writes to
+    map_numbers : numbers of the maps that the statement writes to
     wait_s : maximum seconds to wait for the turn
-    maps_wait_s : maximum seconds to wait for each map afterwards; None: `wait_s`
-    schema : last known schema; None: do not check it
-    executed : whether it was sent
+    maps_wait_s : maximum seconds to wait for each map afterwards; default: `wait_s`
+    schema : last known schema, which is checked; None skips the check
+    executed : whether the statement has been sent
     """
 
     map_numbers: Collection[int]
@@ -252,29 +250,29 @@ class SingleStatement:
     executed: bool = False
 
     def execute(self, cursor: Any, statement: str, parameters: Any) -> None:
-        """Execute the statement on a cursor of psycopg whose connection commits each statement.
+        """Execute the statement on a psycopg cursor whose connection commits each statement.
 
         Raises
         ------
-        NewerSchema : another version migrated the store beyond what this one may write.
-        MapsInUse : a map was in use for longer than `maps_wait_s`.
-        ValueError : it is the second statement.
+        NewerSchema : If another version migrated the store, and this version may not write to it.
+        MapsInUse : If a map is in use for longer than `maps_wait_s`.
+        ValueError : If a statement has already been executed.
         """
         import psycopg
 
         if self.executed:
             raise ValueError("a transaction of a single statement has a second one")
         self.executed = True
-        if self.schema is not None and self.schema.found is None:
+        if self.schema is not None and self.schema.current is None:
             self.schema.read(cursor.connection)
-        sent = None if self.schema is None else self.schema.found
+        sent = None if self.schema is None else self.schema.current
         try:
             self._send(cursor, statement, parameters)
         except psycopg.errors.DivisionByZero:  # nothing was written
             if self.schema is None:
                 raise
             self.schema.read(cursor.connection)
-            if self.schema.found == sent:  # another thread may have read the new one before
+            if self.schema.current == sent:  # another thread may have read the new schema already
                 raise
             self._send(cursor, statement, parameters)
 
@@ -282,15 +280,15 @@ class SingleStatement:
         import psycopg
 
         connection = cursor.connection
-        # sorted against deadlocks
+        # the order prevents deadlocks
         locks = sorted({number & LOCK_BITS for number in self.map_numbers})
         maps_wait_s = self.wait_s if self.maps_wait_s is None else self.maps_wait_s
         turn = connection.cursor()
         try:
-            # without a BEGIN, the pipeline is one transaction
+            # a pipeline without BEGIN is a single transaction
             with connection.pipeline():
-                # the time limit of statements would end a commit that waits for its standby, and
-                # acknowledge it although the standby may lack it
+                # the time limit of statements would interrupt a commit that waits for its standby,
+                # and acknowledge it although the standby may not have it
                 turn.execute(
                     "SELECT set_config('statement_timeout', '0', true),"
                     " set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s),"
@@ -300,8 +298,8 @@ class SingleStatement:
                 if self.schema is None:
                     connection.execute(f"{_MAPS} {_NUMBERS}", (MAP_LOCKS, locks))
                 else:
-                    known = self.schema.found or ()
-                    connection.execute(_MAPS_AND_SCHEMA, (MAP_LOCKS, *known, locks))
+                    schema = self.schema.current or ()
+                    connection.execute(_MAPS_AND_SCHEMA, (MAP_LOCKS, *schema, locks))
                 cursor.execute(statement, parameters)
         except psycopg.errors.LockNotAvailable as error:
             if turn.pgresult is None or self.maps_wait_s is None:
@@ -309,12 +307,12 @@ class SingleStatement:
             raise MapsInUse from error
 
 
-#: The schema of a store, and the oldest one whose processes may write to it.
+#: Query of the schema of a store, and of the oldest revision whose processes may write to it.
 SCHEMA = "SELECT version_num, least_revision FROM alembic_version, schema_range"
-#: Locks the maps, one after the other.
+#: Query that locks maps, one after the other.
 _MAPS, _NUMBERS = "SELECT pg_advisory_xact_lock(%s, number)", "FROM unnest(%s::integer[]) AS number"
-#: Divides by zero if the schema has changed, so that the transaction fails. The schema cannot
-#: change while this process has its turn.
+#: Query that also divides by zero, and so aborts the transaction, if the schema has changed. The
+#: schema cannot change while this process has its turn.
 _MAPS_AND_SCHEMA = (
     f"{_MAPS}, (SELECT 1 / count(*) FROM alembic_version, schema_range"
     f" WHERE version_num = %s AND least_revision = %s) {_NUMBERS}"
@@ -322,7 +320,7 @@ _MAPS_AND_SCHEMA = (
 
 
 class KnownSchema:
-    """The schema of a store as this process last read it.
+    """Schema of a store that this process read last.
 
     Parameters
     ----------
@@ -331,17 +329,17 @@ class KnownSchema:
 
     def __init__(self, check: Callable[[Any], None]) -> None:
         self._check = check
-        self.found: tuple[str, str] | None = None
+        self.current: tuple[str, str] | None = None
 
     def read(self, connection: Any) -> None:
-        """Read the schema again on a connection of psycopg; raise the error of `check`."""
+        """Read the schema again on a psycopg connection, and call `check`."""
         row = connection.execute(SCHEMA).fetchone()
         self._check(row)
-        self.found = row
+        self.current = row
 
 
 def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool:
-    """Execute statements with the options `_MESSAGE` or SINGLE; return whether this has done so."""
+    """Execute a statement with the option `_MESSAGE` or SINGLE, and return whether it has one."""
     if _MESSAGE in context.execution_options:
         cursor.execute(statement)
         while cursor.nextset():
@@ -355,24 +353,24 @@ def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool
 
 
 def _refuse_single(_cursor: Any, _statement: str, *others: Any) -> None:
-    """Raise ValueError for SINGLE with a statement that has no parameters, or several sets."""
+    """Raise ValueError, since SINGLE requires a statement with one set of parameters."""
     if others[-1].execution_options.get(SINGLE) is not None:
-        raise ValueError("a transaction of a single statement needs one with parameters")
+        raise ValueError("a transaction of a single statement requires one set of parameters")
 
 
 def take_turn(
     connection: Connection, wait_s: float, query: str | None = None, map_number: int | None = None
 ) -> Any:
-    """Begin a transaction, and wait for a writer's turn, in one message.
+    """Begin a transaction and wait for a writer's turn in one message.
 
-    From the turn to the next message, which takes a round trip, nobody else writes.
+    Other writers wait until the commit.
 
     Parameters
     ----------
     connection : see `begin`
     wait_s : maximum seconds to wait
-    query : query of one row, executed in the turn
-    map_number : number of the only map that is written to; None: all maps
+    query : query of one row, which is executed in the turn
+    map_number : number of the map, if the transaction writes to a single map
 
     Returns
     -------
@@ -388,7 +386,7 @@ def take_turn(
     if wait_s == BUSY_S:
         message.append(turn)
     else:
-        # a migration, which waits longer than BUSY_S, has no time limit afterwards
+        # a migration waits longer than BUSY_S, and its later locks have no time limit
         after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
         message += [f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}", turn]
         message.append(f"SET LOCAL lock_timeout = {after}")
@@ -403,13 +401,13 @@ def require_synchronous(connection: Connection) -> None:
 
     Raises
     ------
-    StoreAway : an operator ended the wait, of which the server only warns.
+    StoreAway : If an operator ended the wait, which the server reports only as a warning.
     """
     if _WARNED in connection.info:
         raise StoreAway(
-            f"{database_label(connection.engine.url)}: an operator ended the wait for a standby. "
-            "The commit is stored, and lost if the server fails before a standby follows. Restart "
-            "the standby, or remove it from synchronous_standby_names."
+            f"{database_label(connection.engine.url)}: An operator ended the wait for a standby. "
+            "The commit is stored, but will be lost if the server fails before a standby has it. "
+            "Restart the standby, or remove it from synchronous_standby_names."
         )
 
 
@@ -418,13 +416,12 @@ def _note_use(_connection: Any, record: Any) -> None:
 
 
 def _require_alive(dialect: Dialect, connection: Any, record: Any, _proxy: object) -> None:
-    """Test a connection that was idle, or on which the server sent input, usually that it closes
-    it.
+    """Test a connection that was idle, or has input from the server, such as a shutdown message.
 
-    If it is broken, all pooled connections are dropped.
+    If the connection is broken, all pooled connections are dropped.
     """
     used = record.info.get(_USED)
-    if used is None:  # the connection is new
+    if used is None:  # a new connection
         return
     if time.monotonic() - used < UNTRIED_S and not _has_input(connection):
         return
@@ -437,33 +434,33 @@ def _require_alive(dialect: Dialect, connection: Any, record: Any, _proxy: objec
 
 
 def _has_input(connection: Any) -> bool:
-    """Return whether the server has sent unrequested input."""
+    """Return whether the server has sent input that was not requested."""
     poll = select.poll()
     poll.register(connection.fileno(), select.POLLIN)
     return bool(poll.poll(0))
 
 
 def _watch_commits(connection: Any, record: Any) -> None:
-    """Record warnings: a COMMIT has one only if the wait for its standby ended early."""
+    """Record warnings, which a COMMIT causes only if the wait for its standby ended early."""
     if not hasattr(connection, "add_notice_handler"):
         return
 
-    def warned(said: Any) -> None:
-        if said.severity_nonlocalized == "WARNING":
+    def warned(notice: Any) -> None:
+        if notice.severity_nonlocalized == "WARNING":
             record.info[_WARNED] = True
 
     connection.add_notice_handler(warned)
 
 
 def forget_warnings(connection: Connection) -> None:
-    """Forget the warnings of statements before a COMMIT."""
+    """Discard the warnings of the statements before a COMMIT."""
     connection.info.pop(_WARNED, None)
 
 
 def _drop_connections(context: ExceptionContext) -> None:
-    """Drop all connections if the server is a standby, as the next may lead to the primary.
+    """Drop all connections if the server is a standby, or prepared statements are outdated.
 
-    Do the same if prepared statements are outdated.
+    A new connection may lead to the primary.
     """
     error = context.original_exception
     if getattr(error, "sqlstate", None) in ("25006", "26000") or is_of_old_plan(error):

@@ -1,6 +1,6 @@
-"""Session locks: of a fleet's blobs, and of the processes that build an index.
+"""Session locks for the blobs of a fleet, and for processes that build an index.
 
-The server releases them when the connection ends, however its process dies.
+The server releases a session lock when the connection ends, even if the process is killed.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 
     from sceneprint.store.database import Database
 
-#: Number within `LOCKS` of the lock of blobs (see `blobs/`).
+#: Second number of the lock of blobs, after `LOCKS` (see `blobs/`).
 BLOBS = 2
 #: First number of the locks of index builds; the second is the map's.
 INDEX_LOCKS = 0x5CE80
 
 log = logging.getLogger(__name__)
 
-#: Counts removals, and is odd during one. Sequences are not rolled back, so removals of dead
-#: processes count as well.
+#: Sequence that counts the starts and ends of removals, so it is odd during a removal. Sequences
+#: are not rolled back, so removals of dead processes count too.
 _COUNTER = "sceneprint_removals"
 _MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
 _READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
-#: Used instead of `nextval`, which after a crash skips up to 32 numbers, so that odd and even would
-#: mix. Only the holder of the lock counts.
+#: Query that increments the sequence. `nextval` may skip up to 32 numbers after a crash, which
+#: would confuse odd and even numbers. Only the holder of the lock increments the sequence.
 _NEXT = (
     f"SELECT setval('{_COUNTER}', CASE WHEN is_called THEN last_value ELSE 0 END + 1)"
     f" FROM {_COUNTER}"
@@ -44,28 +44,28 @@ _NEXT = (
 _SHARE = "SELECT pg_advisory_lock_shared(%s, %s)"
 _TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
 _GIVE = "SELECT pg_advisory_unlock(%s, %s)"
-#: Seconds since a blob was doomed; infinity if it is not.
+#: Query of the seconds since a blob was doomed; infinity if the blob is not doomed.
 _DOOMED = (
     "SELECT coalesce(extract(epoch FROM clock_timestamp()) - max(at), 'infinity')::float"
     " FROM doomed WHERE blob = %s"
 )
-#: The lock is released as soon as it is granted.
+#: Query that waits for a lock, which is released as soon as it is granted.
 _WAIT = "SELECT set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s)"
 
 
 class SessionLocks(Locks):
-    """The lock of all hosts that share a PostgreSQL database.
+    """Lock for all hosts that share a PostgreSQL database.
 
-    A pooler that assigns one connection to several clients breaks it: connect to the server itself,
-    or let the pooler assign whole sessions.
+    The lock does not work with a pooler that assigns one connection to several clients. Connect
+    directly to the server, or configure the pooler to assign whole sessions.
     """
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._alone = threading.Lock()  # of the removing thread
+        self._alone = threading.Lock()  # held by the thread that removes blobs
         self._remover, self._reader = _Connection(database), _Connection(database)
         self._uncertain = False
-        # an odd number of `_COUNTER`, and the time since this process has seen it
+        # last odd number of `_COUNTER`, and the time at which this process read it first
         self._odd: tuple[int, float] | None = None
 
     def close(self) -> None:
@@ -74,9 +74,9 @@ class SessionLocks(Locks):
         self._reader.close()
 
     @contextmanager
-    def kept(self) -> Iterator[None]:
-        """See `Locks`; raise UnusableStore if the lock cannot be taken, or was lost meanwhile."""
-        # another connection than that of removals, for which its own lock would be free
+    def block_removals(self) -> Iterator[None]:
+        """See `Locks`. Raise UnusableStore if the lock cannot be taken, or was lost meanwhile."""
+        # a session does not block itself, so removals use a different connection
         connection = self._database.driver_connection()
         try:
             with self._database.explained():
@@ -93,8 +93,8 @@ class SessionLocks(Locks):
             connection.execute("SELECT 1")
         except psycopg.Error as error:
             raise UnusableStore(
-                f"{self._database.shown}: the connection was lost that prevented removals of "
-                "blobs, and needed blobs may be missing. Run the command again."
+                f"{self._database.shown}: The connection that prevented removals of blobs was "
+                "lost, and needed blobs may be missing. Run the command again."
             ) from error
 
     @contextmanager
@@ -114,7 +114,7 @@ class SessionLocks(Locks):
             self._alone.release()
 
     def mark_uncertain(self) -> None:
-        """See `Locks`: no removal begins, and this one does not count as over, for LONGEST_S."""
+        """See `Locks`. For LONGEST_S, no removal begins, and this one is not finished."""
         self._uncertain = True
 
     @property
@@ -128,11 +128,11 @@ class SessionLocks(Locks):
         return number if number is not None and number % 2 == 0 else None
 
     def wait(self, digest: str | None, seconds: float) -> None:
-        """See `Locks`: a dead process loses the lock, although the counter stays odd."""
-        # a blob that is removed after the turn is doomed until the removal has ended
+        """See `Locks`. A dead process loses the lock, although the counter remains odd."""
+        # a blob that is removed after the turn is doomed until the end of the removal
         if digest is not None and self._reader.query(_DOOMED, digest) == math.inf:
             return
-        # another connection, as other threads call `removals` meanwhile
+        # other threads use the shared connection in `removals` meanwhile
         connection = self._database.driver_connection()
         try:
             with self._database.explained():
@@ -140,14 +140,14 @@ class SessionLocks(Locks):
         finally:
             connection.close()
         if digest is not None and self.removals() is None:
-            # the removing process has lost its lock: it is dead or disconnected, and its requests
-            # may still arrive
+            # the removing process has lost its lock, so it is dead or disconnected, and its
+            # requests may still arrive
             age_s = self._reader.query(_DOOMED, digest)
             if age_s is None or age_s < LONGEST_S:
                 raise StoreLocked(
-                    f"{self._database.shown}: a process that removes the same bytes lost its "
-                    "connection, and may still remove them. Nothing was stored. Try again in a "
-                    "minute or two."
+                    f"{self._database.shown}: A process that was removing the same blob lost its "
+                    "connection, and may still remove the blob. Nothing was stored. Try again in "
+                    "two minutes."
                 )
 
     def _begin(self) -> bool:
@@ -156,10 +156,10 @@ class SessionLocks(Locks):
         if not self._is_over(self._remover.query(_READ, same=True)):
             self._remover.close()
             return False
-        # without the counter, no removal begins: writers of the same blobs would not notice it
-        for _ in range(2):  # the number is odd already after the death of a remover
+        # a removal requires the counter, since writers of the same blobs would not notice it else
+        for _ in range(2):  # the number is already odd if a removing process has died
             number = self._remover.query(_NEXT, same=True)
-            if number is None:  # the connection is lost, and so is the lock
+            if number is None:  # the connection and the lock are lost
                 break
             if number % 2 == 1:
                 return True
@@ -167,10 +167,10 @@ class SessionLocks(Locks):
         return False
 
     def _is_over(self, number: int | None) -> bool:
-        """Return whether the former removal is over.
+        """Return whether the former removal is finished.
 
-        An odd number remains of a process that died or was disconnected, or whose requests failed:
-        these may still be carried out.
+        The number remains odd if the process died or was disconnected, or its requests failed,
+        because the requests may still be executed.
         """
         if number is None:
             return False
@@ -184,7 +184,7 @@ class SessionLocks(Locks):
         if self._uncertain:  # leave the number odd
             self._remover.close()
             return
-        # only on the same connection: on another, this would count the present holder's removal
+        # on another connection, this would end the removal of the current holder of the lock
         ended = self._remover.query(_NEXT, same=True) is not None
         if not ended or not self._remover.query(_GIVE, LOCKS, BLOBS, same=True):
             log.warning("blob lock lost")
@@ -193,9 +193,9 @@ class SessionLocks(Locks):
 
 @contextmanager
 def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], None] | None]:
-    """Hold the turn to build a map's index for the fleet, as long as a connection lasts.
+    """Hold the turn to build the index of a map for the fleet while a connection lasts.
 
-    On SQLite, the lock of the index's folder is enough.
+    On SQLite, the lock of the index folder suffices.
 
     Yields
     ------
@@ -203,7 +203,7 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
 
     Raises
     ------
-    UnusableStore : the database cannot be reached.
+    UnusableStore : If the database cannot be reached.
     """
     import psycopg
 
@@ -217,8 +217,8 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
             connection.execute("SELECT 1")
         except psycopg.Error as error:
             raise UnusableStore(
-                f"{database.shown}: the connection was lost that prevented others from building "
-                "the same index. It is built again."
+                f"{database.shown}: The connection that prevented other processes from building "
+                "the same index was lost. The index will be built again."
             ) from error
 
     try:
@@ -231,22 +231,22 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
 
 
 class _Connection:
-    """A lasting connection, opened on demand, and again after it broke."""
+    """Permanent connection, which is opened on demand and after a failure."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._lock = threading.Lock()
         self._held: list[psycopg.Connection[Any]] = []  # at most one
-        # not in __del__: the driver warns of open connections that are collected
+        # the driver issues a warning for open connections when they are collected
         weakref.finalize(self, _close, self._held)
 
     def query(self, statement: str, *values: int | str, same: bool = False) -> Any:
-        """Return the value of a query; None if there is none, for whatever reason.
+        """Return the value of a query; None if there is no value or the query fails.
 
         Parameters
         ----------
         statement, values : query and its parameters
-        same : whether to use only the former connection, which holds locks
+        same : whether to use only the existing connection, which holds locks
         """
         import psycopg
 

@@ -208,7 +208,7 @@ def test_a_repair_removes_nothing_under_a_backup(house: Any) -> None:
         stray = house.blob(engine.store.blobs.put(b"nothing refers to this"))
         age(stray, 3700)
         house.damage(house.blob(blob))
-        with engine.store.blobs.kept():
+        with engine.store.blobs.block_removals():
             found = house.look(repair=True)
             assert [one.left for one in found] == [True, True]
             assert all("a backup or another process" in str(one.error) for one in found)

@@ -90,7 +90,7 @@ def test_what_cannot_be_checked_or_repaired_has_its_own_code(
     fsck("--grace", "1" + "0" * 400, expect=1)
     (house.data / "blobs").rename(house.data / "away")
     said = fsck("--repair", expect=2)
-    assert "there is no such folder" in said
+    assert "The folder does not exist" in said
     assert said.count("\n") == 1
 
 
