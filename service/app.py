@@ -141,7 +141,7 @@ their sensor. Refusals are problem documents (RFC 9457) that say what happened, 
 
 
 @asynccontextmanager
-async def warming(context: Context) -> AsyncIterator[None]:
+async def warm_up(context: Context) -> AsyncIterator[None]:
     """Compile or load kernels and tables in the background; the service responds meanwhile."""
     stop = threading.Event()
     context.signers.hold()
@@ -210,7 +210,7 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
             # Above the limit of one tenant, so that other tenants always find a free thread.
             to_thread.current_default_thread_limiter().total_tokens += service.places
             app.state.service, app.state.refusals = service, RefusalFilter()
-            loading = warming(context) if warm else nullcontext()
+            loading = warm_up(context) if warm else nullcontext()
             async with housekeeping(service), loading:
                 yield
             service.feed.close()

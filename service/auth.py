@@ -1,6 +1,6 @@
 """Authentication and authorisation of all routes, and the audit log of refused requests.
 
-    request  --caller-->  Caller, with the Service  --may_read | may_write-->  a map
+    request  --authenticate-->  Caller, with the Service  --may_read | may_write-->  a map
     refused request  --record_refusal-->  a line of the audit log
 
 Dependencies that do not block run in the event loop, because a thread may become free only after a
@@ -147,23 +147,23 @@ class Caller:
         return None if self.reads_every else tuple(sorted(set(self.grants) - {EVERY}))
 
 
-def require_readable(query_id: str, here: Service, asking: Caller) -> QueryRow:
+def require_readable(query_id: str, here: Service, caller: Caller) -> QueryRow:
     """Return the row of a query. Raise UnknownQuery, with the same text, if its answer is not
     stored or the caller may not read all maps that it names.
     """
     row = here.context.query_log.find_row(query_id)
     maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
-    if len(asking.readable(maps)) < len(maps):
+    if len(caller.readable(maps)) < len(maps):
         raise unknown_query(query_id)
     return row
 
 
-def anybody() -> Caller:
+def anonymous_caller() -> Caller:
     """Return the caller if no key is required. Only processes of this machine reach the service."""
     return Caller("", {EVERY: "admin"})
 
 
-async def caller(
+async def authenticate(
     request: Request, here: Here,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller:  # fmt: skip
@@ -175,7 +175,7 @@ async def caller(
         if requires_key(request, here):
             raise KeyRequired(_key_required_text(request, here))
         set_actor(Actor("", address_of(request) or None))
-        return anybody()
+        return anonymous_caller()
     key = await to_thread.run_sync(here.find_key, credentials.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
@@ -232,7 +232,7 @@ def v1_router(
     """Return a router for paths below /v1, which all check the caller and `depends`. `tag` names
     the operations in the OpenAPI document.
     """
-    dependencies = [Depends(one) for one in (caller, *depends)]
+    dependencies = [Depends(one) for one in (authenticate, *depends)]
     tags: list[str | Enum] | None = None if tag is None else [tag]
     return APIRouter(
         prefix=f"/v1{prefix}", tags=tags, dependencies=dependencies, route_class=ListRoute
@@ -269,7 +269,7 @@ def page_response(page: Page[Any]) -> Response:
     return Response(f'{{"items":[{items}],{rest[1:]}', media_type="application/json")
 
 
-Asking = Annotated[Caller, Depends(caller)]
+Sender = Annotated[Caller, Depends(authenticate)]
 
 
 async def guest(
@@ -281,7 +281,7 @@ async def guest(
     """
     if credentials is None and requires_key(request, here):
         return None
-    return await caller(request, here, credentials)
+    return await authenticate(request, here, credentials)
 
 
 Guest = Annotated[Caller | None, Depends(guest)]
@@ -317,34 +317,34 @@ def _key_required_text(request: Request, here: Here) -> str:
     )
 
 
-async def may_read(map_name: str, asking: Asking) -> None:
+async def may_read(map_name: str, caller: Sender) -> None:
     """Raise UnknownMap if the caller may not read the map."""
-    asking.require(map_name, "read")
+    caller.require(map_name, "read")
 
 
-async def may_write(map_name: str, asking: Asking) -> None:
+async def may_write(map_name: str, caller: Sender) -> None:
     """Raise UnknownMap or Forbidden if the caller may not change the content of the map."""
-    asking.require(map_name, "write")
+    caller.require(map_name, "write")
 
 
-async def may_admin(map_name: str, asking: Asking) -> None:
+async def may_admin(map_name: str, caller: Sender) -> None:
     """Raise UnknownMap or Forbidden if the caller may not change the map itself."""
-    asking.require(map_name, "admin")
+    caller.require(map_name, "admin")
 
 
-async def reads_every(asking: Asking) -> None:
+async def reads_every(caller: Sender) -> None:
     """Raise Forbidden if the caller may not read all maps."""
-    asking.require_every("read")
+    caller.require_every("read")
 
 
-async def administers(asking: Asking) -> None:
+async def administers(caller: Sender) -> None:
     """Raise Forbidden if the caller is not an administrator of all maps."""
-    asking.require_every("admin")
+    caller.require_every("admin")
 
 
-def _forbidden(asking: Caller, scope: Scope, what: str) -> Forbidden:
+def _forbidden(caller: Caller, scope: Scope, what: str) -> Forbidden:
     return Forbidden(
-        f"The key {asking.name!r:.80} does not have the scope {scope!r} for {what}. Ask the "
+        f"The key {caller.name!r:.80} does not have the scope {scope!r} for {what}. Ask the "
         "operator for a key that has it."
     )
 

@@ -62,6 +62,8 @@ _PLAIN = (
     "session", "captured_at", "name", "sequence",
 )  # fmt: skip
 _OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame", "up")
+#: End of the descriptions of query parameters that replace fields of a form.
+BARE = "Only if the body is the frame."
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
@@ -74,35 +76,36 @@ def parameters() -> list[dict[str, Any]]:
     """Return the query parameters of a frame that is the body, for the OpenAPI document."""
     number, text = {"type": "number"}, {"type": "string"}
     whole = {"type": "integer", "minimum": 1, "maximum": 65535}
-    own = "Only if the body is the frame: "
     texts: dict[str, tuple[dict[str, Any], str]] = {
         "meta": (text, "FrameMeta as JSON, in place of the parameters below."),
-        **dict.fromkeys(("fx", "fy", "cx", "cy"), (number, "camera intrinsics, pixels.")),
-        "width": (whole, "width of the camera's image, pixels; default: that of the image."),
-        "height": (whole, "height of the camera's image, pixels; default: that of the image."),
-        "distortion": (text, "k1,k2,p1,p2[,k3] of OpenCV."),
-        "depth_scale": (number, "stored units per metre; default: 1000."),
-        "depth_along_ray": ({"type": "boolean"}, "whether samples are ranges along the ray."),
-        "trust_depth": ({"type": "boolean"}, "accept a depth image that fails the sanity check."),
-        "viewpoint": (text, "viewpoint of a point cloud as x,y,z in metres, or `none`."),
-        "units_per_metre": (number, "units per metre of a point cloud; default: 1."),
+        **dict.fromkeys(("fx", "fy", "cx", "cy"), (number, "Camera intrinsics, pixels.")),
+        "width": (whole, "Width of the camera's image, pixels; default: that of the image."),
+        "height": (whole, "Height of the camera's image, pixels; default: that of the image."),
+        "distortion": (text, "Coefficients k1,k2,p1,p2[,k3] of OpenCV."),
+        "depth_scale": (number, "Stored units per metre; default: 1000."),
+        "depth_along_ray": ({"type": "boolean"}, "Whether samples are ranges along the ray."),
+        "trust_depth": ({"type": "boolean"}, "Accept a depth image that fails the sanity check."),
+        "viewpoint": (text, "Viewpoint of a point cloud as x,y,z in metres, or `none`."),
+        "units_per_metre": (number, "Units per metre of a point cloud; default: 1."),
         "format": (
             {"type": "string", "enum": list(get_args(CloudFormat))},
-            "format of a point cloud; required only for `kitti`.",
+            "Format of a point cloud; required only for `kitti`.",
         ),
-        "robot": (text, "name of the robot."),
-        "session": (text, "name of the session."),
-        "captured_at": ({"type": "string", "format": "date-time"}, "capture time with time zone."),
-        "name": (text, "name of the original file or message."),
-        "sequence": ({"type": "integer", "minimum": 0}, "index within the session."),
-        "tags": (text, "tags, separated by commas."),
+        "robot": (text, "Name of the robot."),
+        "session": (text, "Name of the session."),
+        "captured_at": ({"type": "string", "format": "date-time"}, "Capture time with time zone."),
+        "name": (text, "Name of the original file or message."),
+        "sequence": ({"type": "integer", "minimum": 0}, "Index within the session."),
+        "tags": (text, "Tags, separated by commas."),
         "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}: metres, unit quaternion."),
-        "parent_frame": (text, "parent frame of `pose`; default: ROBOT/SESSION."),
+        "parent_frame": (text, "Parent frame of `pose`; default: ROBOT/SESSION."),
         "base": (text, "T_base_sensor, the mounting pose of the sensor, in the format of `pose`."),
-        "base_frame": (text, "name of the robot's base frame; default: base_link."),
-        "up": (text, "unit vector x,y,z that points up, in the axes of the sensor."),
+        "base_frame": (text, "Name of the robot's base frame; default: base_link."),
+        "up": (text, "Unit vector x,y,z that points up, in the axes of the sensor."),
     }
-    return [query_parameter(name, schema, own + what) for name, (schema, what) in texts.items()]
+    return [
+        query_parameter(name, schema, f"{what} {BARE}") for name, (schema, what) in texts.items()
+    ]
 
 
 def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> dict[str, Any]:
@@ -113,7 +116,7 @@ def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> d
     }  # fmt: skip
 
 
-async def received(
+async def read_frame_body(
     request: Request, fields: Sequence[str]
 ) -> tuple[UploadFile, FrameMeta, dict[str, str]]:
     """Read a request whose body is the frame.
@@ -148,7 +151,7 @@ async def received(
             if not head:
                 raise UnreadableFrame(_NO_BODY)
         except OSError as error:
-            raise unspoolable(error) from error
+            raise spool_error(error) from error
         others = {name: values.pop(name) for name in fields if name in values}
         meta = _query_meta(values, head)
     except BaseException:
@@ -157,7 +160,7 @@ async def received(
     return file, meta, others
 
 
-def unspoolable(error: OSError) -> UnusableStore:
+def spool_error(error: OSError) -> UnusableStore:
     """Return the error for a body that cannot be written to the temporary folder."""
     kind = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else UnusableStore
     return kind(
@@ -356,7 +359,7 @@ def _charset(request: Request) -> str:
 
 
 @asynccontextmanager
-async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
+async def read_upload(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
     """Read a frame from a form with a file part `frame`, a field `meta` and the named fields, or
     from a body that is the frame, with the same fields in the query string.
 
@@ -372,13 +375,13 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
     StoreFull, UnusableStore : If the frame cannot be written to the temporary folder.
     """
     if media_type(request) in TYPES:
-        file, meta, others = await received(request, fields)
+        file, meta, others = await read_frame_body(request, fields)
         try:
             yield FormUpload(file.file, meta, others)
         finally:
             await file.close()
         return
-    async with form_of(request, most_files=1) as form:
+    async with read_form(request, most_files=1) as form:
         check_parts(form, {"frame", "meta", *fields})
         frame = form.get("frame")
         if not isinstance(frame, UploadFile) or len(form.getlist("frame")) != 1:
@@ -392,8 +395,8 @@ async def uploaded(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
 
 
 @asynccontextmanager
-async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
-    """Read a form, and close its files afterwards. Errors are those of `uploaded`."""
+async def read_form(request: Request, most_files: int) -> AsyncIterator[FormData]:
+    """Read a form, and close its files afterwards. Errors are those of `read_upload`."""
     if _has_no_body(request):
         raise MalformedBody(_NO_BODY)
     if media_type(request) != FORM:
@@ -415,7 +418,7 @@ async def form_of(request: Request, most_files: int) -> AsyncIterator[FormData]:
             "`frame` and a field `meta`, with a boundary as in RFC 7578."
         ) from error
     except OSError as error:  # large parts are spooled to a file
-        raise unspoolable(error) from error
+        raise spool_error(error) from error
     try:
         yield form
     finally:
@@ -552,7 +555,7 @@ def _text(values: list[UploadFile | str], name: str) -> str:
 
 # Several frames in one form, each with its own metadata and its own result.
 #
-# form  --frames_of-->  FormFrames  --read-->  Upload, ...  --upload_responses-->  Batch
+# form  --read_frames-->  FormFrames  --read-->  Upload, ...  --upload_responses-->  Batch
 
 
 @dataclass(frozen=True, eq=False)
@@ -594,7 +597,7 @@ class FormFrames:
 
 
 @asynccontextmanager
-async def frames_of(
+async def read_frames(
     request: Request, *fields: str, most: int = MOST_OF_BATCH
 ) -> AsyncIterator[FormFrames]:
     """Read a form with parts `frame` and a field `metas`.
@@ -606,10 +609,10 @@ async def frames_of(
 
     Raises
     ------
-    UnsupportedType, MalformedBody, StoreFull, UnusableStore : See `form_of`.
+    UnsupportedType, MalformedBody, StoreFull, UnusableStore : See `read_form`.
     InvalidRequest : If there is no frame, or the numbers of metadata and frames differ.
     """
-    async with form_of(request, most_files=most) as form:
+    async with read_form(request, most_files=most) as form:
         check_parts(form, ("frame", "metas", *fields))
         files = [one.file for one in form.getlist("frame") if isinstance(one, UploadFile)]
         if not files or len(files) != len(form.getlist("frame")):
@@ -669,7 +672,7 @@ def _batch_meta(meta: Any) -> FrameMeta | InvalidRequest:
 
 # The header Idempotency-Key: a repeated request takes effect once.
 #
-# guarded(asking, key, route, payload...)  -->  IdempotentRequest, stored with the result
+# idempotent_request(caller, key, route, payload...)  -->  IdempotentRequest, stored with the result
 
 #: As a parameter of a route: `key: IdempotencyKey = None`.
 IdempotencyKey = Annotated[
@@ -686,19 +689,19 @@ IdempotencyKey = Annotated[
 ]
 
 
-def guarded(asking: Caller, key: str | None, *parts: object) -> IdempotentRequest | None:
+def idempotent_request(caller: Caller, key: str | None, *parts: object) -> IdempotentRequest | None:
     """Return the record that makes a request take effect once; None without an idempotency key.
 
     Parameters
     ----------
-    asking : caller of the request; the keys of different callers are independent
+    caller : caller of the request; the keys of different callers are independent
     parts : everything that distinguishes the request, such as route, map, content and metadata, as
         bytes, records or JSON values
     """
     if key is None:
         return None
     plain = json.dumps([_plain(part) for part in parts], sort_keys=True)
-    return IdempotentRequest(asking.name, key, hashlib.sha256(plain.encode()).hexdigest())
+    return IdempotentRequest(caller.name, key, hashlib.sha256(plain.encode()).hexdigest())
 
 
 def mark_replayed(response: Response, *, replayed: bool) -> None:

@@ -69,7 +69,7 @@ def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
     return None
 
 
-def stranger(
+def foreign_request_error(
     headers: Iterable[tuple[bytes, bytes]], allows: Callable[[bytes], bool], path: str = ""
 ) -> SceneprintError | None:
     """Return the reason for refusing a request to a service of one machine; None to accept it.

@@ -53,11 +53,11 @@ class Feed:
     ----------
     database : database that is polled while streams are open
     most : maximum number of open streams
-    kept : number of newest events of each map that the database never deletes
+    retained : number of newest events of each map that the database never deletes
     """
 
-    def __init__(self, database: Database, most: int, kept: int) -> None:
-        self._database, self._most, self._kept = database, most, kept
+    def __init__(self, database: Database, most: int, retained: int) -> None:
+        self._database, self._most, self._retained = database, most, retained
         self._streams = Holdings()
         self._closed = False
         self._poller: asyncio.Task[None] | None = None
@@ -133,7 +133,7 @@ class Feed:
             self._poller = asyncio.create_task(self._poll())
         rewinds = self._rewinds
         first, place, seen = await to_thread.run_sync(
-            begin, self._database, wanted, self._kept, after
+            begin, self._database, wanted, self._retained, after
         )
         yield first, seen  # even if it is empty, because the reader needs its position
         clock = asyncio.get_running_loop().time
@@ -148,7 +148,7 @@ class Feed:
             if rewinds != self._rewinds:
                 rewinds = self._rewinds
                 _, place, seen = await to_thread.run_sync(
-                    begin, self._database, wanted, self._kept, None
+                    begin, self._database, wanted, self._retained, None
                 )
                 yield [missed(seen)], seen
                 continue

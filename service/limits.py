@@ -116,7 +116,7 @@ class Turns:
             self._timer = asyncio.get_running_loop().call_later(rest_s, self._admit)
 
 
-class SharedLooks:
+class SharedChecks:
     """Results of slow checks that concurrent requests share, up to an age of `most_s` seconds."""
 
     def __init__(self, most_s: float) -> None:

@@ -19,11 +19,11 @@ from service.auth import REFUSED, address_of, record_refusal
 from service.browser_security import (
     Headers,
     Origins,
+    foreign_request_error,
     forwarded,
     is_preflight,
     preflight_headers,
     security_headers,
-    stranger,
 )
 from service.limits import (
     Broken,
@@ -86,7 +86,7 @@ class RequestMiddleware:
         sent_id = headers.get(b"x-request-id", b"")
         request_id = sent_id.decode() if _ID.fullmatch(sent_id) else uuid.uuid4().hex
         name_request(request_id)
-        set_tenant(NOBODY)  # until the key is checked; see `auth.caller`
+        set_tenant(NOBODY)  # until the key is checked; see `auth.authenticate`
         set_actor(None)
         own: Headers = [(b"x-request-id", request_id.encode())]
         own += self._origins.headers(headers.get(b"origin"))
@@ -147,7 +147,7 @@ class RequestMiddleware:
         origin, length = headers.get(b"origin"), headers.get(b"content-length", b"")
         known = origin is not None and self._origins.allows(origin)
         if self._alone:
-            refusal = stranger(scope["headers"], self._origins.allows, scope["path"])
+            refusal = foreign_request_error(scope["headers"], self._origins.allows, scope["path"])
             if refusal is not None:
                 return refusal
         if known and is_preflight(scope["method"], headers):

@@ -64,7 +64,7 @@ def phrase(status: int) -> str:
     return _PHRASES.get(status, HTTPStatus(status).phrase)
 
 
-def declared(*statuses: int) -> dict[int | str, dict[str, Any]]:
+def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return responses with these status codes for the OpenAPI document."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
@@ -134,4 +134,4 @@ def _id(request: Request) -> str:
     return str(getattr(request.state, "request_id", ""))
 
 
-__all__ = ["Problem", "declared", "install", "problem", "status_of"]
+__all__ = ["Problem", "install", "problem", "refusals", "status_of"]

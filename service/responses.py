@@ -14,7 +14,7 @@ from starlette.background import BackgroundTask
 from sceneprint.engine.maps.map_frames import Output
 from sceneprint.errors import DamagedBlob, InvalidRequest
 from sceneprint.store.queue import JobFile
-from service.problems import declared, problem
+from service.problems import problem, refusals
 from service.running_service import Service
 
 # The headers Accept, If-Match and If-None-Match (RFC 9110, sections 12.5.1 and 13.1).
@@ -24,7 +24,7 @@ _TYPE = re.compile(r"\s*([\w.+*-]+/[\w.+*-]+)\s*((?:;[^,]*)?)", re.ASCII)
 _QUALITY = re.compile(r";\s*q\s*=\s*(\d+(?:\.\d*)?)", re.ASCII)
 
 
-def expected(request: Request) -> Collection[str] | None:
+def expected_tags(request: Request) -> Collection[str] | None:
     """Return the entity tags of If-Match, or None for any; raise InvalidRequest if the header has
     no tag.
     """
@@ -87,20 +87,20 @@ def file_responses(
     if model is not None:
         done["model"] = model
     unchanged = {"description": "Not modified: If-None-Match names this ETag."}
-    return {200: done, 304: unchanged, **declared(*statuses)}
+    return {200: done, 304: unchanged, **refusals(*statuses)}
 
 
-def tagged(output: Output[Any]) -> dict[str, str]:
+def tag_headers(output: Output[Any]) -> dict[str, str]:
     """Return the headers of an output with its entity tag."""
     return {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
 
 
-async def sent(
+async def send_output(
     request: Request, here: Service, output: Output[bytes], kind: str,
     name: str | None = None, **headers: str,
 ) -> Response:  # fmt: skip
     """Send an output. It is built only if the client does not have it, after a wait at the gate."""
-    headers |= tagged(output)
+    headers |= tag_headers(output)
     if is_known(request, output.tag):
         return Response(None, 304, headers)
     data = await here.gate.enter(output.make)
@@ -140,7 +140,7 @@ def files(
         200: {"description": description, "headers": headers, "content": binary},
         206: {"description": "The requested range.", "headers": headers, "content": binary},
         304: {"description": "Not modified: If-None-Match names this ETag."},
-        **declared(404, 416, *statuses),
+        **refusals(404, 416, *statuses),
     }  # fmt: skip
 
 

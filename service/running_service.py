@@ -28,7 +28,7 @@ from sceneprint.engine.search.query import Queries
 from sceneprint.process import NOBODY, current_tenant
 from sceneprint.store.keys import KeyRow, KeyUses, find_key
 from service.event_stream import Feed
-from service.limits import BodySpool, Gate, Holdings, RateLimits, SharedLooks, Turns, take_turn
+from service.limits import BodySpool, Gate, Holdings, RateLimits, SharedChecks, Turns, take_turn
 from service.metrics import Metrics
 
 T = TypeVar("T")
@@ -66,7 +66,7 @@ class Service:
     reads : turns of requests in shared threads
     spool : number of bytes on disk that wait to be read
     lookups : threads that look up keys
-    looks : results of state checks that concurrent requests share
+    checks : results of state checks that concurrent requests share
     """
 
     def __init__(self, context: Context, metrics: Metrics) -> None:
@@ -99,7 +99,7 @@ class Service:
         self.places = settings.concurrent_requests + settings.queued_requests
         self.requests, self.spool = Holdings(), BodySpool()
         self.reads = Turns(READS, READS_BESIDE, rests=True)
-        self.lookups, self.looks = CapacityLimiter(LOOKUPS), SharedLooks(READY_S)
+        self.lookups, self.checks = CapacityLimiter(LOOKUPS), SharedChecks(READY_S)
 
     def find_key(self, secret: str) -> KeyRow | None:
         """Return the key with a secret, even an expired one; None if it does not exist."""

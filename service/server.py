@@ -190,7 +190,7 @@ class Connection(H11Protocol):
 def close_oldest(connections: Iterable[object], new: object) -> None:
     """If there is no room for a new connection, close the one that has been silent for longest."""
     all_ours = [one for one in connections if isinstance(one, Connection | Handshake)]
-    if len(all_ours) <= room():
+    if len(all_ours) <= connection_limit():
         return
     waiting = [one for one in all_ours if one is not new and one.idle]
     if waiting:
@@ -301,7 +301,7 @@ class Handshake(asyncio.Protocol):
             connection.data_received(bytes(self._early))
 
 
-def room() -> int:
+def connection_limit() -> int:
     """Return the maximum number of open connections."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
@@ -309,7 +309,7 @@ def room() -> int:
     return min(MOST_CONNECTIONS, max(soft - OTHER_FILES, 16))
 
 
-def make_room() -> None:
+def raise_file_limit() -> None:
     """Raise this process's limit of open files to that of all connections, if permitted."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MOST_CONNECTIONS + OTHER_FILES
@@ -385,14 +385,14 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
         timeout_graceful_shutdown=GRACE_S,
         timeout_keep_alive=30,
         # our classes have the time limits that uvicorn lacks
-        http=Connection if context is None else secured(context),
+        http=Connection if context is None else tls_protocol(context),
         ws="none",
         h11_max_incomplete_event_size=16 << 10,
         proxy_headers=False,  # uvicorn would trust X-Forwarded-For from any local process
     )
     raise_descriptors()
     sys.setswitchinterval(SWITCH_S)
-    make_room()
+    raise_file_limit()
     server = _Server(config, lambda: ready(url, read_only), lambda: _close_feed(app))
     try:
         server.run(sockets=[listening])
@@ -417,7 +417,7 @@ def _require_store(settings: Settings) -> bool:
         store.close()
 
 
-def secured(context: ssl.SSLContext) -> type[asyncio.Protocol]:
+def tls_protocol(context: ssl.SSLContext) -> type[asyncio.Protocol]:
     """Return the factory of TLS connections for uvicorn."""
     return cast("type[asyncio.Protocol]", partial(Handshake, context))
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from sceneprint import __version__
 from sceneprint.settings import Settings
-from service.browser_security import Headers, security_headers, stranger
+from service.browser_security import Headers, foreign_request_error, security_headers
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -57,7 +57,7 @@ class Front:
         headers = scope["headers"]
         if not asks or any(name == b"origin" for name, _ in headers):
             return False
-        return not self._alone or stranger(headers, lambda _: False) is None
+        return not self._alone or foreign_request_error(headers, lambda _: False) is None
 
     async def _live(self, receive: Receive, send: Send) -> None:
         """Run the application until the server stops it."""

@@ -63,7 +63,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         return not stop.requested and os.getppid() == parent
 
     with ExitStack() as stack:
-        try:  # it waits without a limit, because a replacement would only wait as well
+        try:  # it waits without a limit, because a replacement would have to wait too
             context = stack.enter_context(open_context(settings, math.inf, should_continue))
         except StoreAway:
             return
@@ -168,7 +168,7 @@ _TIMEOUT = "Timeout ("
 
 
 @dataclass(frozen=True)
-class Left:
+class WorkerTrace:
     """Trace of a dead worker.
 
     Parameters
@@ -182,7 +182,7 @@ class Left:
     text: str
 
     @property
-    def too_long(self) -> bool:
+    def timed_out(self) -> bool:
         """Whether the worker was ended because its job exceeded the time limit."""
         return self.text.startswith(_TIMEOUT)
 
@@ -220,7 +220,7 @@ class Trace:
             raise
         self._end()
 
-    def left(self) -> Left:
+    def read(self) -> WorkerTrace:
         """Return the trace after the worker has died."""
         size = os.fstat(self._descriptor).st_size
         head = os.pread(self._descriptor, HEAD, 0).partition(b"\n")[0]
@@ -228,8 +228,9 @@ class Trace:
         text = os.pread(self._descriptor, KEPT, start).decode(errors="replace")
         job_id, _, token = head.decode(errors="replace").partition(" ")
         if not token.isdigit():  # it crashed without a job
-            return Left(None, 0, os.pread(self._descriptor, KEPT, 0).decode(errors="replace"))
-        return Left(job_id, int(token), text)
+            text = os.pread(self._descriptor, KEPT, 0).decode(errors="replace")
+            return WorkerTrace(None, 0, text)
+        return WorkerTrace(job_id, int(token), text)
 
     def close(self) -> None:
         """Release the memory."""

@@ -18,7 +18,7 @@ from sceneprint.engine.jobs.lifecycle import worker_died
 from sceneprint.errors import SceneprintError
 from sceneprint.settings import Settings
 from sceneprint.store import open_store
-from worker.loop import Left, Trace, work
+from worker.loop import Trace, WorkerTrace, work
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ RESTART_S = 1.0
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
-class Post:
+class Slot:
     """A slot for a worker: its process, or the time from which it may be replaced."""
 
     def __init__(self) -> None:
@@ -39,12 +39,12 @@ class Post:
         self.trace = Trace()
         self.free_at = 0.0
 
-    def end(self) -> tuple[int, int, Left]:
+    def end(self) -> tuple[int, int, WorkerTrace]:
         """Return process id, exit code and trace of a worker that has ended, and free the slot."""
         assert self.worker is not None
         self.worker.join()
         pid, code = self.worker.pid or 0, self.worker.exitcode or 0
-        left = self.trace.left()
+        left = self.trace.read()
         self.worker.close()
         self.trace.close()
         self.worker, self.trace, self.free_at = None, Trace(), time.monotonic()
@@ -58,13 +58,13 @@ class Supervisor:
         self._settings = settings
         # Forked children would inherit locks of threads and crash in OpenMP.
         self._context = multiprocessing.get_context("spawn")
-        self._posts: list[Post] = []
+        self._slots: list[Slot] = []
 
     def start(self) -> None:
         """Start all workers."""
-        self._posts = [Post() for _ in range(self._settings.workers)]
-        for post in self._posts:
-            self._fill(post)
+        self._slots = [Slot() for _ in range(self._settings.workers)]
+        for slot in self._slots:
+            self._start_worker(slot)
 
     def watch(self, stop: threading.Event) -> None:
         """Replace workers that end until `stop` is set; then stop all of them."""
@@ -72,11 +72,11 @@ class Supervisor:
             with _readable(stop) as stopped:
                 while not stop.is_set():
                     now = time.monotonic()
-                    for post in self._posts:
-                        if post.worker is None and post.free_at <= now:
-                            self._fill(post)
-                    free = [post.free_at - now for post in self._posts if post.worker is None]
-                    busy = {post.worker.sentinel: post for post in self._posts if post.worker}
+                    for slot in self._slots:
+                        if slot.worker is None and slot.free_at <= now:
+                            self._start_worker(slot)
+                    free = [slot.free_at - now for slot in self._slots if slot.worker is None]
+                    busy = {slot.worker.sentinel: slot for slot in self._slots if slot.worker}
                     for one in wait([stopped, *busy], min(free, default=None)):
                         if isinstance(one, int) and one in busy:
                             self._replace(busy[one])
@@ -85,28 +85,28 @@ class Supervisor:
 
     def stop(self) -> None:
         """Let every worker finish its frame, and kill those that take too long."""
-        posts = [(post, post.worker) for post in self._posts if post.worker is not None]
-        for _, worker in posts:
+        slots = [(slot, slot.worker) for slot in self._slots if slot.worker is not None]
+        for _, worker in slots:
             worker.terminate()
         until = time.monotonic() + GRACE_S
-        for post, worker in posts:
+        for slot, worker in slots:
             worker.join(max(until - time.monotonic(), 0.1))
             if worker.is_alive():
                 log.error("worker does not stop", extra={"pid": worker.pid})
                 worker.kill()
-            _, code, left = post.end()
+            _, code, left = slot.end()
             self._report(code, left)
-        self._posts = []
+        self._slots = []
 
-    def _fill(self, post: Post) -> None:
+    def _start_worker(self, slot: Slot) -> None:
         worker = self._context.Process(
-            target=work, args=(self._settings, os.getpid(), post.trace), name="sceneprint-worker"
+            target=work, args=(self._settings, os.getpid(), slot.trace), name="sceneprint-worker"
         )
         worker.start()
-        post.worker = worker
+        slot.worker = worker
 
-    def _replace(self, post: Post) -> None:
-        pid, code, left = post.end()
+    def _replace(self, slot: Slot) -> None:
+        pid, code, left = slot.end()
         if code == 0:
             log.info("worker replaced", extra={"pid": pid})
         else:
@@ -115,12 +115,12 @@ class Supervisor:
             if left.job_id is None:
                 if left.text:
                     log.error("worker traceback", extra={"pid": pid, "traceback": left.text})
-                post.free_at += RESTART_S
+                slot.free_at += RESTART_S
                 return
-        self._fill(post)
+        self._start_worker(slot)
         self._report(code, left)
 
-    def _report(self, code: int, left: Left) -> None:
+    def _report(self, code: int, left: WorkerTrace) -> None:
         """Record the failure of a dead worker's job, instead of waiting for its lease."""
         if left.job_id is None:
             return
@@ -135,8 +135,8 @@ class Supervisor:
             log.error("store unreachable", extra={"error": str(trouble)})
 
 
-def _cause(code: int, left: Left, job_s: float) -> str:
-    if left.too_long:
+def _cause(code: int, left: WorkerTrace, job_s: float) -> str:
+    if left.timed_out:
         return f"its worker exceeded {job_s:g} s and was stopped"
     if code == -signal.SIGKILL:
         return "its worker was killed by signal 9 (possibly out of memory)"

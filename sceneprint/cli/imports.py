@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 STALL_S = 120.0
 
 
-class Patience:
+class TimeLimit:
     """A time limit for the jobs of an upload: a deadline, or STALL_S without progress.
 
     Parameters
@@ -74,7 +74,7 @@ class Patience:
         return True
 
 
-def why_unsigned(client: Client, jobs: Iterable[str]) -> str:
+def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
     """Return why jobs have not ended, from the statistics of the service."""
     from sceneprint_client.api import JobState
 
@@ -159,7 +159,7 @@ def import_archives(
 def _report_late(client: Client, options: argparse.Namespace, name: str, job: Job) -> None:
     print_error(
         f"{name}: import {job.job_id} did not end within {options.timeout or STALL_S:g} s; it "
-        f"continues when a worker is free. {why_unsigned(client, [job.job_id])}"
+        f"continues when a worker is free. {unsigned_reason(client, [job.job_id])}"
     )
 
 
@@ -167,7 +167,7 @@ def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job
     """Return the job of an import when it has ended or the time limit is over."""
     from sceneprint_client.api import JobState
 
-    patience, seen = Patience(options.timeout), job.progress
+    limit, seen = TimeLimit(options.timeout), job.progress
     with tqdm(desc=name, unit="frame", disable=None) as bar:
         while not job.state.over:
             client.wait([job.job_id], timeout_s=_PAUSE_S)
@@ -176,8 +176,8 @@ def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job
                 _show_progress(bar, name, job.progress)
             if job.progress != seen or job.state == JobState.RUNNING:
                 seen = job.progress
-                patience.note_progress()
-            if not job.state.over and patience.is_over(client):
+                limit.note_progress()
+            if not job.state.over and limit.is_over(client):
                 break
     return job
 

@@ -29,7 +29,7 @@ def add_model_options(command: argparse.ArgumentParser) -> None:
     choice.add_argument("--model", type=Path, metavar="FILE", help="file of your own model")
 
 
-def open_for(options: argparse.Namespace, settings: Settings, *, psi: bool = False) -> Signer:
+def open_signer_of(options: argparse.Namespace, settings: Settings, *, psi: bool = False) -> Signer:
     """Return the signer of the model in the options, with compiled kernels and an open table. Raise
     UnreadableModel if the model does not exist.
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from sceneprint.atomic_files import write_whole
 from sceneprint.cli.bag import add_recording_options, sequences_at
 from sceneprint.cli.output import one_line, print_error
-from sceneprint.cli.preparation import add_model_options, open_for
+from sceneprint.cli.preparation import add_model_options, open_signer_of
 from sceneprint.errors import DatasetError, FrameError
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.pipeline import Signer, sign
@@ -44,7 +44,7 @@ def run_sign(options: argparse.Namespace) -> int:
     frame could not be signed.
     """
     frames, out = _named_frames(options), options.out
-    signer = open_for(options, Settings(), psi=options.psi)
+    signer = open_signer_of(options, Settings(), psi=options.psi)
     if out is not None:
         _prepare_folder(out, signer)
     entries: list[dict[str, Any]] = []

@@ -337,13 +337,14 @@ def run_restore(options: argparse.Namespace) -> int:
         return _list_bundles(options.place)
     place, name = options.place, options.bundle
     task = "verify" if options.verify_only else "restore"
+    to_server = settings.database_url is not None and not options.verify_only
+    shown = _server(settings) if to_server else ""
     keys = [] if options.verify_only else restoration.list_bundle_keys(place, name)
     keep = _keep_keys(options.keys, keys)
     with ended_by_signals(), progress_bar(task, "record", unit_scale=True) as progress:
         if options.verify_only:
             bundle, done = restoration.verify_bundle(place, name, progress), "is complete"
-        elif settings.database_url is not None:
-            shown = _server(settings)
+        elif to_server:
             bundle = restoration.restore_to_server(place, settings, name, progress, keep_keys=keep)
             done = f"is restored to {shown}"
         else:

@@ -23,7 +23,7 @@ from sceneprint.cli.bag import (
 )
 from sceneprint.cli.imports import (
     STALL_S,
-    Patience,
+    TimeLimit,
     add_map_options,
     axis_or_up,
     check_map_options,
@@ -31,7 +31,7 @@ from sceneprint.cli.imports import (
     import_archives,
     import_maps,
     is_archive_file,
-    why_unsigned,
+    unsigned_reason,
 )
 from sceneprint.cli.options import (
     add_service_options,
@@ -143,14 +143,14 @@ class Tally:
 
 
 def wait_for_all(
-    client: Client, map_name: str, tally: Tally, patience: Patience, *, may_be_redundant: bool
+    client: Client, map_name: str, tally: Tally, limit: TimeLimit, *, may_be_redundant: bool
 ) -> None:
     """Wait for jobs until all have ended or the time limit is over; `tally.waiting` has the rest.
 
     Parameters
     ----------
     tally : counts of the upload, updated for every job that ends
-    patience : time limit
+    limit : time limit
     may_be_redundant : whether frames were sent with the condition that their place is new
     """
     total = len(tally.waiting)
@@ -161,13 +161,13 @@ def wait_for_all(
             def advance(done: int, _: int, before: int = before) -> None:
                 progress(before + done, total)
 
-            waited = client.wait(tally.waiting, timeout_s=patience.left_s, progress=advance)
+            waited = client.wait(tally.waiting, timeout_s=limit.left_s, progress=advance)
             over = [job for job in waited if job.state.over]
             for job in over:
                 redundant = may_be_redundant and _is_redundant(client, map_name, job)
                 tally.end(job, redundant=redundant)
-                patience.note_progress()
-            if tally.waiting and patience.is_over(client):
+                limit.note_progress()
+            if tally.waiting and limit.is_over(client):
                 return
 
 
@@ -307,8 +307,8 @@ def run_upload(options: argparse.Namespace) -> int:
             late = not import_archives(client, options, archives, tally)
             if not options.no_wait and not late:
                 novel = options.if_novel is not None
-                patience = Patience(options.timeout)
-                wait_for_all(client, options.map, tally, patience, may_be_redundant=novel)
+                limit = TimeLimit(options.timeout)
+                wait_for_all(client, options.map, tally, limit, may_be_redundant=novel)
                 if tally.waiting:
                     late = True
                     _report_late(client, options, tally)
@@ -335,7 +335,7 @@ def _report_late(client: Client, options: argparse.Namespace, tally: Tally) -> N
     how = "not" if options.timeout else "none was"
     print_error(
         f"{len(tally.waiting)} frames are stored and waiting, but {how} signed within "
-        f"{options.timeout or STALL_S:g} s. {why_unsigned(client, tally.waiting)}"
+        f"{options.timeout or STALL_S:g} s. {unsigned_reason(client, tally.waiting)}"
     )
 
 

@@ -34,7 +34,7 @@ def routes(files: Mapping[str, StaticFile]) -> APIRouter:
     """Return the routes of the dashboard for files of `files_in`."""
     router = APIRouter(include_in_schema=False)
 
-    def sent(request: Request, name: str) -> Response:
+    def respond(request: Request, name: str) -> Response:
         found = files.get(name)
         if found is None:
             raise HTTPException(404, "the dashboard does not have this file")
@@ -49,7 +49,7 @@ def routes(files: Mapping[str, StaticFile]) -> APIRouter:
 
     @router.api_route("/dashboard", methods=["GET", "HEAD"])
     def index(request: Request) -> Response:
-        return sent(request, INDEX)
+        return respond(request, INDEX)
 
     @router.api_route("/dashboard/", methods=["GET", "HEAD"])
     def slash() -> Response:
@@ -57,6 +57,6 @@ def routes(files: Mapping[str, StaticFile]) -> APIRouter:
 
     @router.api_route("/dashboard/{path:path}", methods=["GET", "HEAD"])
     def file(request: Request, path: str) -> Response:
-        return sent(request, path)
+        return respond(request, path)
 
     return router

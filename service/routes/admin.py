@@ -28,15 +28,15 @@ from sceneprint_client.api.admin import (
     NewModel,
     Stats,
 )
-from service.auth import Asking, Guest, administers, may_admin, reads_every, v1_router
+from service.auth import Guest, Sender, administers, may_admin, reads_every, v1_router
 from service.bodies import json_body, read_record
-from service.problems import declared
+from service.problems import refusals
 from service.running_service import Here
 
 router = APIRouter(tags=["operations"])
 
 #: Longest time that `/readyz` waits for the state of the compiled kernels, seconds.
-LOOK_S = 1.0
+KERNEL_CHECK_S = 1.0
 
 
 class Health(BaseModel):
@@ -59,7 +59,7 @@ class Readiness(Health):
 
 
 @router.head("/healthz", include_in_schema=False)  # load balancers send HEAD
-@router.get("/healthz", responses=declared())
+@router.get("/healthz", responses=refusals())
 async def healthz() -> Health:
     """Return 200 while the process runs, even if the store is unavailable."""
     return Health(status="ok", version=__version__)
@@ -67,24 +67,24 @@ async def healthz() -> Health:
 
 @router.head("/readyz", include_in_schema=False)
 @router.get(
-    "/readyz", responses=declared(), response_model_exclude_defaults=True,
+    "/readyz", responses=refusals(), response_model_exclude_defaults=True,
     openapi_extra={"security": [{}]},  # besides a key: none
 )  # fmt: skip
-async def readyz(here: Here, asking: Guest) -> Readiness:
+async def readyz(here: Here, caller: Guest) -> Readiness:
     """Return 200 if the service can work. It returns 503 while the database or the object store
     does not respond, while kernels are being compiled, and permanently after a later version has
     migrated the store. Requires no key. The result is at most one second old.
     """
-    found = await here.looks.get("readiness", partial(_check_readiness, here.context))
+    found = await here.checks.get("readiness", partial(_check_readiness, here.context))
     # Counting takes time that grows with the store, so requests without a key get no counts.
-    if asking is None or not asking.reads_every:
+    if caller is None or not caller.reads_every:
         return found
-    frames, jobs = await here.looks.get("counts", here.statistics.state_counts)
+    frames, jobs = await here.checks.get("counts", here.statistics.state_counts)
     return found.model_copy(update={"frames": frames, "jobs": jobs})
 
 
 def _check_readiness(context: Context) -> Readiness:
-    context.signers.require_kernels(LOOK_S)
+    context.signers.require_kernels(KERNEL_CHECK_S)
     context.store.blobs.check()
     context.store.database.require_schema()
     with context.store.database.read() as connection:
@@ -99,7 +99,7 @@ def _check_readiness(context: Context) -> Readiness:
 
 
 @router.get(
-    "/metrics", response_class=Response, responses=declared(), dependencies=[Depends(reads_every)]
+    "/metrics", response_class=Response, responses=refusals(), dependencies=[Depends(reads_every)]
 )
 def metrics(here: Here) -> Response:
     """Return metrics in the format of Prometheus. With required keys, it takes `read` for `*`."""
@@ -120,7 +120,7 @@ Limit = Annotated[int, Query(ge=1, le=1000)]
 @keys_router.post(
     "/keys",
     status_code=201,
-    responses=declared(400, 404, 409, 413, 415, 422),
+    responses=refusals(400, 404, 409, 413, 415, 422),
     openapi_extra=json_body("NewKey"),
     dependencies=[Depends(administers)],
 )
@@ -130,31 +130,31 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
     make = partial(
         operations.create_key, here.context.store, new.name, new.grants, new.expires_at, new.tenant
     )
-    made = await here.run(make)
-    response.headers["Location"] = f"/v1/keys/{quote(made.name, safe='')}"
-    return made
+    key = await here.run(make)
+    response.headers["Location"] = f"/v1/keys/{quote(key.name, safe='')}"
+    return key
 
 
-@keys_router.get("/keys", responses=declared(422), dependencies=[Depends(administers)])
+@keys_router.get("/keys", responses=refusals(422), dependencies=[Depends(administers)])
 def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key]:
     """List keys by name, without their secrets."""
     return operations.list_keys(here.context.store, cursor, limit)
 
 
-@keys_router.get("/keys/me", responses=declared())
-def me(asking: Asking) -> Me:
+@keys_router.get("/keys/me", responses=refusals())
+def me(caller: Sender) -> Me:
     """Return the name, the grants and the expiry of the key of this request."""
-    until = asking.expires_at
+    until = caller.expires_at
     return Me(
-        name=asking.name or None,
-        grants=dict(asking.grants),
+        name=caller.name or None,
+        grants=dict(caller.grants),
         expires_at=None if until is None else datetime.fromtimestamp(until, UTC),
     )
 
 
 @keys_router.post(
     "/keys/{key_name:path}/rotate",
-    responses=declared(404, 422),
+    responses=refusals(404, 422),
     dependencies=[Depends(administers)],
 )
 def rotate_key(
@@ -180,7 +180,7 @@ def rotate_key(
 @keys_router.delete(
     "/keys/{key_name:path}",
     status_code=204,
-    responses=declared(404),
+    responses=refusals(404),
     dependencies=[Depends(administers)],
 )
 def revoke_key(key_name: Annotated[str, Path(description="Name of the key.")], here: Here) -> None:
@@ -188,7 +188,7 @@ def revoke_key(key_name: Annotated[str, Path(description="Name of the key.")], h
     operations.revoke_key(here.context.store, key_name)
 
 
-@keys_router.get("/audit", responses=declared(422), dependencies=[Depends(administers)])
+@keys_router.get("/audit", responses=refusals(422), dependencies=[Depends(administers)])
 def list_changes(
     here: Here,
     actor: Annotated[
@@ -216,10 +216,10 @@ def list_changes(
 operations_router = v1_router(tag="operations")
 
 
-@operations_router.get("/stats", responses=declared(404, 422))
+@operations_router.get("/stats", responses=refusals(404, 422))
 def stats(
     here: Here,
-    asking: Asking,
+    caller: Sender,
     map_name: Annotated[
         str | None,
         Query(alias="map", description="Only this map; required if the key may not read all maps."),
@@ -228,17 +228,17 @@ def stats(
 ) -> Stats:
     """Return the present load and the history of up to an hour, over all processes."""
     if map_name is None:
-        asking.require_every("read")
+        caller.require_every("read")
     else:
-        asking.require(map_name, "read")
+        caller.require(map_name, "read")
     return here.statistics.collect(minutes, map_name)
 
 
-@operations_router.get("/models", responses=declared())
-def models(here: Here, asking: Asking) -> Page[ModelInfo]:
+@operations_router.get("/models", responses=refusals())
+def models(here: Here, caller: Sender) -> Page[ModelInfo]:
     """List models for maps: the presets, and those that maps have or had."""
-    found = here.catalogue.list_all(lambda name: asking.may("read", name))
-    if not asking.reads_every:  # a model of unreadable maps would reveal them
+    found = here.catalogue.list_all(lambda name: caller.may("read", name))
+    if not caller.reads_every:  # a model of unreadable maps would reveal them
         found = [one for one in found if one.preset or one.maps]
     return Page[ModelInfo](items=found)
 
@@ -246,18 +246,18 @@ def models(here: Here, asking: Asking) -> Page[ModelInfo]:
 @operations_router.post(
     "/maps/{map_name}/reencoding",
     status_code=202,
-    responses=declared(400, 404, 409, 413, 415, 422),
+    responses=refusals(400, 404, 409, 413, 415, 422),
     openapi_extra=json_body("NewModel"),
     dependencies=[Depends(may_admin)],
 )
-async def reencode(map_name: str, request: Request, here: Here, asking: Asking) -> Map:
+async def reencode(map_name: str, request: Request, here: Here, caller: Sender) -> Map:
     """Sign all frames of a map with another model. The map switches when all are signed.
 
     Until then, queries use the present model. `reencoding` of the map shows the progress. A
     repeated request retries failed frames.
     """
     wanted = await read_record(request, NewModel, "The model")
-    may_read = None if asking.reads_every else partial(asking.may, "read")
+    may_read = None if caller.reads_every else partial(caller.may, "read")
     find = here.catalogue.find
     return await here.run(
         lambda: map_lifecycle.begin_reencoding(
@@ -267,7 +267,7 @@ async def reencode(map_name: str, request: Request, here: Here, asking: Asking) 
 
 
 @operations_router.delete(
-    "/maps/{map_name}/reencoding", responses=declared(404, 409), dependencies=[Depends(may_admin)]
+    "/maps/{map_name}/reencoding", responses=refusals(404, 409), dependencies=[Depends(may_admin)]
 )
 def cancel_reencoding(map_name: str, here: Here) -> Map:
     """Cancel the change of a map's model and delete the signatures of the new model."""

@@ -9,7 +9,7 @@ from fastapi import Path, Request, Response
 from sceneprint_client.api.copies import CopyRequest
 from service.auth import may_read, v1_router
 from service.bodies import json_body, read_record
-from service.problems import declared
+from service.problems import refusals
 from service.running_service import Here
 
 router = v1_router("/maps/{map_name}/copy", "maps", may_read)
@@ -20,7 +20,7 @@ _BYTES: dict[int | str, dict[str, Any]] = {
 
 
 @router.post(
-    "", response_class=Response, responses={**_BYTES, **declared(400, 404, 413, 415, 422)},
+    "", response_class=Response, responses={**_BYTES, **refusals(400, 404, 413, 415, 422)},
     openapi_extra=json_body("CopyRequest"),
 )  # fmt: skip
 async def copy_map(map_name: str, request: Request, here: Here) -> Response:
@@ -33,7 +33,7 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
 
 
 @router.get(
-    "/artifacts/{digest}", response_class=Response, responses={**_BYTES, **declared(404, 422)}
+    "/artifacts/{digest}", response_class=Response, responses={**_BYTES, **refusals(404, 422)}
 )
 def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
@@ -42,7 +42,7 @@ def get_artifact(
     return _response(here.copies.artifact(map_name, digest))
 
 
-@router.get("/model", response_class=Response, responses={**_BYTES, **declared(404)})
+@router.get("/model", response_class=Response, responses={**_BYTES, **refusals(404)})
 def get_map_model(map_name: str, here: Here) -> Response:
     """Return the model file of a map."""
     return _response(here.copies.model(map_name))

@@ -21,7 +21,7 @@ from sceneprint_client.api.results import (
     View,
 )
 from sceneprint_client.formats import BYTES, HEAD, media_types_of
-from service.auth import Asking, MatchMap, may_read, require_readable, v1_router
+from service.auth import MatchMap, Sender, may_read, require_readable, v1_router
 from service.responses import (
     file_responses,
     files,
@@ -29,8 +29,8 @@ from service.responses import (
     preferred_media_type,
     safe,
     send_file,
-    sent,
-    tagged,
+    send_output,
+    tag_headers,
 )
 from service.running_service import Here, Service
 
@@ -65,7 +65,7 @@ async def get_cloud(
     samples are in the upload.
     """
     found = await here.run(lambda: here.outputs.cloud(map_name, frame_id, frame))
-    return await sent(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
+    return await send_output(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
 
 
 @router.get(
@@ -96,7 +96,7 @@ async def get_preview(
 ) -> Response:
     """Return a picture of a frame."""
     found = await here.run(lambda: here.outputs.preview(map_name, frame_id, view, width))
-    return await sent(request, here, found, PNG, name=f"{frame_id}-{view}.png")
+    return await send_output(request, here, found, PNG, name=f"{frame_id}-{view}.png")
 
 
 @router.get(
@@ -108,7 +108,7 @@ async def get_patches(map_name: str, frame_id: str, request: Request, here: Here
     """Return the surface patches of a frame by level, and the patches that validation compares."""
     found = await here.run(lambda: here.outputs.patches(map_name, frame_id))
     document = Output(found.tag, lambda: found.make().model_dump_json().encode())
-    return await sent(request, here, document, JSON)
+    return await send_output(request, here, document, JSON)
 
 
 @router.get(
@@ -131,7 +131,7 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
         output = Output(record.tag, lambda: record.make().model_dump_json().encode())
     else:
         output = await here.run(lambda: outputs.vector(map_name, frame_id, kind))
-    return await sent(request, here, output, kind, Vary="Accept")
+    return await send_output(request, here, output, kind, Vary="Accept")
 
 
 @router.get(
@@ -143,7 +143,7 @@ async def get_upload(map_name: str, frame_id: str, request: Request, here: Here)
     """Return the uploaded file of a frame."""
     found = await here.run(lambda: here.outputs.upload(map_name, frame_id))
     if is_known(request, found.tag):
-        return Response(None, 304, tagged(found))
+        return Response(None, 304, tag_headers(found))
     return await here.gate.enter(lambda: _upload(request, here, found, frame_id))
 
 
@@ -193,7 +193,7 @@ async def get_frame_points(
 ) -> Response:
     """Return the points of `cloud.ply` in a third of its bytes, for drawing on a page."""
     found = await here.run(lambda: here.points.frame(map_name, frame_id, frame, limit))
-    return await sent(request, here, found, MEDIA_TYPE)
+    return await send_output(request, here, found, MEDIA_TYPE)
 
 
 @points_router.get(
@@ -207,12 +207,12 @@ async def get_frame_points(
     ),
 )
 async def get_query_points(
-    query_id: str, request: Request, here: Here, asking: Asking, limit: Limit = LIMIT
+    query_id: str, request: Request, here: Here, caller: Sender, limit: Limit = LIMIT
 ) -> Response:
     """Return the surface of a query in the frame of its sensor, for drawing on a page."""
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     found = await here.run(lambda: here.points.query(query_id, limit))
-    return await sent(request, here, found, MEDIA_TYPE)
+    return await send_output(request, here, found, MEDIA_TYPE)
 
 
 @points_router.get(
@@ -231,7 +231,7 @@ async def get_match_points(
     frame_id: str,
     request: Request,
     here: Here,
-    asking: Asking,
+    caller: Sender,
     map_name: MatchMap = None,
     side: Annotated[PointsSide, Query(description="Which of the two frames to return.")] = "query",
     transform: Annotated[
@@ -246,8 +246,8 @@ async def get_match_points(
     """Return the query or one of its matches in the frame of its own sensor, for drawing on a page.
     Every point has its distance from the surface of the other frame.
     """
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     found = await here.run(
         lambda: here.points.match(query_id, frame_id, map_name, side, transform, limit)
     )
-    return await sent(request, here, found, MEDIA_TYPE)
+    return await send_output(request, here, found, MEDIA_TYPE)

@@ -32,32 +32,32 @@ from sceneprint_client.api.frames import (
 from sceneprint_client.api.listing import FramePage
 from sceneprint_client.formats import media_types_of
 from service import bodies
-from service.auth import Asking, Caller, may_read, may_write, v1_router
+from service.auth import Caller, Sender, may_read, may_write, v1_router
 from service.bodies import (
     FORM,
     FRAME_BODY,
     IdempotencyKey,
-    frames_of,
-    guarded,
+    idempotent_request,
     mark_replayed,
     media_type,
     priority_of,
+    read_frames,
+    read_upload,
     upload_responses,
-    uploaded,
 )
-from service.problems import declared
+from service.problems import refusals
 from service.running_service import Here, Service
 
 router = v1_router("/maps/{map_name}/frames", "frames")
 
 
-@router.get("", responses=declared(404, 422), dependencies=[Depends(may_read)])
+@router.get("", responses=refusals(404, 422), dependencies=[Depends(may_read)])
 def list_frames(map_name: str, here: Here, wanted: Annotated[FramePage, Query()]) -> Page[Frame]:
     """List frames in the order of their upload; deleted frames only with `state=deleted`."""
     return map_frames.list_frames(here.context.store, map_name, wanted, wanted.cursor, wanted.limit)
 
 
-@router.get("/{frame_id}", responses=declared(404), dependencies=[Depends(may_read)])
+@router.get("/{frame_id}", responses=refusals(404), dependencies=[Depends(may_read)])
 def get_frame(map_name: str, frame_id: str, here: Here, response: Response) -> Frame:
     """Return a frame and its state. The ETag changes with each PATCH."""
     frame = map_frames.get_frame(here.context.store, map_name, frame_id)
@@ -66,7 +66,7 @@ def get_frame(map_name: str, frame_id: str, here: Here, response: Response) -> F
 
 
 @router.delete(
-    "/{frame_id}", status_code=204, responses=declared(404), dependencies=[Depends(may_write)]
+    "/{frame_id}", status_code=204, responses=refusals(404), dependencies=[Depends(may_write)]
 )
 def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
     """Delete a frame. Queries stop finding it at once.
@@ -102,7 +102,7 @@ OPTIONS = {"priority": _PRIORITY, "if_novel": _IF_NOVEL}
 _RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"model": Added, "description": "The map already has this frame."},
     201: {"model": Added, "description": "With `Prefer: wait`: the frame has its final state."},
-    **declared(400, 404, 409, 413, 415, 422),
+    **refusals(400, 404, 409, 413, 415, 422),
 }
 Prefer = Annotated[
     str | None,
@@ -110,9 +110,9 @@ Prefer = Annotated[
 ]
 
 
-def in_query(options: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+def query_options(options: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the query parameters of upload options, for the OpenAPI document."""
-    text = "Only if the body is the frame: the same as in the form."
+    text = f"The same as in the form. {bodies.BARE}"
     return [bodies.query_parameter(name, schema, text) for name, schema in options.items()]
 
 
@@ -122,7 +122,7 @@ def _described_upload() -> dict[str, Any]:
     properties = {**form["schema"]["properties"], **OPTIONS}
     schema = {**form["schema"], "properties": properties}
     return {
-        "parameters": [*bodies.parameters(), *in_query(OPTIONS)],
+        "parameters": [*bodies.parameters(), *query_options(OPTIONS)],
         "requestBody": {
             **FRAME_BODY, "content": {FORM: {**form, "schema": schema}, **bodies.content()},
         },
@@ -170,14 +170,14 @@ _BATCH = {
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def add_frame(
-    map_name: str, request: Request, here: Here, asking: Asking, response: Response,
+    map_name: str, request: Request, here: Here, caller: Sender, response: Response,
     prefer: Prefer = None, key: IdempotencyKey = None,
 ) -> Added:  # fmt: skip
     """Add a frame to a map. It is stored durably before the response; a worker signs it next.
 
     Send a form, or the image as the body with all options in the query string.
     """
-    return await _add_frame(map_name, None, request, here, asking, response, prefer, key)
+    return await _add_frame(map_name, None, request, here, caller, response, prefer, key)
 
 
 @router.put(
@@ -185,7 +185,7 @@ async def add_frame(
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def put_frame(
-    map_name: str, frame_id: str, request: Request, here: Here, asking: Asking,
+    map_name: str, frame_id: str, request: Request, here: Here, caller: Sender,
     response: Response, prefer: Prefer = None,
 ) -> Added:  # fmt: skip
     """Add a frame to a map under your own id. Repeating the request returns the existing frame.
@@ -194,28 +194,28 @@ async def put_frame(
     metadata under the same id is refused; the same content under another id is a separate frame.
     """
     check_frame_id(frame_id)
-    return await _add_frame(map_name, frame_id, request, here, asking, response, prefer, None)
+    return await _add_frame(map_name, frame_id, request, here, caller, response, prefer, None)
 
 
 @router.post(
-    "/batch", responses=declared(400, 404, 413, 415, 422), openapi_extra=_BATCH,
+    "/batch", responses=refusals(400, 404, 413, 415, 422), openapi_extra=_BATCH,
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def add_batch(
-    map_name: str, request: Request, here: Here, asking: Asking, response: Response,
+    map_name: str, request: Request, here: Here, caller: Sender, response: Response,
     key: IdempotencyKey = None,
 ) -> Batch:  # fmt: skip
     """Add up to 64 frames to a map at once. An invalid frame does not affect the others.
 
     All valid frames are added in one transaction: if the request fails, none is added.
     """
-    async with here.upload_gate.place(), frames_of(request, "priority", "if_novel") as batch:
+    async with here.upload_gate.place(), read_frames(request, "priority", "if_novel") as batch:
 
         def add() -> tuple[Batch, bool]:
             uploads = batch.read()
             contents = [(one.data, one.meta) for one in uploads]
             parts = ("batch", map_name, contents, batch.priority, batch.if_novel, batch.faults())
-            once = guarded(asking, key, *parts)
+            once = idempotent_request(caller, key, *parts)
             outcomes, replayed = here.uploads.add_all(map_name, uploads, once)
             return upload_responses(batch, outcomes), replayed
 
@@ -225,18 +225,18 @@ async def add_batch(
 
 
 async def _add_frame(
-    map_name: str, frame_id: str | None, request: Request, here: Service, asking: Caller,
+    map_name: str, frame_id: str | None, request: Request, here: Service, caller: Caller,
     response: Response, prefer: str | None, key: str | None,
 ) -> Added:  # fmt: skip
     options = ("priority", "if_novel")
-    async with here.upload_gate.place(), uploaded(request, *options) as form:
+    async with here.upload_gate.place(), read_upload(request, *options) as form:
         priority = priority_of(form.fields)
         if_novel = novelty_of(form.fields.get("if_novel"))
 
         def add() -> tuple[Added, bool, bool]:
             upload = Upload(form.file.read(), form.meta, priority, if_novel, frame_id)
             parts = ("frame", map_name, upload.data, form.meta, priority, if_novel)
-            once = guarded(asking, key, *parts)
+            once = idempotent_request(caller, key, *parts)
             outcome, replayed = here.uploads.add(map_name, upload, once)
             return outcome.accepted, outcome.new, replayed
 
@@ -325,12 +325,12 @@ def _described_import() -> dict[str, Any]:
 
 
 @imports_router.post(
-    "", status_code=202, responses=declared(400, 404, 409, 413, 415, 422),
+    "", status_code=202, responses=refusals(400, 404, 409, 413, 415, 422),
     openapi_extra=_described_import(),
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def add_import(
-    map_name: str, request: Request, here: Here, asking: Asking, response: Response,
+    map_name: str, request: Request, here: Here, caller: Sender, response: Response,
     key: IdempotencyKey = None,
 ) -> Job:  # fmt: skip
     """Import an archive of sequences, or a map in one file. The body is the file itself.
@@ -353,7 +353,7 @@ async def add_import(
     receiving = contextmanager_in_threadpool(here.imports.receive(map_name, options))
     async with here.upload_gate.place(), receiving as receiver:
         archive = await _store_archive(receiver, request, here)
-        once = guarded(asking, key, "import", map_name, archive.blob, options)
+        once = idempotent_request(caller, key, "import", map_name, archive.blob, options)
         job, replayed = await here.upload_gate.run(
             lambda: here.imports.begin(map_name, archive, options, once), patient=True
         )
@@ -363,7 +363,7 @@ async def add_import(
 
 
 @imports_router.get(
-    "/{job_id}/items", responses=declared(404, 422), dependencies=[Depends(may_read)]
+    "/{job_id}/items", responses=refusals(404, 422), dependencies=[Depends(may_read)]
 )
 def list_import_items(
     map_name: str,

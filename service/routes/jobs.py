@@ -19,9 +19,9 @@ from sceneprint.store.events import EventFilter
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage, RetriedJobs
-from service.auth import Asking, Caller, hold_read, page_response, release_place, v1_router
+from service.auth import Caller, Sender, hold_read, page_response, release_place, v1_router
 from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
-from service.problems import declared
+from service.problems import refusals
 from service.running_service import Here, Service
 
 router = v1_router("/jobs", "jobs")
@@ -30,10 +30,10 @@ router = v1_router("/jobs", "jobs")
 MOST_RETRIED = 200
 
 
-@router.get("", responses=declared(404, 422))
+@router.get("", responses=refusals(404, 422))
 def list_jobs(
     here: Here,
-    asking: Asking,
+    caller: Sender,
     state: JobState | None = None,
     kind: Annotated[
         str | None, Query(max_length=16, description="Only this kind, such as `associate`.")
@@ -48,20 +48,20 @@ def list_jobs(
 
     `state=dead` lists jobs that failed repeatedly.
     """
-    names = asking.named
+    names = caller.named
     if map_name is not None:
-        asking.require(map_name, "read")
+        caller.require(map_name, "read")
         get_map(here.context.store, map_name)
         names = (map_name,)
-    elif names is None and not asking.may("admin"):
+    elif names is None and not caller.may("admin"):
         names = tuple(one.name for one in get_maps(here.context.store))
     return lifecycle.list_jobs(here.context.store, state, cursor, limit, kind, names)
 
 
-@router.post("/retry", responses=declared(404, 422))
+@router.post("/retry", responses=refusals(404, 422))
 def retry_dead_jobs(
     here: Here,
-    asking: Asking,
+    caller: Sender,
     map_name: Annotated[
         str | None, Query(alias="map", description="Only jobs of this map.")
     ] = None,
@@ -76,26 +76,26 @@ def retry_dead_jobs(
     `*`.
     """
     if map_name is not None:
-        asking.require(map_name, "write")
+        caller.require(map_name, "write")
         get_map(here.context.store, map_name)
         names: tuple[str, ...] | None = (map_name,)
     else:
-        asking.require_every("write")
-        every = None if asking.may("admin") else get_maps(here.context.store)
+        caller.require_every("write")
+        every = None if caller.may("admin") else get_maps(here.context.store)
         names = None if every is None else tuple(one.name for one in every)
     return lifecycle.retry_dead(here.context.store, here.context.bell, cursor, limit, names)
 
 
-@router.get("/{job_id}", responses=declared(404))
-def get_job(job_id: str, here: Here, asking: Asking) -> Job:
+@router.get("/{job_id}", responses=refusals(404))
+def get_job(job_id: str, here: Here, caller: Sender) -> Job:
     """Return a job and its state."""
-    return asking.require_job(lifecycle.get_job(here.context.store, job_id))
+    return caller.require_job(lifecycle.get_job(here.context.store, job_id))
 
 
-@router.post("/{job_id}/cancel", responses=declared(404, 409))
-def cancel_job(job_id: str, here: Here, asking: Asking) -> Job:
+@router.post("/{job_id}/cancel", responses=refusals(404, 409))
+def cancel_job(job_id: str, here: Here, caller: Sender) -> Job:
     """Cancel an unfinished job; its frame becomes `failed`. A second request changes nothing."""
-    asking.require_job(lifecycle.get_job(here.context.store, job_id), "write")
+    caller.require_job(lifecycle.get_job(here.context.store, job_id), "write")
     return lifecycle.cancel(here.context.store, job_id)
 
 
@@ -104,14 +104,14 @@ def cancel_job(job_id: str, here: Here, asking: Asking) -> Job:
     status_code=202,
     responses={
         200: {"model": Job, "description": "This job is already retrying the frame."},
-        **declared(404, 409),
+        **refusals(404, 409),
     },
 )
-def retry_job(job_id: str, here: Here, asking: Asking, response: Response) -> Job:
+def retry_job(job_id: str, here: Here, caller: Sender, response: Response) -> Job:
     """Retry a dead, cancelled or failed job. A frame gets a new job; a long job continues from its
     last progress under its own id.
     """
-    asking.require_job(lifecycle.get_job(here.context.store, job_id), "write")
+    caller.require_job(lifecycle.get_job(here.context.store, job_id), "write")
     job, is_new = lifecycle.retry(here.context.store, here.context.bell, job_id)
     response.headers["Location"] = f"/v1/jobs/{job.job_id}"
     response.status_code = 202 if is_new else 200
@@ -131,11 +131,11 @@ _STREAM = {
 }
 
 
-@events_router.get("", response_model=EventPage, responses={200: _STREAM, **declared(404, 422)})
+@events_router.get("", response_model=EventPage, responses={200: _STREAM, **refusals(404, 422)})
 async def events(
     request: Request,
     here: Here,
-    asking: Asking,
+    caller: Sender,
     map_name: Annotated[
         str | None, Query(alias="map", description="Only events of this map.")
     ] = None,
@@ -183,16 +183,16 @@ async def events(
 
     def read_filter() -> tuple[EventFilter, int | None]:
         seals.row("event", cursor)  # raises for an invalid cursor, although a stream has no pages
-        wanted = _wanted(here, asking, map_name, kind)
+        wanted = _wanted(here, caller, map_name, kind)
         return wanted, None if last is None else seals.event(last, place)
 
     wanted, number = await here.run(read_filter)
     if MEDIA_TYPE in request.headers.get("accept", ""):
-        here.feed.join(asking.tenant)
+        here.feed.join(caller.tenant)
         release_place(request)
-        messages = _messages(here.feed, seals, wanted, number, _access_check(request, here, asking))
-        return EventStream(messages, partial(here.feed.leave, asking.tenant))
-    await hold_read(request, here, asking.tenant)
+        messages = _messages(here.feed, seals, wanted, number, _access_check(request, here, caller))
+        return EventStream(messages, partial(here.feed.leave, caller.tenant))
+    await hold_read(request, here, caller.tenant)
     newest_first = order == "newest" or (order is None and last is None)
 
     def page() -> Response:
@@ -205,29 +205,29 @@ async def events(
     return await to_thread.run_sync(page)
 
 
-def _wanted(here: Service, asking: Caller, map_name: str | None, kinds: list[str]) -> EventFilter:
+def _wanted(here: Service, caller: Caller, map_name: str | None, kinds: list[str]) -> EventFilter:
     if map_name is not None:
-        asking.require(map_name, "read")
+        caller.require(map_name, "read")
     wanted = here.events.wanted(map_name, kinds)
-    if not asking.reads_every:
-        wanted = replace(wanted, since=asking.created_at)
-    if map_name is not None or asking.may("admin"):
+    if not caller.reads_every:
+        wanted = replace(wanted, since=caller.created_at)
+    if map_name is not None or caller.may("admin"):
         return wanted
-    if asking.named is not None:
-        return replace(wanted, maps=frozenset(asking.named))
+    if caller.named is not None:
+        return replace(wanted, maps=frozenset(caller.named))
     return replace(wanted, of_maps=True)
 
 
-def _access_check(request: Request, here: Service, asking: Caller) -> Callable[[], bool]:
+def _access_check(request: Request, here: Service, caller: Caller) -> Callable[[], bool]:
     """Return a function that checks whether the key is still valid, with the same grants."""
     secret = request.headers.get("authorization", "").partition(" ")[2].strip()
 
     def has_access() -> bool:
-        if not asking.name:
+        if not caller.name:
             return True  # no key is required
         key = here.find_key(secret)
         lasts = key is not None and (key.expires_at is None or key.expires_at > time.time())
-        return key is not None and lasts and dict(key.grants) == dict(asking.grants)
+        return key is not None and lasts and dict(key.grants) == dict(caller.grants)
 
     return has_access
 

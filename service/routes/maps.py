@@ -11,10 +11,10 @@ from sceneprint.engine.maps import map_lifecycle
 from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS
-from service.auth import Asking, may_admin, may_read, may_write, v1_router
+from service.auth import Sender, may_admin, may_read, may_write, v1_router
 from service.bodies import json_body, read_json_object, read_record
-from service.problems import declared
-from service.responses import expected
+from service.problems import refusals
+from service.responses import expected_tags
 from service.running_service import Here
 
 router = v1_router("/maps", "maps")
@@ -23,29 +23,29 @@ router = v1_router("/maps", "maps")
 @router.post(
     "",
     status_code=201,
-    responses={200: {"model": Map}, **declared(400, 409, 413, 415, 422)},
+    responses={200: {"model": Map}, **refusals(400, 409, 413, 415, 422)},
     openapi_extra=json_body("NewMap"),
 )
-async def create_map(request: Request, here: Here, asking: Asking, response: Response) -> Map:
+async def create_map(request: Request, here: Here, caller: Sender, response: Response) -> Map:
     """Create a map. If it already exists with the same settings, the response is 200."""
     new = await read_record(request, NewMap, "The map")
-    asking.require_new(new.name)
+    caller.require_new(new.name)
     if OPERATORS & new.model_fields_set:
-        asking.require_every("admin")
+        caller.require_every("admin")
     record, is_new = await here.run(map_lifecycle.create_map, here.context.store, new)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/maps/{record.name}"
     return record
 
 
-@router.get("", responses=declared())
-def list_maps(here: Here, asking: Asking) -> Page[Map]:
+@router.get("", responses=refusals())
+def list_maps(here: Here, caller: Sender) -> Page[Map]:
     """List the maps that the key may read, by name."""
     found = map_lifecycle.get_maps(here.context.store)
-    return Page[Map](items=[one for one in found if asking.may("read", one.name)])
+    return Page[Map](items=[one for one in found if caller.may("read", one.name)])
 
 
-@router.get("/{map_name}", responses=declared(404), dependencies=[Depends(may_read)])
+@router.get("/{map_name}", responses=refusals(404), dependencies=[Depends(may_read)])
 def get_map(map_name: str, here: Here, response: Response) -> Map:
     """Return a map with its number of frames in each state. The ETag changes with each PATCH."""
     found = map_lifecycle.get_map(here.context.store, map_name)
@@ -54,7 +54,7 @@ def get_map(map_name: str, here: Here, response: Response) -> Map:
 
 
 @router.delete(
-    "/{map_name}", status_code=204, responses=declared(404), dependencies=[Depends(may_admin)]
+    "/{map_name}", status_code=204, responses=refusals(404), dependencies=[Depends(may_admin)]
 )
 def delete_map(map_name: str, here: Here) -> None:
     """Delete a map with everything in it. This cannot be undone."""
@@ -96,7 +96,7 @@ def _document(record: str) -> dict[str, Any]:
 @edits_router.patch(
     "/frames/{frame_id}",
     tags=["frames"],
-    responses=declared(400, 404, 412, 413, 415, 422),
+    responses=refusals(400, 404, 412, 413, 415, 422),
     openapi_extra=_document("FrameEdit"),
     dependencies=[Depends(may_write)],
 )
@@ -104,7 +104,7 @@ async def patch_frame(
     map_name: str, frame_id: str, request: Request, here: Here, response: Response
 ) -> Frame:
     """Edit the metadata of a frame (JSON merge patch, RFC 7396). Filters use it at once."""
-    patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
+    patch, tags = await read_json_object(request, "The edit", _KINDS), expected_tags(request)
     frame = await here.run(edit_frame, here.context.store, map_name, frame_id, patch, tags)
     response.headers["ETag"] = f'"{frame.etag}"'
     return frame
@@ -113,21 +113,21 @@ async def patch_frame(
 @edits_router.patch(
     "",
     tags=["maps"],
-    responses=declared(400, 404, 412, 413, 415, 422),
+    responses=refusals(400, 404, 412, 413, 415, 422),
     openapi_extra=_document("MapEdit"),
     dependencies=[Depends(may_admin)],
 )
 async def patch_map(
-    map_name: str, request: Request, here: Here, asking: Asking, response: Response,
+    map_name: str, request: Request, here: Here, caller: Sender, response: Response,
     dry_run: DryRun = False,
 ) -> Map:  # fmt: skip
     """Edit the title, quotas, retention and up vector of a map (JSON merge patch, RFC 7396).
 
     `quota_frames` and `quota_bytes` require the scope `admin` for `*`.
     """
-    patch, tags = await read_json_object(request, "The edit", _KINDS), expected(request)
+    patch, tags = await read_json_object(request, "The edit", _KINDS), expected_tags(request)
     if OPERATORS & patch.keys():
-        asking.require_every("admin")
+        caller.require_every("admin")
     edit = partial(edit_map, here.context.store, map_name, patch, tags, dry_run=dry_run)
     edited = await here.run(edit)
     response.headers["ETag"] = f'"{edited.etag}"'

@@ -23,7 +23,7 @@ from sceneprint_client.api.coverage import (
 from sceneprint_client.api.sessions import Association, Difference, Edge, Graph, GraphFormat
 from service.auth import may_read, may_write, v1_router
 from service.bodies import json_body, read_record
-from service.problems import declared
+from service.problems import refusals
 from service.responses import file_responses, preferred_media_type, send_product_file
 from service.running_service import Here, Service
 
@@ -65,24 +65,24 @@ def product_router(
     add, writes = router.add_api_route, [Depends(may_write)]
     add(
         "", begin, methods=["POST"], name=f"begin_{noun}", status_code=202, response_model=record,
-        responses=declared(400, 404, 413, 415, 422), dependencies=writes,
+        responses=refusals(400, 404, 413, 415, 422), dependencies=writes,
         openapi_extra=json_body(request_type.__name__, required=not optional),
         description=f"{about} GET the path in `Location` until `state` is `succeeded`. Requires "
         "the scope `write`.",
     )  # fmt: skip
     add(
-        "", list_all, methods=["GET"], name=f"list_{path}", responses=declared(404, 422),
+        "", list_all, methods=["GET"], name=f"list_{path}", responses=refusals(404, 422),
         response_model=Page[record],  # type: ignore[valid-type]
         description=f"The {noun} jobs of a map, newest first.",
     )  # fmt: skip
     add(
-        "/{job_id}", get, methods=["GET"], name=f"get_{noun}", responses=declared(404),
+        "/{job_id}", get, methods=["GET"], name=f"get_{noun}", responses=refusals(404),
         response_model=record,
         description=f"The state of the {noun} job, and its result once it has succeeded.",
     )  # fmt: skip
     add(
         "/{job_id}", delete, methods=["DELETE"], name=f"delete_{noun}", status_code=204,
-        responses=declared(404, 409), dependencies=writes,
+        responses=refusals(404, 409), dependencies=writes,
         description=f"Delete the {noun} job and its results, even while a worker runs it. 409 if "
         "the map depends on it.",
     )  # fmt: skip
@@ -101,7 +101,7 @@ coverage_router = product_router(
 )  # fmt: skip
 
 
-@coverage_router.get("/{job_id}/frames", responses=declared(404, 422))
+@coverage_router.get("/{job_id}/frames", responses=refusals(404, 422))
 def list_coverage_frames(
     map_name: str,
     job_id: str,
@@ -119,7 +119,7 @@ def list_coverage_frames(
     return here.coverage.frames(map_name, job_id, cursor, limit, outcome)
 
 
-@coverage_router.get("/{job_id}/changes", responses=declared(404, 409, 422))
+@coverage_router.get("/{job_id}/changes", responses=refusals(404, 409, 422))
 def get_coverage_changes(
     map_name: str,
     job_id: str,
@@ -183,7 +183,7 @@ _Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Minimum overlap o
 
 
 @associations_router.delete(
-    "/{job_id}/join", responses=declared(404, 409), dependencies=[Depends(may_write)]
+    "/{job_id}/join", responses=refusals(404, 409), dependencies=[Depends(may_write)]
 )
 def undo_join(map_name: str, job_id: str, here: Here) -> Association:
     """Undo the join of an association. Poses return to the uploaded ones, or to the parent frame of
@@ -193,7 +193,7 @@ def undo_join(map_name: str, job_id: str, here: Here) -> Association:
     return here.associations.undo_join(map_name, job_id)
 
 
-@associations_router.get("/{job_id}/edges", responses=declared(404, 422))
+@associations_router.get("/{job_id}/edges", responses=refusals(404, 422))
 def list_edges(
     map_name: str,
     job_id: str,
@@ -216,7 +216,7 @@ def list_edges(
 
 
 @associations_router.get(
-    "/{job_id}/graph", response_class=Response, responses={**_GRAPH, **declared(404, 409, 422)}
+    "/{job_id}/graph", response_class=Response, responses={**_GRAPH, **refusals(404, 409, 422)}
 )
 async def get_graph(
     map_name: str,

@@ -35,20 +35,20 @@ from sceneprint_client.api import (
 from sceneprint_client.api.base import Given, Label, record_of
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from service import bodies
-from service.auth import Asking, Caller, may_read, require_readable, v1_router
+from service.auth import Caller, Sender, may_read, require_readable, v1_router
 from service.bodies import (
     FORM,
     FRAME_BODY,
     FormUpload,
-    form_of,
-    frames_of,
     media_type,
     query_parameter,
+    read_form,
+    read_frames,
     read_json,
     read_meta,
-    uploaded,
+    read_upload,
 )
-from service.problems import declared
+from service.problems import refusals
 from service.running_service import Here, Service
 
 Asked = TypeVar("Asked", bound=Query)
@@ -88,20 +88,20 @@ class _Sender(Given):
 
 
 @asynccontextmanager
-async def question(
+async def read_query(
     request: Request, kind: type[Asked], named: str
 ) -> AsyncIterator[QueryBody[Asked]]:
     """Read a query from JSON or from an upload.
 
     Parameters
     ----------
-    request : request with JSON, or with a frame that `uploaded` reads
+    request : request with JSON, or with a frame that `read_upload` reads
     kind : class of the query
     named : name of the JSON field that names a stored frame; a form does not have it
 
     Raises
     ------
-    UnsupportedType, MalformedBody, InvalidRequest, StoreFull, UnusableStore : See `uploaded`.
+    UnsupportedType, MalformedBody, InvalidRequest, StoreFull, UnusableStore : See `read_upload`.
     """
     if media_type(request) == JSON:
         fields = await read_object(request)
@@ -110,7 +110,7 @@ async def question(
         yield QueryBody(record_of(kind, fields, _QUERY), None, own, sender.robot)
         return
     options = [name for name in kind.model_fields if name != named]
-    async with uploaded(request, *options) as upload:
+    async with read_upload(request, *options) as upload:
         yield QueryBody(record_of(kind, upload.fields, _QUERY), upload, {}, upload.meta.robot)
 
 
@@ -122,7 +122,7 @@ async def read_object(request: Request) -> dict[str, Any]:
     return body
 
 
-def unnamed(name: str) -> InvalidRequest:
+def missing_frame_error(name: str) -> InvalidRequest:
     """Return the error for a query without a frame."""
     return InvalidRequest(
         f"The query has no frame. Specify `{name}`, or send a frame in a form.",
@@ -130,7 +130,7 @@ def unnamed(name: str) -> InvalidRequest:
     )
 
 
-def described(kind: type[BaseModel], named: Mapping[str, Any], required: list[str]) -> Any:
+def query_operation(kind: type[BaseModel], named: Mapping[str, Any], required: list[str]) -> Any:
     """Return `requestBody` and `parameters` of a query, for the OpenAPI document.
 
     Parameters
@@ -183,7 +183,7 @@ def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
 def _parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
     """Return the query parameter of an option, for requests whose body is the frame."""
     schema = {key: one for key, one in option.items() if key not in ("description", "title")}
-    text = f"Only if the body is the frame: {option.get('description', 'the same as in JSON')}"
+    text = f"{option.get('description', 'The same as in JSON.')} {bodies.BARE}"
     return query_parameter(name, schema, text)
 
 
@@ -230,7 +230,7 @@ class PairBody:
 
 
 @asynccontextmanager
-async def pair(request: Request) -> AsyncIterator[PairBody]:
+async def read_pair(request: Request) -> AsyncIterator[PairBody]:
     """Read two frames from JSON, or from a form with parts `a` and `b`. Raise UnsupportedType or
     MalformedBody if the body is neither, InvalidRequest for a missing or repeated frame or an
     invalid field, and StoreFull or UnusableStore if a file cannot be spooled.
@@ -240,7 +240,7 @@ async def pair(request: Request) -> AsyncIterator[PairBody]:
         a, b = (_pair_frame(name, how, {}, {}) for name in _SIDES)
         yield PairBody(a, b, how)
         return
-    async with form_of(request, most_files=2) as form:
+    async with read_form(request, most_files=2) as form:
         files, texts = _parts(form)
         own = {name: value for name, value in texts.items() if not name.startswith("meta_")}
         how = record_of(Comparison, own, "The comparison")
@@ -335,33 +335,33 @@ _ROBOT: dict[str, Any] = {
 _FRAME_ID: dict[str, Any] = {
     "frame_id": {"type": "string", "description": "Id of a frame of the map; replaces an upload."}
 }
-_BODY = described(Query, _FRAME_ID | _ROBOT, ["frame_id"])
-_SEVERAL = described(SeveralQuery, _ROBOT, ["maps"])
-_STATUSES = declared(400, 404, 413, 415, 422)
+_BODY = query_operation(Query, _FRAME_ID | _ROBOT, ["frame_id"])
+_SEVERAL = query_operation(SeveralQuery, _ROBOT, ["maps"])
+_STATUSES = refusals(400, 404, 413, 415, 422)
 
 
 @router.post(
     "/maps/{map_name}/queries", responses=_STATUSES, openapi_extra=_BODY,
     dependencies=[Depends(may_read)],
 )  # fmt: skip
-async def ask(map_name: str, request: Request, here: Here, asking: Asking) -> Answer:
+async def ask(map_name: str, request: Request, here: Here, caller: Sender) -> Answer:
     """Find where a frame was taken. Send a frame, or name a frame of the map.
 
     A sent frame is not added to the map. A frame of the map is not compared with itself.
     """
-    return await _answer(map_name, request, here, asking, localizes=False)
+    return await _answer(map_name, request, here, caller, localizes=False)
 
 
 @router.post(
     "/maps/{map_name}/localize", responses=_STATUSES, openapi_extra=_BODY,
     dependencies=[Depends(may_read)],
 )  # fmt: skip
-async def localize(map_name: str, request: Request, here: Here, asking: Asking) -> Localization:
+async def localize(map_name: str, request: Request, here: Here, caller: Sender) -> Localization:
     """Find the pose of a robot in a map. The options are those of a query.
 
     The full answer with all candidates is stored under `query_id` unless `keep` is false.
     """
-    return localization_of(await _answer(map_name, request, here, asking, localizes=True))
+    return localization_of(await _answer(map_name, request, here, caller, localizes=True))
 
 
 _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
@@ -372,7 +372,7 @@ _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
     dependencies=[Depends(may_read)],
 )  # fmt: skip
 async def localize_sequence(
-    map_name: str, request: Request, here: Here, asking: Asking
+    map_name: str, request: Request, here: Here, caller: Sender
 ) -> Localization:
     """Find the pose of a robot in a map from its last frames. The pose is that of the last frame.
 
@@ -381,13 +381,13 @@ async def localize_sequence(
     """
     since, at = time.perf_counter(), time.time()
     options = tuple(Query.model_fields)
-    async with here.gate.place(), frames_of(request, *options, most=MOST_OF_SEQUENCE) as sent:
+    async with here.gate.place(), read_frames(request, *options, most=MOST_OF_SEQUENCE) as sent:
         query = record_of(Query, sent.texts, _QUERY)
         wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
         if wrong is not None:
             raise wrong
         *_, last = (one for one in sent.metas if isinstance(one, FrameMeta))
-        log = SentQuery([map_name], query, last.robot, last.session, asking.key_id, at=at)
+        log = SentQuery([map_name], query, last.robot, last.session, caller.key_id, at=at)
         answer = await run_query(
             here, log, since,
             lambda: here.queries.sequence(
@@ -397,45 +397,45 @@ async def localize_sequence(
     return localization_of(answer)
 
 
-@router.post("/queries", responses=_STATUSES | declared(409), openapi_extra=_SEVERAL)
-async def ask_several(request: Request, here: Here, asking: Asking) -> Answer:
+@router.post("/queries", responses=_STATUSES | refusals(409), openapi_extra=_SEVERAL)
+async def ask_several(request: Request, here: Here, caller: Sender) -> Answer:
     """Find where a frame was taken in several maps, with one ranking over all of them.
 
     The maps must have the same model. Poses are averaged only within one parent frame of one map,
     which `location.map` names.
     """
     since, at, queries = time.perf_counter(), time.time(), here.queries
-    async with here.gate.place(), question(request, SeveralQuery, "frame") as body:
+    async with here.gate.place(), read_query(request, SeveralQuery, "frame") as body:
         query, upload, frame = body.query, body.upload, body.query.frame
         if query.query_id is not None and (upload is not None or frame is not None):
             raise InvalidRequest(
                 "The query has two frames. Specify either a frame or `query_id`.",
                 (("query_id", "specified together with a frame"),),
             )
-        maps = await here.run(queries.maps_of, query, partial(asking.may, "read"))
+        maps = await here.run(queries.maps_of, query, partial(caller.may, "read"))
         named = None if frame is None else FrameName(map=frame.map, frame_id=frame.frame_id)
-        sent = SentQuery(maps, query, body.robot, body.session, asking.key_id, named, at)
+        sent = SentQuery(maps, query, body.robot, body.session, caller.key_id, named, at)
         if upload is not None:
             return await run_query(
                 here, sent, since,
                 lambda: queries.upload(maps, upload.file.read(), upload.meta, query, since, sent),
             )  # fmt: skip
         if query.query_id is not None:
-            return await _repeat(query.query_id, here, asking, sent, since)
+            return await _repeat(query.query_id, here, caller, sent, since)
         if named is None:
-            raise unnamed("frame")
-        asking.require(named.map, "read")
+            raise missing_frame_error("frame")
+        caller.require(named.map, "read")
         return await run_query(
             here, sent, since, lambda: queries.stored(maps, named, query, since, sent)
         )
 
 
 async def _repeat(
-    query_id: str, here: Service, asking: Caller, sent: SentQuery, since: float
+    query_id: str, here: Service, caller: Caller, sent: SentQuery, since: float
 ) -> Answer:
     """Repeat an earlier query with other options."""
     log = here.context.query_log
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     stored = await here.run(log.find, query_id)
     sent = replace(sent, frame=stored.answer.frame)
     return await run_query(
@@ -445,12 +445,12 @@ async def _repeat(
 
 
 async def _answer(
-    map_name: str, request: Request, here: Service, asking: Caller, *, localizes: bool
+    map_name: str, request: Request, here: Service, caller: Caller, *, localizes: bool
 ) -> Answer:
     since, at = time.perf_counter(), time.time()
-    async with here.gate.place(), question(request, Query, "frame_id") as body:
+    async with here.gate.place(), read_query(request, Query, "frame_id") as body:
         query, upload = body.query, body.upload
-        sent = SentQuery([map_name], query, body.robot, body.session, asking.key_id, at=at)
+        sent = SentQuery([map_name], query, body.robot, body.session, caller.key_id, at=at)
         if localizes:
             check_localizes(query)
         if upload is not None:
@@ -462,7 +462,7 @@ async def _answer(
             )  # fmt: skip
         frame_id = body.named["frame_id"]
         if not isinstance(frame_id, str):
-            raise unnamed("frame_id")
+            raise missing_frame_error("frame_id")
         frame = FrameName(map=map_name, frame_id=frame_id)
         sent = replace(sent, frame=frame)
         return await run_query(
@@ -502,20 +502,20 @@ def _body() -> dict[str, Any]:
 
 @similarity_router.post(
     "/similarity",
-    responses=declared(400, 404, 413, 415, 422),
+    responses=refusals(400, 404, 413, 415, 422),
     openapi_extra={"requestBody": _body()},
 )
-async def compare(request: Request, here: Here, asking: Asking) -> Similarity:
+async def compare(request: Request, here: Here, caller: Sender) -> Similarity:
     """Return how similar two frames are and whether they show one place. Neither is stored.
 
     Each frame is named or sent: in the file part `a` with `meta_a`, or `b` with `meta_b`. Stored
     frames must have the same model; sent frames are signed with it. The transform maps b to a.
     """
-    async with here.gate.place(), pair(request) as body:
+    async with here.gate.place(), read_pair(request) as body:
         a, b = body.a, body.b
         for side in (a, b):
             if isinstance(side, NamedFrame):
-                asking.require(side.map, "read")
+                caller.require(side.map, "read")
         return await here.gate.run(
             lambda: here.queries.compare(
                 a.read() if isinstance(a, Sent) else a,

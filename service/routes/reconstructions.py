@@ -9,9 +9,9 @@ from fastapi import Request, Response
 from sceneprint.engine.products.reconstruction import MEDIA_TYPE, MESH
 from sceneprint.engine.results.query_entry import StoredAnswer, unknown_query
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
-from service.auth import Asking, Caller, v1_router
+from service.auth import Caller, Sender, v1_router
 from service.bodies import json_body, read_record
-from service.problems import declared
+from service.problems import refusals
 from service.responses import files, send_product_file
 from service.running_service import Here, Service
 
@@ -21,28 +21,28 @@ router = v1_router(tag="reconstructions")
 @router.post(
     "/queries/{query_id}/reconstruction",
     status_code=202,
-    responses=declared(400, 404, 413, 415, 422),
+    responses=refusals(400, 404, 413, 415, 422),
     openapi_extra=json_body("NewReconstruction", required=False),
 )
 async def reconstruct(
-    query_id: str, request: Request, here: Here, asking: Asking, response: Response
+    query_id: str, request: Request, here: Here, caller: Sender, response: Response
 ) -> Reconstruction:
     """Fuse the accepted matches of an answer into a surface in the query's camera frame.
 
     A worker runs the job with Open3D, even if the answer expires meanwhile. GET the path in
     `Location` until `state` is `succeeded`, then download mesh.ply. Requires the scope `write`.
     """
-    stored = await here.run(lambda: _stored_answer(here, asking, query_id))
+    stored = await here.run(lambda: _stored_answer(here, caller, query_id))
     wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
     record = await here.run(lambda: here.reconstructions.begin_for(stored, wanted))
     response.headers["Location"] = f"/v1/reconstructions/{record.job_id}"
     return record
 
 
-@router.get("/reconstructions/{job_id}", responses=declared(404))
-def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstruction:
+@router.get("/reconstructions/{job_id}", responses=refusals(404))
+def get_reconstruction(job_id: str, here: Here, caller: Sender) -> Reconstruction:
     """Return a reconstruction, its progress, and its result once it has succeeded."""
-    return _find_reconstruction(here, asking, job_id)
+    return _find_reconstruction(here, caller, job_id)
 
 
 @router.get(
@@ -55,24 +55,24 @@ def get_reconstruction(job_id: str, here: Here, asking: Asking) -> Reconstructio
         409,
     ),
 )
-async def get_mesh(job_id: str, request: Request, here: Here, asking: Asking) -> Response:
+async def get_mesh(job_id: str, request: Request, here: Here, caller: Sender) -> Response:
     """Return the surface in the query's camera frame. 409 until the job has succeeded."""
-    await here.run(_find_reconstruction, here, asking, job_id)
+    await here.run(_find_reconstruction, here, caller, job_id)
     async with here.gate.place():  # the whole file is read into memory
         find = partial(here.reconstructions.file, None, job_id, MESH)
         name = f"{job_id[:12]}-{MESH}"
         return await here.gate.run(partial(send_product_file, request, here, find, name))
 
 
-@router.delete("/reconstructions/{job_id}", status_code=204, responses=declared(404))
-def delete_reconstruction(job_id: str, here: Here, asking: Asking) -> None:
+@router.delete("/reconstructions/{job_id}", status_code=204, responses=refusals(404))
+def delete_reconstruction(job_id: str, here: Here, caller: Sender) -> None:
     """Delete a reconstruction with its files. A running job is cancelled."""
-    for name in _find_reconstruction(here, asking, job_id).maps:
-        asking.require(name, "write")
+    for name in _find_reconstruction(here, caller, job_id).maps:
+        caller.require(name, "write")
     here.reconstructions.remove(None, job_id)
 
 
-def _stored_answer(here: Service, asking: Caller, query_id: str) -> StoredAnswer:
+def _stored_answer(here: Service, caller: Caller, query_id: str) -> StoredAnswer:
     """Return a stored answer if the caller may read all its maps and write to the maps of its
     matches.
     """
@@ -80,15 +80,15 @@ def _stored_answer(here: Service, asking: Caller, query_id: str) -> StoredAnswer
     answer = stored.answer
     matched = {match.map for match in answer.matches}
     queried = {*answer.maps, *([] if answer.frame is None else [answer.frame.map])}
-    if not all(asking.may("read", name) for name in queried | matched):
+    if not all(caller.may("read", name) for name in queried | matched):
         raise unknown_query(query_id)
     for name in sorted(matched):
-        asking.require(name, "write")
+        caller.require(name, "write")
     return stored
 
 
-def _find_reconstruction(here: Service, asking: Caller, job_id: str) -> Reconstruction:
+def _find_reconstruction(here: Service, caller: Caller, job_id: str) -> Reconstruction:
     found = here.reconstructions.get(None, job_id)
-    if not all(asking.may("read", name) for name in found.maps):
+    if not all(caller.may("read", name) for name in found.maps):
         raise here.reconstructions.unknown(job_id)
     return found

@@ -27,9 +27,9 @@ from sceneprint_client.api.results import (
     StoredQuery,
     View,
 )
-from service.auth import Asking, Caller, MatchMap, require_readable, v1_router
+from service.auth import Caller, MatchMap, Sender, require_readable, v1_router
 from service.bodies import json_body, read_record
-from service.problems import declared
+from service.problems import refusals
 from service.running_service import Here, Service
 
 router = v1_router("/queries/{query_id}", "queries")
@@ -37,17 +37,17 @@ router = v1_router("/queries/{query_id}", "queries")
 
 def _ply(description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
     content = {PLY: {"schema": {"type": "string", "format": "binary"}}}
-    return {200: {"description": description, "content": content}, **declared(*statuses)}
+    return {200: {"description": description, "content": content}, **refusals(*statuses)}
 
 
-@router.get("", responses=declared(404, 422))
-def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
+@router.get("", responses=refusals(404, 422))
+def get_answer(query_id: str, here: Here, caller: Sender) -> Answer:
     """Return a stored answer.
 
     Answers are stored for 30 days by default, or less if space runs out; with `keep` false they are
     not stored.
     """
-    require_readable(query_id, here, asking)
+    require_readable(query_id, here, caller)
     return here.inspection.answer(query_id)
 
 
@@ -56,30 +56,30 @@ def get_answer(query_id: str, here: Here, asking: Asking) -> Answer:
     response_class=Response,
     responses=_ply("Points and normals in the query's sensor's frame.", 404, 409, 422),
 )
-async def get_query_cloud(query_id: str, here: Here, asking: Asking) -> Response:
+async def get_query_cloud(query_id: str, here: Here, caller: Sender) -> Response:
     """Return the surface of the query that validation compares, as binary PLY in metres."""
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     data = await here.gate.enter(lambda: here.inspection.cloud(query_id))
     return Response(data, media_type=PLY)
 
 
-@router.get("/similarities", responses=declared(404, 422))
+@router.get("/similarities", responses=refusals(404, 422))
 async def get_similarities(
     query_id: str,
     here: Here,
-    asking: Asking,
+    caller: Sender,
     limit: Annotated[
         int, Query(ge=1, le=200, description="Number of frames of the ranking, nearest first.")
     ] = 50,
 ) -> Similarities:
     """Return the pairwise similarities of the query and its nearest frames for the selection."""
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     return await here.gate.enter(lambda: here.inspection.similarities(query_id, limit))
 
 
-@router.get("/matches/{frame_id}", responses=declared(404, 409, 422))
+@router.get("/matches/{frame_id}", responses=refusals(404, 409, 422))
 async def get_match(
-    query_id: str, frame_id: str, here: Here, asking: Asking, map_name: MatchMap = None
+    query_id: str, frame_id: str, here: Here, caller: Sender, map_name: MatchMap = None
 ) -> MatchDetails:
     """Return a match with its evidence: its rival, coincident patches, and supporting and
     contradicting points.
@@ -87,7 +87,7 @@ async def get_match(
     The match is validated again, with the seed and the options of the query. A match that the query
     skipped is validated now.
     """
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     return await here.gate.enter(lambda: here.inspection.match(query_id, frame_id, map_name))
 
 
@@ -100,7 +100,7 @@ async def get_overlay(
     query_id: str,
     frame_id: str,
     here: Here,
-    asking: Asking,
+    caller: Sender,
     map_name: MatchMap = None,
     color: Annotated[
         OverlayColour,
@@ -121,7 +121,7 @@ async def get_overlay(
     ] = "aligned",
 ) -> Response:
     """Return the clouds of the query and a match in one frame, as binary PLY in metres."""
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     data = await here.gate.enter(
         lambda: here.inspection.overlay(query_id, frame_id, map_name, color, transform)
     )
@@ -133,14 +133,14 @@ _PNG: dict[int | str, dict[str, Any]] = {
         "description": "The tEXt chunks explain the colours.",
         "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
     },
-    **declared(404, 409, 422),
+    **refusals(404, 409, 422),
 }
 
 
-@router.get("/question", responses=declared(404, 422))
-def get_question(query_id: str, here: Here, asking: Asking) -> StoredQuery:
+@router.get("/question", responses=refusals(404, 422))
+def get_question(query_id: str, here: Here, caller: Sender) -> StoredQuery:
     """Return the maps, the frame and the options of a query."""
-    require_readable(query_id, here, asking)
+    require_readable(query_id, here, caller)
     return here.inspection.question(query_id)
 
 
@@ -148,7 +148,7 @@ def get_question(query_id: str, here: Here, asking: Asking) -> StoredQuery:
 async def get_query_preview(
     query_id: str,
     here: Here,
-    asking: Asking,
+    caller: Sender,
     view: Annotated[
         View, Query(description="As for a frame, except `patches`, which queries do not store.")
     ] = "depth",
@@ -157,36 +157,36 @@ async def get_query_preview(
     ] = WIDTH,
 ) -> Response:
     """Return a picture of the frame of a query."""
-    await here.run(require_readable, query_id, here, asking)
+    await here.run(require_readable, query_id, here, caller)
     data = await here.gate.enter(lambda: here.inspection.preview(query_id, view, width))
     return Response(data, 200, {"Cache-Control": "private, no-cache"}, PNG)
 
 
 @router.put(
-    "/keep", responses=declared(400, 404, 413, 415, 422),
+    "/keep", responses=refusals(400, 404, 413, 415, 422),
     openapi_extra=json_body("KeepOptions", required=False),
 )  # fmt: skip
-async def keep_answer(query_id: str, request: Request, here: Here, asking: Asking) -> QueryRecord:
+async def keep_answer(query_id: str, request: Request, here: Here, caller: Sender) -> QueryRecord:
     """Keep a stored answer until it is released.
 
     Deleting a searched map or a frame of the answer also deletes the answer. A new `title` replaces
     the previous one. Requires the scope `write` for every map that was searched.
     """
-    await here.run(_require_write, query_id, here, asking)
+    await here.run(_require_write, query_id, here, caller)
     options = await read_record(request, KeepOptions, "The request to keep it", optional=True)
     return await here.run(here.context.query_log.keep, query_id, options.title)
 
 
-@router.delete("/keep", status_code=204, responses=declared(404, 422))
-def release_answer(query_id: str, here: Here, asking: Asking) -> None:
+@router.delete("/keep", status_code=204, responses=refusals(404, 422))
+def release_answer(query_id: str, here: Here, caller: Sender) -> None:
     """Release a kept answer. Requires the scope `write` for every map that was searched."""
-    _require_write(query_id, here, asking)
+    _require_write(query_id, here, caller)
     here.context.query_log.release(query_id)
 
 
-def _require_write(query_id: str, here: Service, asking: Caller) -> None:
-    for name in require_readable(query_id, here, asking).searched:
-        asking.require(name, "write")
+def _require_write(query_id: str, here: Service, caller: Caller) -> None:
+    for name in require_readable(query_id, here, caller).searched:
+        caller.require(name, "write")
 
 
 # Past queries.
@@ -194,10 +194,10 @@ def _require_write(query_id: str, here: Service, asking: Caller) -> None:
 history_router = v1_router("/queries", "queries")
 
 
-@history_router.get("", responses=declared(404, 422))
+@history_router.get("", responses=refusals(404, 422))
 def list_queries(
     here: Here,
-    asking: Asking,
+    caller: Sender,
     map_name: Annotated[
         str | None, Query(alias="map", description="Only queries of this map.")
     ] = None,
@@ -209,7 +209,7 @@ def list_queries(
     since: Annotated[
         AwareDatetime | None, Query(description="Earliest time, with a time zone.")
     ] = None,
-    until: Annotated[AwareDatetime | None, Query(description="Only queries before it.")] = None,
+    until: Annotated[AwareDatetime | None, Query(description="Latest time.")] = None,
     kept: Annotated[bool, Query(description="Only queries with kept answers.")] = False,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
@@ -220,9 +220,9 @@ def list_queries(
     A query appears within a second and stays for 30 days by default. Queries with `record` false
     and requests that were refused before their query started are not listed.
     """
-    names = asking.named
+    names = caller.named
     if map_name is not None:
-        asking.require(map_name, "read")
+        caller.require(map_name, "read")
         get_map(here.context.store, map_name)
         names = (map_name,)
     wanted = WantedQueries(
@@ -230,16 +230,16 @@ def list_queries(
         since=None if since is None else since.timestamp(),
         until=None if until is None else until.timestamp(),
     )  # fmt: skip
-    return here.context.query_log.page(wanted, names, cursor, limit, partial(asking.may, "read"))
+    return here.context.query_log.page(wanted, names, cursor, limit, partial(caller.may, "read"))
 
 
-@history_router.delete("", status_code=204, responses=declared(404, 422))
+@history_router.delete("", status_code=204, responses=refusals(404, 422))
 def delete_queries(
     here: Here,
-    asking: Asking,
+    caller: Sender,
     map_name: Annotated[str, Query(alias="map", description="Name of the map.")],
 ) -> None:
     """Delete all past queries of a map with their answers. Requires `admin` for the map."""
-    asking.require(map_name, "admin")
+    caller.require(map_name, "admin")
     here.audit.record("queries.removed", map_name)
     here.context.query_log.remove_of_map(map_name)

@@ -20,12 +20,12 @@ from sceneprint_client.api.listing import (
 )
 from service.auth import may_read, may_write, v1_router
 from service.bodies import json_body, read_record
-from service.problems import declared
+from service.problems import refusals
 from service.running_service import Here
 
 router = v1_router("/maps/{map_name}", "frames")
 
-_STATUSES = declared(400, 404, 413, 415, 422)
+_STATUSES = refusals(400, 404, 413, 415, 422)
 
 
 @router.post(
@@ -60,7 +60,7 @@ async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdit
 
 
 @router.post(
-    "/frames/{frame_id}/restore", responses=declared(404, 409), dependencies=[Depends(may_write)]
+    "/frames/{frame_id}/restore", responses=refusals(404, 409), dependencies=[Depends(may_write)]
 )
 def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
     """Restore a deleted frame. Queries find it again at once.
@@ -71,7 +71,7 @@ def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
     return get_frame(here.context.store, map_name, frame_id)
 
 
-@router.get("/deletions", responses=declared(404, 422), dependencies=[Depends(may_read)])
+@router.get("/deletions", responses=refusals(404, 422), dependencies=[Depends(may_read)])
 def list_deletions(
     map_name: str,
     here: Here,
@@ -83,7 +83,7 @@ def list_deletions(
 
 
 @router.post(
-    "/deletions/{deletion_id}/restore", responses=declared(404), dependencies=[Depends(may_write)]
+    "/deletions/{deletion_id}/restore", responses=refusals(404), dependencies=[Depends(may_write)]
 )
 async def restore_deletion(map_name: str, deletion_id: str, here: Here) -> FramesRestored:
     """Restore the frames of a deletion with all their data. Queries find them again at once.

@@ -14,7 +14,7 @@ from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
 from service.auth import may_read, may_write, v1_router
 from service.bodies import json_body, read_record
-from service.problems import declared
+from service.problems import refusals
 from service.responses import preferred_media_type
 from service.running_service import Here
 
@@ -28,11 +28,11 @@ _TRAJECTORY: dict[int | str, dict[str, Any]] = {
         "model": Trajectory,
         "content": {_PLAIN: {"schema": {"type": "string"}}},
     },
-    **declared(404, 422),
+    **refusals(404, 422),
 }
 
 
-@router.get("/sessions", responses=declared(404, 422))
+@router.get("/sessions", responses=refusals(404, 422))
 def get_sessions(
     map_name: str,
     here: Here,
@@ -53,7 +53,7 @@ _Robot = Annotated[
 ]
 
 
-@router.delete("/sessions", responses=declared(404, 422), dependencies=[Depends(may_write)])
+@router.delete("/sessions", responses=refusals(404, 422), dependencies=[Depends(may_write)])
 async def delete_session_frames(
     map_name: str, session: _SessionName, here: Here, robot: _Robot = None
 ) -> SessionChange:
@@ -69,7 +69,7 @@ async def delete_session_frames(
 
 @router.patch(
     "/sessions",
-    responses=declared(400, 404, 413, 415, 422),
+    responses=refusals(400, 404, 413, 415, 422),
     openapi_extra=json_body("SessionEdit"),
     dependencies=[Depends(may_write)],
 )

@@ -19,8 +19,8 @@ from sceneprint_client.api.surface import (
     SurfaceTile,
 )
 from service.auth import may_read, may_write, v1_router
-from service.problems import declared
-from service.responses import file_responses, is_known, sent
+from service.problems import refusals
+from service.responses import file_responses, is_known, send_output
 from service.running_service import Here
 
 router = v1_router("/maps/{map_name}/surface", "surface", may_read)
@@ -33,7 +33,7 @@ Parent = Annotated[
 ]
 
 
-@router.get("", responses=declared(404))
+@router.get("", responses=refusals(404))
 def get_surface(map_name: str, here: Here) -> MapSurface:
     """Return the state, the levels of tiles and the sessions of a map's fused surface."""
     return here.surfaces.get(map_name)
@@ -44,7 +44,7 @@ def get_surface(map_name: str, here: Here) -> MapSurface:
     status_code=202,
     responses={
         200: {"model": MapSurface, "description": "The surface is up to date."},
-        **declared(404, 422),
+        **refusals(404, 422),
     },
     dependencies=[Depends(may_write)],
 )
@@ -62,13 +62,13 @@ def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
     return surface
 
 
-@router.delete("", status_code=204, responses=declared(404), dependencies=[Depends(may_write)])
+@router.delete("", status_code=204, responses=refusals(404), dependencies=[Depends(may_write)])
 def delete_surface(map_name: str, here: Here) -> None:
     """Delete the surface of a map. Workers build it again only on request."""
     here.surfaces.remove(map_name)
 
 
-@router.get("/tiles", responses=declared(404, 422))
+@router.get("/tiles", responses=refusals(404, 422))
 def list_surface_tiles(
     map_name: str,
     here: Here,
@@ -97,7 +97,7 @@ def get_surface_tile(map_name: str, digest: str, request: Request, here: Here) -
     return Response(found.make(), 200, headers, _BYTES)
 
 
-@router.get("/frames", responses=declared(404, 422))
+@router.get("/frames", responses=refusals(404, 422))
 def list_surface_frames(
     map_name: str,
     here: Here,
@@ -164,7 +164,7 @@ async def get_surface_plan(
 ) -> Response:
     """Return a plan of a surface. `plan` of GET /v1/maps/{map_name}/surface has its position."""
     output = await here.run(lambda: here.surfaces.picture(map_name, parent, width, low, high))
-    return await sent(request, here, output, _PNG, "surface.png")
+    return await send_output(request, here, output, _PNG, "surface.png")
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:

@@ -67,6 +67,6 @@ def test_rows_of_five_are_named_or_refused(sceneprint: Run, scans: Path, tmp_pat
     assert "1 of the frames are point clouds" in done.stdout
     assert "`sceneprint reencode rows --model lidar`" in done.stdout
     done = sceneprint("upload", "rows", scans, "--row", "x,y,z,i", expect=2)
-    assert "--row is for .bin files, and walk has others" in done.stderr
+    assert "--row is for .bin files, but walk has other files" in done.stderr
     done = sceneprint("upload", "rows", scans / "1.ply", "--as-map", "--row", "x,y,z", expect=2)
     assert "--row is for .bin files, not for maps" in done.stderr

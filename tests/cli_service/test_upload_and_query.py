@@ -280,7 +280,7 @@ def test_queries_that_cannot_be_asked(
     assert done.stderr.startswith("seq-01/frame-000000: ")
     for arguments, message in (
         (("--frame", 3), r"has 3 frames\. Set --frame to an index from 0 to 2"),
-        (("--frame", "x"), "no frame is called x"),
+        (("--frame", "x"), "no frame is named x"),
         (("--stages", "validate", "--frame", 1), "stages: "),
         (("--k", 51, "--frame", 1), "less than or equal to 50"),
     ):
@@ -439,7 +439,7 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     [
         (("--as-map", "--every", "2"), "every: does not apply to a map"),
         (("--as-map", "--up", "0,0,1"), "up: one of x, -x"),
-        (("--offset", "0,0,1"), "--offset is for a map that is one file"),
+        (("--offset", "0,0,1"), "--offset is only for maps in one file"),
         (("--height", "1"), "--height is only for maps in one file. Add --as-map"),
         (("--up", "z"), "--up z is an axis of a file, for --as-map"),
     ],

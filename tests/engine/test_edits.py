@@ -132,10 +132,10 @@ def test_where_the_camera_sits(edit: Callable[..., Frame], full: Engine) -> None
         ({"captured_at": "2026-11-16T10:30:00"}, "captured_at: "),
         ({"pose": 5}, "pose: "),
         ({"pose": {"translation": {"x": 1}}}, "pose.translation.y: "),
-        ({"pose": {"matrix": TURN, "translation": {"x": 1, "y": 2, "z": 3}}}, "pose: give "),
+        ({"pose": {"matrix": TURN, "translation": {"x": 1, "y": 2, "z": 3}}}, "pose: specify "),
         ({"pose": {"nose": 1}}, "pose.nose: "),
         ({"pose": {"parent_frame": None}}, "specify its parent_frame, or the session"),
-        ({"T_base_sensor": {"base_frame": "b"}}, "T_base_sensor: give "),
+        ({"T_base_sensor": {"base_frame": "b"}}, "T_base_sensor: specify "),
     ],
 )
 def test_what_cannot_be_is_refused_and_nothing_changes(

@@ -49,7 +49,7 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
 
 @contextmanager
 def running(application: Any, context: ssl.SSLContext | None = None) -> Iterator[tuple[str, int]]:
-    http = Connection if context is None else connections.secured(context)
+    http = Connection if context is None else connections.tls_protocol(context)
     config = uvicorn.Config(
         application, http=http, lifespan="off", log_config=None, access_log=False
     )
@@ -218,7 +218,7 @@ def test_an_answer_that_is_read_slowly_is_given_whole(opened):
 @by_both
 def test_who_was_silent_for_longest_makes_room(opened, monkeypatch):
     monkeypatch.setattr(connections, "HEAD_S", 60)
-    monkeypatch.setattr(connections, "room", lambda: 3)
+    monkeypatch.setattr(connections, "connection_limit", lambda: 3)
     first, second = opened(), opened()
     working = opened(ask("/wait", CLOSE))
     fourth = opened(ask("/", CLOSE))
@@ -232,7 +232,7 @@ def test_who_was_silent_for_longest_makes_room(opened, monkeypatch):
 def test_of_a_crowd_that_comes_at_once_no_more_stay_than_there_is_room_for(opened, monkeypatch):
     """Each newcomer sends another away, not all of them the same."""
     monkeypatch.setattr(connections, "HEAD_S", 60)
-    monkeypatch.setattr(connections, "room", lambda: 5)
+    monkeypatch.setattr(connections, "connection_limit", lambda: 5)
     crowd = [opened() for _ in range(40)]
     for wire in crowd[:34]:
         assert rest(wire) == b""
@@ -253,7 +253,7 @@ def test_who_does_not_agree_on_tls_is_closed_without_a_word(opened):
 @by_tls
 def test_connections_without_tls_yet_are_counted_too(opened, monkeypatch):
     monkeypatch.setattr(connections, "HEAD_S", 60)
-    monkeypatch.setattr(connections, "room", lambda: 3)
+    monkeypatch.setattr(connections, "connection_limit", lambda: 3)
     crowd = [opened(bare=True) for _ in range(20)]
     for wire in crowd[:16]:
         assert rest(wire) == b""
@@ -367,12 +367,12 @@ def test_what_is_no_http_is_refused_as_all_else(opened):
 
 def test_room_is_what_the_machine_allows(monkeypatch):
     monkeypatch.setattr(connections.resource, "getrlimit", lambda _: (1024, 4096))
-    assert connections.room() == 1024 - connections.OTHER_FILES
+    assert connections.connection_limit() == 1024 - connections.OTHER_FILES
     monkeypatch.setattr(connections.resource, "getrlimit", lambda _: (4096, 4096))
-    assert connections.room() == connections.MOST_CONNECTIONS
+    assert connections.connection_limit() == connections.MOST_CONNECTIONS
     set_to = []
     monkeypatch.setattr(connections.resource, "setrlimit", lambda _, both: set_to.append(both))
-    connections.make_room()
+    connections.raise_file_limit()
     monkeypatch.setattr(connections.resource, "getrlimit", lambda _: (256, 1100))
-    connections.make_room()
+    connections.raise_file_limit()
     assert set_to == [(1100, 1100)]

@@ -60,7 +60,7 @@ def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
     write(database, *("hall" for _ in range(20)))
 
     async def run() -> None:
-        feed = Feed(database, most=9, kept=1000)
+        feed = Feed(database, most=9, retained=1000)
         streams = [(EventFilter(), 0), (EventFilter(), 13), (EventFilter(frozenset(("shop",))), 0)]
         begun = [feed.batches(wanted, after, always) for wanted, after in streams]
         for _ in begun:
@@ -87,7 +87,7 @@ def test_from_now_on_means_from_when_it_was_asked(database):
     write(database, "hall")
 
     async def run() -> None:
-        feed = Feed(database, most=1, kept=1000)
+        feed = Feed(database, most=1, retained=1000)
         feed.join()
         stream = feed.batches(EventFilter(), None, always)
         assert await anext(stream) == ([], 1)
@@ -108,7 +108,7 @@ def test_what_is_gone_is_said_to_be(database):
         remove_events(connection, [1, 3])
 
     async def run() -> None:
-        feed = Feed(database, most=9, kept=9)
+        feed = Feed(database, most=9, retained=9)
         for after, place in ((1, 1), (99, 12)):
             stream = feed.batches(EventFilter(), after, always)
             first, told = await anext(stream)
@@ -131,7 +131,7 @@ def test_silence_is_broken_and_a_key_that_opens_nothing_ends_it(database, monkey
         return len(asked) < 3
 
     async def run() -> list[Batch]:
-        feed = Feed(database, most=1, kept=9)
+        feed = Feed(database, most=1, retained=9)
         return [batch async for batch in feed.batches(EventFilter(), None, twice)]
 
     assert asyncio.run(run()) == [([], 1)] * 3
@@ -148,7 +148,7 @@ def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
         return len(asked) < 3
 
     async def run(wanted: EventFilter) -> list[Batch]:
-        feed, found = Feed(database, most=1, kept=1000), []
+        feed, found = Feed(database, most=1, retained=1000), []
         asked.clear()
 
         async def busy() -> None:
@@ -171,7 +171,7 @@ def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
 
 def test_there_are_so_many_places_and_all_end_together(database):
     async def run() -> None:
-        feed = Feed(database, most=2, kept=9)
+        feed = Feed(database, most=2, retained=9)
         for _ in range(2):
             feed.join()
         with pytest.raises(Busy, match="limit of open event streams"):

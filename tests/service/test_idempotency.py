@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sceneprint_client.api.base import Given
 from service.auth import Caller
-from service.bodies import guarded
+from service.bodies import idempotent_request
 
 
 class Before(Given):
@@ -20,7 +20,7 @@ class After(Before):
 
 
 def print_of(part: Given) -> str:
-    once = guarded(Caller("fleet", {}), "k", "route", part)
+    once = idempotent_request(Caller("fleet", {}), "k", "route", part)
     assert once is not None
     return once.fingerprint
 

@@ -18,7 +18,7 @@ from sceneprint.cli import main
 from sceneprint.engine.admin.operations import create_key, list_keys
 from sceneprint.settings import Settings
 from service.app import create_app, housekeeping
-from service.auth import caller
+from service.auth import authenticate
 from service.limits import RequestBody
 from service.metrics import Metrics
 from service.running_service import Service
@@ -179,7 +179,7 @@ def test_a_key_is_looked_up_while_every_shared_thread_is_taken(tmp_path):
             shown = HTTPAuthorizationCredentials(scheme="Bearer", credentials=secret)
             try:
                 with fail_after(30):
-                    return (await caller(request, here, shown)).name
+                    return (await authenticate(request, here, shown)).name
             finally:
                 for one in slow:
                     shared.release_on_behalf_of(one)

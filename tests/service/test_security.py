@@ -195,7 +195,7 @@ def test_who_asks_too_often_is_asked_to_wait(held, refused):
     assert [answer.status_code for answer in answers] == [200, 429, 429]
     assert answers[0].headers["ratelimit-policy"] == '"requests";q=1;w=50'
     assert answers[0].headers["ratelimit"].startswith('"requests";r=0;t=')
-    refused(answers[2], 429, "rate-limited", "Too many requests: 1 at once")
+    refused(answers[2], 429, "rate-limited", "Too many requests: the limit is 1 at once")
     assert answers[2].headers["ratelimit"].startswith('"requests";r=0;t=')
     assert 1 <= int(answers[2].headers["retry-after"]) <= 50
     assert answers[2].headers["ratelimit"].endswith(f"t={answers[2].headers['retry-after']}")
@@ -256,7 +256,7 @@ def test_wrong_keys_are_counted_and_right_ones_are_not_kept_out_by_them(held, re
 
     answers = [try_key(f"sp_wrong{number}") for number in range(4)]
     assert [answer.status_code for answer in answers] == [401, 401, 429, 429]
-    refused(answers[3], 429, "rate-limited", "Too many wrong keys: 2 at once")
+    refused(answers[3], 429, "rate-limited", "Too many wrong keys: the limit is 2 at once")
     assert try_key(held.secrets["robot"]).status_code in (200, 429)
     told = try_key(held.secrets["robot"]).headers["ratelimit-policy"]
     assert told.startswith('"requests"')  # its own limit, not that of the wrong ones

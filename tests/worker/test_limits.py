@@ -64,13 +64,13 @@ def test_a_signal_ends_the_wait(number: int) -> None:
 
 def test_a_job_that_is_done_leaves_nothing() -> None:
     trace = Trace()
-    assert (trace.left().job_id, trace.left().text) == (None, "")
+    assert (trace.read().job_id, trace.read().text) == (None, "")
     with trace.job("ab", 3, 600.0):
-        assert (trace.left().job_id, trace.left().token, trace.left().text) == ("ab", 3, "")
-    assert (trace.left().job_id, trace.left().text) == (None, "")
+        assert (trace.read().job_id, trace.read().token, trace.read().text) == ("ab", 3, "")
+    assert (trace.read().job_id, trace.read().text) == (None, "")
     with pytest.raises(LostLease), trace.job("cd", 4, 600.0):
         raise LostLease("said on purpose")
-    assert (trace.left().job_id, trace.left().text) == (None, "")
+    assert (trace.read().job_id, trace.read().text) == (None, "")
     trace.close()
 
 
@@ -78,8 +78,8 @@ def test_an_error_that_ends_the_worker_leaves_its_traceback() -> None:
     trace = Trace()
     with pytest.raises(MemoryError), trace.job("ab" * 16, 12, 600.0):
         raise MemoryError("all of it")
-    left = trace.left()
-    assert (left.job_id, left.token, left.too_long) == ("ab" * 16, 12, False)
+    left = trace.read()
+    assert (left.job_id, left.token, left.timed_out) == ("ab" * 16, 12, False)
     assert left.text.startswith("Traceback (most recent call last):\n")
     assert left.text.endswith("MemoryError: all of it\n")
     trace.close()
@@ -89,7 +89,7 @@ def test_of_a_long_traceback_the_end_is_kept() -> None:
     trace = Trace()
     with pytest.raises(ValueError, match="end"), trace.job("ab", 1, 600.0):
         raise ValueError("x" * (2 * KEPT) + "the end")
-    left = trace.left()
+    left = trace.read()
     assert (left.job_id, left.token, len(left.text)) == ("ab", 1, KEPT)
     assert left.text.endswith("xthe end\n")
     trace.close()
@@ -98,8 +98,8 @@ def test_of_a_long_traceback_the_end_is_kept() -> None:
 def test_a_crash_of_no_job_is_not_mistaken_for_one() -> None:
     trace = Trace()
     os.write(trace._descriptor, b"Fatal Python error: Segmentation fault\n" + b"x" * HEAD)
-    assert trace.left().job_id is None
-    assert trace.left().text.startswith("Fatal Python error")
+    assert trace.read().job_id is None
+    assert trace.read().text.startswith("Fatal Python error")
     trace.close()
 
 
@@ -120,7 +120,7 @@ def test_code_that_never_gives_the_interpreter_back_is_ended() -> None:
     trace = Trace()
     own = trace._descriptor
     done = subprocess.run([sys.executable, "-c", TIMEOUT, str(own)], pass_fds=[own], check=False)
-    left = trace.left()
-    assert (done.returncode, left.job_id, left.token, left.too_long) == (1, "ab", 7, True)
+    left = trace.read()
+    assert (done.returncode, left.job_id, left.token, left.timed_out) == (1, "ab", 7, True)
     assert "in stuck" in left.text
     trace.close()

@@ -13,8 +13,8 @@ RECORDS = "records.md"
 ERRORS = "../../reference.md#problems"
 JSON = "application/json"
 PROBLEM = "application/problem+json"
-#: Prefix of the descriptions of parameters that replace fields of a form.
-BARE = "Only if the body is the frame: "
+#: End of the descriptions of parameters that replace fields of a form.
+BARE = " Only if the body is the frame."
 _METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD")
 #: Bounds of JSON Schema in words, which follow a type.
 _BOUNDS = {
@@ -106,7 +106,7 @@ def _overview(own: list[Operation], file: str) -> str:
 
 def _describe(one: Operation) -> str:
     parameters = one.body.get("parameters", [])
-    bare = [each for each in parameters if each.get("description", "").startswith(BARE)]
+    bare = [each for each in parameters if each.get("description", "").endswith(BARE)]
     named = [each for each in parameters if each not in bare]
     folded = ""
     if bare:
@@ -133,7 +133,7 @@ def _parameters(parameters: list[Json]) -> str:
             code(one["name"]),
             one["in"] + (" (required)" if one.get("required") else ""),
             type_of(one["schema"]),
-            _meaning(one.get("description", "").removeprefix(BARE), one["schema"]),
+            _meaning(one.get("description", "").removesuffix(BARE), one["schema"]),
         )
         for one in parameters
     )

@@ -147,16 +147,16 @@ class IndexState(ApiRecord):
 
     map: str
     version: int | None = Field(
-        description="Null: the map has none, and a query compares every frame. Small maps need "
-        "none, and models that store psi have none."
+        description="Version of the index; null without an index, as for small maps and models "
+        "that store psi. Queries then compare every frame."
     )
     tail: int = Field(
-        description="Indexed frames that the version lacks. Above the setting `UNINDEXED_FRAMES`, "
-        "and not going down: see that workers run."
+        description="Number of indexed frames that the version lacks. If it stays above the "
+        "setting `UNINDEXED_FRAMES`, check that workers run."
     )
     recall: IndexRecall | None = Field(
         default=None,
-        description="Null without an index, because a query then compares every frame.",
+        description="Recall with the index; null without an index.",
     )
 
 
@@ -261,7 +261,7 @@ class Stats(ApiRecord):
         default=None, description="Use of quota and retention; null for all maps."
     )
     scrub: ScrubSeen | None = Field(
-        default=None, description="Null before the first pass, and for one map."
+        default=None, description="State of the scrub; null before the first pass, and for one map."
     )
     total: Counted = Field(description="Sum of all minutes.")
     minutes: list[Minute] = Field(
@@ -344,9 +344,9 @@ class Product(ApiRecord):
     request_type: ClassVar[type[Given]]
 
     job_id: str = Field(description="Id of the product and of its job: GET /v1/jobs/{job_id}.")
-    map: str | None = Field(description="Null if the result may have frames of several maps.")
+    map: str | None = Field(description="Map; null if the result may have several.")
     state: JobState
-    progress: Progress | None = Field(description="Null before the job starts.")
+    progress: Progress | None = Field(description="Progress; null before the job starts.")
     error: str | None
     created_at: datetime
     finished_at: datetime | None
@@ -396,7 +396,7 @@ class RefusedRetry(ApiRecord):
 class RetriedJobs(ApiRecord):
     """The result of retrying a page of dead jobs."""
 
-    retried: list[Job] = Field(description="The new jobs.")
+    retried: list[Job] = Field(description="Jobs that retry the dead jobs.")
     refused: list[RefusedRetry]
     next_cursor: str | None = Field(
         description="Send it as `cursor` for the next page; null at the end."

@@ -198,8 +198,8 @@ class CellChange(ApiRecord):
         "wrong, 0 otherwise). `new` and `gone`: only one of the jobs has queried frames in the "
         "cell."
     )
-    before: CoverageCell | None = Field(description="Null if the cell had no frames.")
-    after: CoverageCell | None
+    before: CoverageCell | None = Field(description="Earlier counts; null without frames.")
+    after: CoverageCell | None = Field(description="Later counts; null without frames.")
 
 
 class PlanChanges(ApiRecord):

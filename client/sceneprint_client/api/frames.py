@@ -264,7 +264,7 @@ class BatchItem(ApiRecord):
         description="Status code as for a single upload: 202 received, 200 already in the map, 403 "
         "quota exceeded, 409 or 422 refused."
     )
-    frame: Added | None = Field(description="Null if the frame was refused.")
+    frame: Added | None = Field(description="Added frame; null if it was refused.")
     problem: Problem | None = Field(description="Problem of a refused frame; otherwise null.")
 
 
@@ -459,7 +459,7 @@ class ImportItem(ApiRecord):
 
     name: str = Field(description="Name of the file in the archive, or of a sequence.")
     status: int = Field(description="Status code as for an item of a batch.")
-    frame_id: str | None = Field(description="Null if the frame was refused.")
+    frame_id: str | None = Field(description="Id of the frame; null if it was refused.")
     job_id: str | None = Field(description="Id of the job that signs the frame.")
     problem: Problem | None = Field(description="Problem of a refused frame; otherwise null.")
     samples: SampleRange | None = Field(

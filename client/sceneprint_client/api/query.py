@@ -405,7 +405,9 @@ class ExplainedFrame(ApiRecord):
     map: str
     name: str | None = Field(default=None, description="Name of the original file or message.")
     state: str = Field(description="State of the frame. Only indexed frames are searched.")
-    passes_filter: bool | None = Field(description="Null if the frame is not searchable.")
+    passes_filter: bool | None = Field(
+        description="Whether the frame matches the filter; null if it is not searchable."
+    )
     distance: int | None = Field(
         description="Exact distance, whether or not the query computed it."
     )

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from sceneprint.atomic_files import check_writable, write_whole
 from sceneprint.cli import number_within, positive, positive_number, whole_number
 from sceneprint.cli.bag import add_recording_options, sequences_at
-from sceneprint.cli.preparation import add_model_options, open_for
+from sceneprint.cli.preparation import add_model_options, open_signer_of
 from sceneprint.errors import DatasetError
 from sceneprint.settings import Settings
 from sceneprint_client.sidecars import Camera
@@ -155,7 +155,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
     protocol = _protocol(options)
     baselines = _baselines(options.baselines)
-    signer = open_for(options, Settings(), psi=options.signature == "psi")
+    signer = open_signer_of(options, Settings(), psi=options.signature == "psi")
     if options.levels is not None and signer.model.whitening is not None:
         raise DatasetError(
             f"--levels {options.levels}: the signatures of model {signer.model.label} cannot be "
@@ -379,7 +379,7 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
     from sceneprint_lab.evaluation.report import to_json
 
     _check_writable(options.json)
-    signer = open_for(options, Settings())
+    signer = open_signer_of(options, Settings())
     keys = ("frames", "mode", "matching", "seed", "baselines", "jobs")
     settings = PairSettings(
         Drawing(options.pairs, options.negatives, options.apart, options.seed),
