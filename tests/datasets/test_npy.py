@@ -68,9 +68,9 @@ BAD_NPY = {
     "unknown version": (b"\x93NUMPY\x09" + GOOD_NPY[7:], "header of the NPY"),
     "truncated": (GOOD_NPY[:-1], "47 of 48 bytes"),
     "more than announced": (GOOD_NPY + b"\0", "49 of 48 bytes"),
-    "header beyond the file": (GOOD_NPY[:8] + b"\x10\x27" + GOOD_NPY[10:], "announces 10000"),
+    "header beyond the file": (GOOD_NPY[:8] + b"\x10\x27" + GOOD_NPY[10:], "a length of 10000"),
     "endless header": (
-        b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 99_999, "announces 4294967295",
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 99_999, "a length of 4294967295",
     ),
     "signed numbers": (npy(np.ones((3, 4), np.int16)), "'<i2'.* uint16 in stored units"),
     "bytes": (npy(np.ones((3, 4), np.uint8)), "uint16 in stored units"),
