@@ -231,11 +231,11 @@ def seven_scenes(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--db", "0:4"], "Leave --db out"),
-        (["elsewhere"], "Leave PATH out"),
-        (["--queries", "0:4"], "Leave --queries out"),
-        (["--gap-m", "3"], "Leave --gap-m out"),
-        (["--distractors", "elsewhere"], "Leave --distractors out"),
+        (["--db", "0:4"], "Omit --db"),
+        (["elsewhere"], "Omit PATH"),
+        (["--queries", "0:4"], "Omit --queries"),
+        (["--gap-m", "3"], "Omit --gap-m"),
+        (["--distractors", "elsewhere"], "Omit --distractors"),
     ],
 )
 def test_seven_scenes_have_splits_of_their_own(
@@ -293,7 +293,7 @@ def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_pat
     ("arguments", "message"),
     [
         (["{room}"], "Add --db and --queries"),
-        (["{room}", "--db", "0:4"], "--db needs --queries"),
+        (["{room}", "--db", "0:4"], "--db requires --queries"),
         (["{room}", "--db", "0-4", "--queries", "5:6"], "is not a range of frames"),
         (["{room}", "--db", "0:4", "--queries", "5:99"], "outside the 12 frames"),
         (["{room}", "--db", "0:4", "--queries", "3:6"], "selected twice"),
