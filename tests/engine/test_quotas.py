@@ -40,7 +40,7 @@ def test_a_map_takes_what_its_quota_allows(empty, uploads):
     first, _ = empty.add_frame("hall", a.data, a.meta)
     empty.add_frame("hall", b.data, b.meta)
     assert used(empty) == MapUsage(2, len(a.data) + len(b.data))
-    with pytest.raises(QuotaExceeded, match=r"holds 2 frames of the 2 .*PATCH /v1/maps/hall"):
+    with pytest.raises(QuotaExceeded, match=r"has 2 frames, and its quota is 2.*PATCH /v1/maps"):
         empty.add_frame("hall", c.data, c.meta)
     blobs = set(empty.store.blobs.digests())
     assert len(blobs) == 2  # nothing is left of what was not taken
@@ -184,7 +184,7 @@ def test_a_failed_frame_that_comes_larger_needs_room_too(empty, uploads):
     loose = io.BytesIO()
     picture.save(loose, "png", compress_level=0)
     limit(empty, quota_frames=1, quota_bytes=len(loose.getvalue()) - 1)
-    with pytest.raises(QuotaExceeded, match=f"so {len(loose.getvalue()) - len(one.data)} bytes m"):
+    with pytest.raises(QuotaExceeded, match=f"{len(loose.getvalue()) - len(one.data)} more bytes"):
         empty.add_frame("hall", loose.getvalue(), one.meta)
     assert used(empty) == MapUsage(1, len(one.data))
     again, new = empty.add_frame("hall", one.data, one.meta)  # as it was: no more room than before

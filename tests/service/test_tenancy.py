@@ -59,7 +59,7 @@ def test_beyond_the_quota_nothing_is_taken(house, refused, small_shots):
     assert items[2]["problem"]["type"] == "/problems/quota-exceeded"
     for method, place in (("POST", path), ("PUT", f"{path}/mine")):
         answer = house.ask("robot", method, place, **c.form())
-        refused(answer, 403, "quota-exceeded", "holds 2 frames of the 2")
+        refused(answer, 403, "quota-exceeded", "has 2 frames, and its quota is 2")
     assert house.ask("robot", "GET", f"{path}/mine").status_code == 404
     told = house.ask("tenant", "GET", "/v1/maps/alpha").json()
     assert (told["used_frames"], told["used_bytes"]) == (2, len(a.png) + len(b.png))
