@@ -377,7 +377,7 @@ def test_commands_with_a_server(place, postgres, tmp_path, sceneprint, monkeypat
     secret = url.replace("postgres@", "postgres:hidden@")
     for one in (secret, f"{url}?password=hidden", "hidden"):
         said = sceneprint("restore", place, "--data", data, "--database", one, expect=2)
-        assert said.stderr.startswith("sceneprint restore: --database: ")
+        assert said.stderr.startswith("sceneprint restore: --database")
         assert "hidden" not in said.stderr
     again = ("restore", place, "--data", data, "--database", url)
     shown = url.replace("+psycopg", "")
