@@ -331,7 +331,7 @@ def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
         assert not (folder / "bundles").exists() or names_in(folder / "bundles") == []
 
     refused("the database does not exist", tmp_path / "typo")
-    refused("names no object store", to="s3://")
+    refused("is not the URL of an object store", to="s3://")
     (tmp_path / "file").touch()
     refused("is not a folder", to=tmp_path / "file")
     (tmp_path / "notes").mkdir()

@@ -99,11 +99,11 @@ def _sums(
             for i in range(group, min(group + GROUP, len(rows))):
                 stored = database[rows[i], start : start + tile]
                 for q in range(min(i, len(queries)) if half else len(queries)):
-                    asked = queries[q, start : start + tile]
+                    query = queries[q, start : start + tile]
                     total = 0
                     for low in range(0, len(stored), BLOCK):
                         # slices, because a loop that starts at `low` is not vectorized
-                        a, b = asked[low : low + BLOCK], stored[low : low + BLOCK]
+                        a, b = query[low : low + BLOCK], stored[low : low + BLOCK]
                         total += _squares(a, b) if squared else _absolute(a, b)
                     result[q, i] += total
 
