@@ -102,7 +102,7 @@ def vista_of(surface: Surface) -> Vista:
         # azimuth increases to the left if the pole is up; y of an optical frame points down
         flipped = pixels[::-1] if surface.camera.pole == 1 else pixels[:, ::-1]
         return Vista(flipped, np.linalg.norm(points, axis=1), "range", _AXES)
-    return _from_above(points, surface.valid.ravel())
+    return _along_least_extent(points, surface.valid.ravel())
 
 
 def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Ints32) -> Ints32:
@@ -127,8 +127,10 @@ def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Int
     return drawn
 
 
-def _from_above(points: Floats, valid: NDArray[np.bool_]) -> Vista:
-    """Return a view from above, with the highest point at each pixel."""
+def _along_least_extent(points: Floats, valid: NDArray[np.bool_]) -> Vista:
+    """Return a view of unordered points along the axis of their least extent, which is vertical in
+    a room but crosses a wall. Each pixel shows the point that is farthest along that axis.
+    """
     seen = np.flatnonzero(valid)
     if not seen.size:
         return Vista(np.full((1, 1), -1, np.int32), np.zeros(len(points)), "height", _AXES)

@@ -427,8 +427,9 @@ def add_pull(command: argparse.ArgumentParser) -> None:
 
 
 def run_pull(options: argparse.Namespace) -> int:
-    """Copy maps of a service to a data folder, without uploads and keys. Only new data is
-    downloaded. The key must have `read` for the maps. Programs may use the folder meanwhile.
+    """Copy maps of a service to a data folder, without uploads and keys, or update the copies: only
+    new data is downloaded, and frames that the service has deleted are removed. The key must have
+    `read` for the maps. Programs may use the folder in the meantime.
     """
     from sceneprint.engine.maps.map_copy import claim_folder, pull_map
     from sceneprint.store import open_store

@@ -213,7 +213,15 @@ def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
 def unpack_image(
     packed: Packed, scale: float, camera: Intrinsics | Sphere, most: int = MOST
 ) -> Surface:
-    """Return the surface that `pack_image` has packed."""
+    """Return the surface that `pack_image` has packed, within rounding. Areas are computed again.
+
+    Parameters
+    ----------
+    packed : (h, w, 3) uint16; pixels whose first number is 0 are invalid
+    scale : inverse depth (pinhole) or range (sphere) that 1 represents
+    most : greatest number of a packed normal, as it was passed to `pack_image`; the images of
+        pinhole cameras always have the default
+    """
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
     areas, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)

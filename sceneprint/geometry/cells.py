@@ -285,11 +285,16 @@ def cell_positions(cells: SessionCells, cell_m: float) -> Floats:
 def frame_verdicts(
     positions: Floats, surface: Surface, T_parent_sensor: Floats, p: OverlapParameters
 ) -> Bytes:
-    """Return one frame's verdicts on cells: UNKNOWN, AGREES or VIOLATES, (N,) uint8.
+    """Return one frame's verdicts on cells, (N,) uint8.
+
+    AGREES: the cell is on the surface, whatever its normal. VIOLATES: the frame saw through the
+    cell; unordered points never do. UNKNOWN: the cell is outside the view, behind the surface, near
+    an edge, or not measured.
 
     Parameters
     ----------
     positions : (N, 3) positions of the cells, metres in the parent frame
+    surface : surface of the frame, in the sensor frame
     T_parent_sensor : (4, 4) pose of the frame
     p : tolerances of the model
     """

@@ -170,8 +170,9 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
 
     Parameters
     ----------
-    days : days until the answer expires
-    may_read : function that returns whether the caller may read a map; other names are left out
+    days : days from the query until its answer expires; kept answers do not expire
+    may_read : function that returns whether the caller may read a map. Otherwise the record lacks
+        the name of that map, unless it is the query's own, its frame, and the title
     """
     frame = pose = None
     if row.frame_id is not None and row.frame_map is not None and may_read(row.frame_map):

@@ -259,15 +259,19 @@ def _encodings(bag: Bag) -> str:
 
 
 def camera_topic(bag: Bag, frames: FrameTopic, name: str | None) -> BagTopic | None:
-    """Return the CameraInfo topic of depth images: that of their namespace, or of their frame.
+    """Return the CameraInfo topic of depth images; None if none fits.
+
+    It is `name`; otherwise `camera_info` in the namespace of the images; otherwise the only topic
+    whose first message has the frame of the images.
 
     Parameters
     ----------
+    frames : topic of depth images
     name : name that the user specifies, or None
 
     Raises
     ------
-    DatasetError : If `name` is not a topic of CameraInfo, or several topics fit.
+    DatasetError : If `name` is not a topic of CameraInfo, or several topics have the frame.
     """
     topics = bag.of_type(CAMERA)
     if name is not None:
