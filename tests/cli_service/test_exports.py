@@ -50,7 +50,7 @@ def test_a_database_of_rtabmap_is_uploaded_with_its_poses(
 ) -> None:
     done = sceneprint("upload", "flat", database, "--model", "depth")
     assert done.stdout.splitlines()[1].startswith("3 frames: 3 received, 0 already there; 3 inde")
-    assert "flat.db: 3 frames taken, poses of odometry" in done.stderr
+    assert "flat.db: 3 frames taken, odometry poses" in done.stderr
     with Client(service_url) as client:
         frames = sorted(client.frames("flat"), key=lambda one: one.sequence or 0)
         client.delete_map("flat")

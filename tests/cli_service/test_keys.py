@@ -107,7 +107,7 @@ def test_tenants_are_made_listed_and_deleted(sceneprint: Run, tmp_path: Path) ->
         return sceneprint(*arguments, "--data", tmp_path, expect=expect)
 
     assert run("keys", "--create-tenant", "acme").stdout == "tenant acme is created\n"
-    assert "a tenant named 'acme'" in run("keys", "--create-tenant", "acme", expect=2).stderr
+    assert "A tenant named 'acme'" in run("keys", "--create-tenant", "acme", expect=2).stderr
     run("keys", "--create", "robot", "--tenant", "acme", "--scope", "read")
     run("keys", "--create", "alone", "--scope", "read")
     done = run("keys", "--create", "x", "--tenant", "other", expect=2)

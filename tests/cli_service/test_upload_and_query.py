@@ -126,8 +126,8 @@ def test_what_is_lost_though_nobody_asked_ends_with_code_2(
     assert hint == "map day has no poses, so answers have frames but no coordinates"
     assert "3 received, 0 already there; 3 indexed" in counts
     assert summary.startswith(
-        "poses of 0 of 3 frames; 3 without: groundtruth.txt has no pose within 20 ms of them "
-        "(nearest: 97.5 s away); depth "
+        "poses of 0 of 3 frames; 3 without: groundtruth.txt has no pose within 20 ms of their "
+        "time stamps (nearest: 97.5 s away); depth "
     )
     assert "m on is unusual for a depth camera" in summary  # four times as far away
     assert "3 already there; 3 indexed" in sceneprint(*options, "--no-pose").stdout

@@ -548,5 +548,5 @@ def test_a_folder_where_somebody_builds_is_left_alone(
 
 
 def test_memory_is_shared_with_nobody() -> None:
-    with pytest.raises(ValidationError, match="inside one process"):
+    with pytest.raises(ValidationError, match="only in one process"):
         Settings(index_url="memory:///")

@@ -38,7 +38,7 @@ def test_what_is_wrong_is_said_at_the_door(served, yard, small_shots, refused) -
         return http.post(f"{yard}/imports", **said)
 
     refused(post(**sent(data, "application/json")), 415, "unsupported-type", "application/zip")
-    refused(post(**sent(small_shots[0].png)), 422, "unreadable-archive", "no archive")
+    refused(post(**sent(small_shots[0].png)), 422, "unreadable-archive", "not a supported archive")
     refused(post(**sent(b"")), 422, "unreadable-archive", "The archive is empty")
     refused(post(**sent(data, robott="x")), 422, "invalid-request", "robott")
     refused(post(**sent(data, every="0")), 422, "invalid-request", "every")

@@ -121,7 +121,7 @@ def test_a_newer_store_is_refused_in_one_line(begin, newer, what):
     assert server.end() == 2
     (line,) = server.errors.read_text().splitlines()
     assert line.startswith(f"{what}: ")
-    assert "has schema from the future, which this version of sceneprint does not know" in line
+    assert "has schema from the future of a later version of sceneprint" in line
     assert server.process.stdout.read() == ""
 
 
@@ -137,7 +137,7 @@ def refusal(begin, *arguments: str, folder=None) -> str:
 def test_a_folder_that_cannot_be_made_is_refused_in_one_line(begin, tmp_path):
     (tmp_path / "file").write_text("not a folder")
     line = refusal(begin, folder=tmp_path / "file" / "data")
-    assert line.startswith(f"sceneprint serve: {tmp_path}/file/data/blobs: the folder cannot be")
+    assert line.startswith(f"sceneprint serve: {tmp_path}/file/data/blobs: The folder cannot be")
 
 
 @pytest.mark.sqlite_only("a file that is damaged")

@@ -231,7 +231,7 @@ def test_a_wait_looks_less_and_less_often_and_ends_with_its_caller(
     here: Any = SimpleNamespace(context=SimpleNamespace(store=None), run=run)
     request: Any = SimpleNamespace(is_disconnected=is_disconnected)
     added = Added(frame_id="f", job_id="j", state="received", reason=None)
-    settled = asyncio.run(frames._settled(request, here, "m", added, 10.0))
+    settled = asyncio.run(frames._wait_for_frame(request, here, "m", added, 10.0))
     assert settled.state == "received"
     if looks is not None:
         assert pauses == pytest.approx(looks)

@@ -120,7 +120,7 @@ def test_a_service_that_cannot_be_loaded_ends_with_the_error(
 def test_while_kernels_are_compiled_readyz_says_so_and_who_needs_them_waits(
     open_house: Any, tmp_path: Path, until: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.routes.admin.LOOK_S", 0.05)
+    monkeypatch.setattr("service.routes.admin.KERNEL_CHECK_S", 0.05)
     monkeypatch.setattr("sceneprint.engine.signers.KERNELS_S", 0.05)
     with open_house(tmp_path, None, {"robot": {"*": "write"}}) as house:
         house.engine.signers.require_kernels(60)  # those of this machine are there
