@@ -106,7 +106,9 @@ def test_what_a_caller_asks_of_matches_is_asked_without_free_space_too() -> None
     blind = Evidence(0.0, 0.0, overlap=0.5, plane_overlap=0.5, violations=None, stiffness=1.0)
     usual = ValidationParameters()
     assert objection(blind, thresholds(None, usual)[0].acceptance, "full") is None
-    for asked, why in (({"evidence": 0.6}, "only 50% agrees"), ({"plane_overlap": 0.6}, "plane")):
+    for asked, why in (
+        ({"evidence": 0.6}, "only 50% of the surfaces agree"), ({"plane_overlap": 0.6}, "plane"),
+    ):  # fmt: skip
         p, mode = thresholds(ValidationOptions.model_validate(asked), usual)
         found = objection(blind, p.acceptance, mode)
         assert found is not None

@@ -13,14 +13,18 @@ from sceneprint_client.api import NewMap
 
 def test_two_workers_sign_each_frame_once(crew, frames):
     crew.engine.create_map(NewMap(name="many", model="depth"))
-    added = [crew.engine.add_frame("many", *one)[0] for one in frames[:8]]
-    crew.settled("many", 8)
+    added = []
+    while len({crew.pid(one.job_id) for one in added}) < 2:  # on a busy machine one may sign some
+        assert len(added) < 40
+        added += [
+            crew.engine.add_frame("many", *one)[0] for one in frames[len(added) : len(added) + 8]
+        ]
+        crew.settled("many", len(added))
     jobs = [crew.engine.get_job(one.job_id) for one in added]
     assert {(job.state, job.error) for job in jobs} == {("succeeded", None)}
-    assert [job.attempts for job in jobs] == [1] * 8
-    assert len({crew.pid(one.job_id) for one in added}) == 2
-    assert crew.signed("many") == [1] * 8
-    assert crew.engine.get_map("many").revision == 8
+    assert {job.attempts for job in jobs} == {1}
+    assert crew.signed("many") == [1] * len(added)
+    assert crew.engine.get_map("many").revision == len(added)
     lines = [line for line in crew.log("job succeeded") if line["map"] == "many"]
     assert sorted(line["frame_id"] for line in lines) == sorted(one.frame_id for one in added)
     assert {line["attempt"] for line in lines} == {1}
