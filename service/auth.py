@@ -67,7 +67,8 @@ MatchMap = Annotated[
     Query(
         alias="map",
         max_length=128,
-        description="Map of the match, if several maps have the same id; default: the first one.",
+        description="Map of the match, if several maps contain a frame with this id; default: the "
+        "first map.",
     ),
 ]
 

@@ -63,7 +63,7 @@ _PLAIN = (
 )  # fmt: skip
 _OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame", "up")
 #: End of the descriptions of query parameters that replace fields of a form.
-BARE = "Only if the body is the frame."
+BARE = "Allowed only if the request body is the frame itself."
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
@@ -77,15 +77,31 @@ def parameters() -> list[dict[str, Any]]:
     number, text = {"type": "number"}, {"type": "string"}
     whole = {"type": "integer", "minimum": 1, "maximum": 65535}
     texts: dict[str, tuple[dict[str, Any], str]] = {
-        "meta": (text, "FrameMeta as JSON, in place of the parameters below."),
+        "meta": (text, "FrameMeta as JSON, instead of the parameters below."),
         **dict.fromkeys(("fx", "fy", "cx", "cy"), (number, "Camera intrinsics, pixels.")),
-        "width": (whole, "Width of the camera's image, pixels; default: that of the image."),
-        "height": (whole, "Height of the camera's image, pixels; default: that of the image."),
-        "distortion": (text, "Coefficients k1,k2,p1,p2[,k3] of OpenCV."),
+        "width": (
+            whole,
+            "Width of the camera's image, pixels; default: the width of the uploaded image.",
+        ),
+        "height": (
+            whole,
+            "Height of the camera's image, pixels; default: the height of the uploaded image.",
+        ),
+        "distortion": (text, "OpenCV distortion coefficients k1,k2,p1,p2[,k3]."),
         "depth_scale": (number, "Stored units per metre; default: 1000."),
-        "depth_along_ray": ({"type": "boolean"}, "Whether samples are ranges along the ray."),
-        "trust_depth": ({"type": "boolean"}, "Accept a depth image that fails the sanity check."),
-        "viewpoint": (text, "Viewpoint of a point cloud as x,y,z in metres, or `none`."),
+        "depth_along_ray": (
+            {"type": "boolean"},
+            "Whether samples are distances along the ray of the pixel instead of the optical axis.",
+        ),
+        "trust_depth": (
+            {"type": "boolean"},
+            "Whether to accept a depth image that fails the sanity check.",
+        ),
+        "viewpoint": (
+            text,
+            "Viewpoint of a point cloud as x,y,z in metres, or `none` if it has no single "
+            "viewpoint.",
+        ),
         "units_per_metre": (number, "Units per metre of a point cloud; default: 1."),
         "format": (
             {"type": "string", "enum": list(get_args(CloudFormat))},
@@ -93,7 +109,7 @@ def parameters() -> list[dict[str, Any]]:
         ),
         "robot": (text, "Name of the robot."),
         "session": (text, "Name of the session."),
-        "captured_at": ({"type": "string", "format": "date-time"}, "Capture time with time zone."),
+        "captured_at": ({"type": "string", "format": "date-time"}, "Capture time, with time zone."),
         "name": (text, "Name of the original file or message."),
         "sequence": ({"type": "integer", "minimum": 0}, "Index within the session."),
         "tags": (text, "Tags, separated by commas."),
@@ -683,8 +699,9 @@ IdempotencyKey = Annotated[
         max_length=255,
         pattern=r"^[\x20-\x7e]+$",
         description="Random key of this request, printable ASCII. If you repeat the request with "
-        "the same key within a day, it takes effect once; the response shows the present state, "
-        "with `Idempotent-Replayed: true`. A different request with the same key is refused.",
+        "the same key within a day, it takes effect only once; the response then shows the current "
+        "state, with `Idempotent-Replayed: true`. A different request with the same key is "
+        "refused.",
     ),
 ]
 

@@ -77,7 +77,8 @@ def file_responses(
     """Responses of a route that sends files, for the OpenAPI document."""
     headers = {
         "ETag": {
-            "description": "Entity tag of the bytes. Send it in If-None-Match to avoid a download.",
+            "description": "Entity tag of the bytes. Send it in If-None-Match to avoid downloading "
+            "the same bytes again.",
             "schema": {"type": "string"},
         }
     }

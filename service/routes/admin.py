@@ -47,21 +47,23 @@ class Health(BaseModel):
 
 
 class Readiness(Health):
-    """State of a service that is ready. With `read_only` it answers queries and refuses changes."""
+    """State of a service that is ready. If `read_only` is true, the service answers queries but
+    refuses changes.
+    """
 
     read_only: bool
     frames: dict[str, int] | None = Field(
-        description="Number of frames in each state; null unless your key may read all maps."
+        description="Number of frames in each state; null if your key may not read all maps."
     )
     jobs: dict[str, int] | None = Field(
-        description="Number of jobs in each state; null unless your key may read all maps."
+        description="Number of jobs in each state; null if your key may not read all maps."
     )
 
 
 @router.head("/healthz", include_in_schema=False)  # load balancers send HEAD
 @router.get("/healthz", responses=refusals())
 async def healthz() -> Health:
-    """Return 200 while the process runs, even if the store is unavailable."""
+    """Return 200 while the process is running, even if the store is unavailable."""
     return Health(status="ok", version=__version__)
 
 
@@ -71,9 +73,9 @@ async def healthz() -> Health:
     openapi_extra={"security": [{}]},  # besides a key: none
 )  # fmt: skip
 async def readyz(here: Here, caller: Guest) -> Readiness:
-    """Return 200 if the service can work. It returns 503 while the database or the object store
-    does not respond, while kernels are being compiled, and permanently after a later version has
-    migrated the store. Requires no key. The result is at most one second old.
+    """Return 200 if the service is ready. Return 503 while the database or the object store does
+    not respond, while kernels are being compiled, and permanently after a later version has
+    migrated the store. No key is required. The result is at most one second old.
     """
     found = await here.checks.get("readiness", partial(_check_readiness, here.context))
     # Counting takes time that grows with the store, so requests without a key get no counts.
@@ -102,7 +104,7 @@ def _check_readiness(context: Context) -> Readiness:
     "/metrics", response_class=Response, responses=refusals(), dependencies=[Depends(reads_every)]
 )
 def metrics(here: Here) -> Response:
-    """Return metrics in the format of Prometheus. With required keys, it takes `read` for `*`."""
+    """Return Prometheus metrics. If keys are required, the key needs `read` for `*`."""
     figures = here.statistics.figures()
     held, spool = here.requests.by_tenant(), here.spool.by_tenant()
     text = here.metrics.text(figures, here.feed.streams, here.context.query_log.lost, held, spool)
@@ -143,7 +145,7 @@ def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key
 
 @keys_router.get("/keys/me", responses=refusals())
 def me(caller: Sender) -> Me:
-    """Return the name, the grants and the expiry of the key of this request."""
+    """Return the name, the grants and the expiry time of the key of this request."""
     until = caller.expires_at
     return Me(
         name=caller.name or None,
@@ -165,11 +167,12 @@ def rotate_key(
         Query(
             ge=0,
             le=operations.MOST_OVERLAP_S,
-            description="Seconds for which the previous secret still works; 0 revokes it now.",
+            description="Number of seconds for which the previous secret remains valid; 0 revokes "
+            "it immediately.",
         ),
     ] = operations.OVERLAP_S,
 ) -> MadeKey:
-    """Give a key a new secret. Only this response contains it.
+    """Give a key a new secret. Only this response contains the secret.
 
     A second rotation within the overlap replaces the new secret; the previous secret still expires
     at the time that the first rotation set.
@@ -184,7 +187,7 @@ def rotate_key(
     dependencies=[Depends(administers)],
 )
 def revoke_key(key_name: Annotated[str, Path(description="Name of the key.")], here: Here) -> None:
-    """Revoke a key. It is refused from the next request on, on every machine of the store."""
+    """Revoke a key. Every machine that uses the store refuses the key from the next request on."""
     operations.revoke_key(here.context.store, key_name)
 
 
@@ -192,7 +195,7 @@ def revoke_key(key_name: Annotated[str, Path(description="Name of the key.")], h
 def list_changes(
     here: Here,
     actor: Annotated[
-        str | None, Query(max_length=128, description="Only changes by the key of this name.")
+        str | None, Query(max_length=128, description="Only changes by the key with this name.")
     ] = None,
     map_name: Annotated[
         str | None, Query(alias="map", max_length=63, description="Only changes of this map.")
@@ -224,9 +227,9 @@ def stats(
         str | None,
         Query(alias="map", description="Only this map; required if the key may not read all maps."),
     ] = None,
-    minutes: Annotated[int, Query(ge=1, le=60, description="Length of the history.")] = 60,
+    minutes: Annotated[int, Query(ge=1, le=60, description="Length of the history, minutes.")] = 60,
 ) -> Stats:
-    """Return the present load and the history of up to an hour, over all processes."""
+    """Return the current load of all processes, and its history of up to an hour."""
     if map_name is None:
         caller.require_every("read")
     else:
@@ -236,7 +239,7 @@ def stats(
 
 @operations_router.get("/models", responses=refusals())
 def models(here: Here, caller: Sender) -> Page[ModelInfo]:
-    """List models for maps: the presets, and those that maps have or had."""
+    """List the models for maps, which are the presets and all models that maps have or had."""
     found = here.catalogue.list_all(lambda name: caller.may("read", name))
     if not caller.reads_every:  # a model of unreadable maps would reveal them
         found = [one for one in found if one.preset or one.maps]
@@ -251,10 +254,10 @@ def models(here: Here, caller: Sender) -> Page[ModelInfo]:
     dependencies=[Depends(may_admin)],
 )
 async def reencode(map_name: str, request: Request, here: Here, caller: Sender) -> Map:
-    """Sign all frames of a map with another model. The map switches when all are signed.
+    """Sign all frames of a map with another model. The map switches when all frames are signed.
 
-    Until then, queries use the present model. `reencoding` of the map shows the progress. A
-    repeated request retries failed frames.
+    Until then, queries use the current model. The field `reencoding` of the map shows the progress.
+    To retry failed frames, repeat the request.
     """
     wanted = await read_record(request, NewModel, "The model")
     may_read = None if caller.reads_every else partial(caller.may, "read")

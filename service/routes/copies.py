@@ -24,9 +24,9 @@ _BYTES: dict[int | str, dict[str, Any]] = {
     openapi_extra=json_body("CopyRequest"),
 )  # fmt: skip
 async def copy_map(map_name: str, request: Request, here: Here) -> Response:
-    """Return a consistent copy of a map and its indexed frames: a first line with a `MapCopy` as
-    JSON, then the bytes of the parts that are not in `have`, at most approximately 32 MB. Repeat
-    the request for the remaining parts.
+    """Return a consistent copy of a map and its indexed frames. The first line is a `MapCopy` as
+    JSON. It is followed by the bytes of the parts that are not in `have`, at most approximately 32
+    MB. To receive the remaining parts, repeat the request.
     """
     known = await read_record(request, CopyRequest, "The request")
     return _response(await here.run(here.copies.bundle, map_name, frozenset(known.have)))
@@ -38,7 +38,7 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
 def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
-    """Return the geometry that validation compares of an indexed frame."""
+    """Return the geometry of an indexed frame, which validation compares."""
     return _response(here.copies.artifact(map_name, digest))
 
 

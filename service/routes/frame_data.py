@@ -55,14 +55,14 @@ async def get_cloud(
     frame: Annotated[
         CloudFrame,
         Query(
-            description="Frame of the coordinates: `optical` of the camera (for a cloud, its "
-            "sensor), `parent` of its pose, or `base` of the robot."
+            description="Coordinate frame. `optical`: the frame of the camera (for a cloud, of its "
+            "sensor). `parent`: the parent frame of the pose. `base`: the base frame of the robot."
         ),
     ] = "optical",
 ) -> Response:
-    """Return the visible surface as a cloud of up to 160 x 120 points, smoothed as validation
-    compares it. A point cloud is first rendered as a range image around its viewpoint. The original
-    samples are in the upload.
+    """Return the visible surface as a cloud of up to 160 x 120 points, smoothed as for validation.
+    A point cloud is first rendered as a range image around its viewpoint. The original samples are
+    in the upload.
     """
     found = await here.run(lambda: here.outputs.cloud(map_name, frame_id, frame))
     return await send_output(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
@@ -83,11 +83,11 @@ async def get_preview(
     view: Annotated[
         View,
         Query(
-            description="`depth`: yellow near, violet far. `normals`: red, green and blue are "
-            "127.5 (1 + n) for x right, y down, z forward. `patches`: one colour for each patch of "
-            "the finest level. Pixels without data are dark grey. A cloud is shown as seen from "
-            "its viewpoint, with normals along its own axes; without a viewpoint, it is shown from "
-            "above, with heights in place of depth."
+            description="`depth`: yellow is near, violet is far. `normals`: red, green and blue "
+            "are 127.5 (1 + n) for x right, y down, z forward. `patches`: one colour for each "
+            "patch of the finest level. Pixels without data are dark grey. A cloud is shown as "
+            "seen from its viewpoint, with normals along its own axes; without a viewpoint, it is "
+            "shown from above, with heights in place of depth."
         ),
     ] = "depth",
     width: Annotated[
@@ -122,8 +122,8 @@ async def get_patches(map_name: str, frame_id: str, request: Request, here: Here
     ),
 )
 async def get_signature(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
-    """Return the signature of a frame. The distance of two signatures of one model is the sum of
-    the absolute differences of their bytes.
+    """Return the signature of a frame. The distance between two signatures of the same model is the
+    sum of the absolute differences of their bytes.
     """
     outputs, kind = here.outputs, preferred_media_type(request, (JSON, BYTES, NPY))
     if kind == JSON:
@@ -165,9 +165,10 @@ def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str
 points_router = v1_router()
 
 Limit = Annotated[
-    int, Query(ge=1, le=MOST, description="Maximum number of points; the choice is deterministic.")
+    int,
+    Query(ge=1, le=MOST, description="Maximum number of points; the selection is deterministic."),
 ]
-_BYTES = "12 bytes per point after a header of 48 bytes; see docs/reference.md, Points. "
+_BYTES = "A header of 48 bytes, then 12 bytes per point; see docs/reference.md, Points. "
 
 
 @points_router.get(
@@ -177,7 +178,7 @@ _BYTES = "12 bytes per point after a header of 48 bytes; see docs/reference.md, 
     response_class=Response,
     responses=file_responses(
         MEDIA_TYPE,
-        description=f"{_BYTES}With normals and validation patches.",
+        description=f"{_BYTES}Points have normals and validation patches.",
         statuses=(404, 409, 422),
     ),
 )
@@ -187,11 +188,11 @@ async def get_frame_points(
     request: Request,
     here: Here,
     frame: Annotated[
-        CloudFrame, Query(description="Frame of the coordinates, as for `cloud.ply`.")
+        CloudFrame, Query(description="Coordinate frame, as for `cloud.ply`.")
     ] = "optical",
     limit: Limit = LIMIT,
 ) -> Response:
-    """Return the points of `cloud.ply` in a third of its bytes, for drawing on a page."""
+    """Return the points of `cloud.ply` in a third of its bytes, for display on a web page."""
     found = await here.run(lambda: here.points.frame(map_name, frame_id, frame, limit))
     return await send_output(request, here, found, MEDIA_TYPE)
 
@@ -202,14 +203,14 @@ async def get_frame_points(
     response_class=Response,
     responses=file_responses(
         MEDIA_TYPE,
-        description=f"{_BYTES}With normals and validation patches.",
+        description=f"{_BYTES}Points have normals and validation patches.",
         statuses=(404, 409, 422),
     ),
 )
 async def get_query_points(
     query_id: str, request: Request, here: Here, caller: Sender, limit: Limit = LIMIT
 ) -> Response:
-    """Return the surface of a query in the frame of its sensor, for drawing on a page."""
+    """Return the surface of a query in the frame of its sensor, for display on a web page."""
     await here.run(require_readable, query_id, here, caller)
     found = await here.run(lambda: here.points.query(query_id, limit))
     return await send_output(request, here, found, MEDIA_TYPE)
@@ -221,8 +222,8 @@ async def get_query_points(
     response_class=Response,
     responses=file_responses(
         MEDIA_TYPE,
-        description=f"{_BYTES}With normals, validation patches and, if there is a transform, "
-        "residuals.",
+        description=f"{_BYTES}Points have normals, validation patches and, if there is a "
+        "transform, residuals.",
         statuses=(404, 409, 422),
     ),
 )
@@ -237,14 +238,14 @@ async def get_match_points(
     transform: Annotated[
         OverlayTransform,
         Query(
-            description="Transform of the comparison: `aligned` of the match, `rival` the other "
-            "transform that fits best, `none` the identity."
+            description="Transform of the comparison. `aligned`: the transform of the match. "
+            "`rival`: the best alternative transform. `none`: the identity."
         ),
     ] = "aligned",
     limit: Limit = LIMIT,
 ) -> Response:
-    """Return the query or one of its matches in the frame of its own sensor, for drawing on a page.
-    Every point has its distance from the surface of the other frame.
+    """Return the query or one of its matches in the frame of its own sensor, for display on a web
+    page. Every point has its distance from the surface of the other frame.
     """
     await here.run(require_readable, query_id, here, caller)
     found = await here.run(

@@ -53,7 +53,9 @@ router = v1_router("/maps/{map_name}/frames", "frames")
 
 @router.get("", responses=refusals(404, 422), dependencies=[Depends(may_read)])
 def list_frames(map_name: str, here: Here, wanted: Annotated[FramePage, Query()]) -> Page[Frame]:
-    """List frames in the order of their upload; deleted frames only with `state=deleted`."""
+    """List frames in the order of their upload; deleted frames are listed only with
+    `state=deleted`.
+    """
     return map_frames.list_frames(here.context.store, map_name, wanted, wanted.cursor, wanted.limit)
 
 
@@ -69,9 +71,10 @@ def get_frame(map_name: str, frame_id: str, here: Here, response: Response) -> F
     "/{frame_id}", status_code=204, responses=refusals(404), dependencies=[Depends(may_write)]
 )
 def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
-    """Delete a frame. Queries stop finding it at once.
+    """Delete a frame. Queries stop finding it immediately.
 
-    POST /v1/maps/{map_name}/frames/{frame_id}/restore undoes it, within ten minutes by default.
+    POST /v1/maps/{map_name}/frames/{frame_id}/restore undoes the deletion, by default within ten
+    minutes.
     """
     here.tombstones.delete_frame(map_name, frame_id)
 
@@ -94,25 +97,27 @@ _PRIORITY = {
 _IF_NOVEL = {
     "anyOf": [{"type": "number", "exclusiveMinimum": 0, "maximum": 1}, {"type": "boolean"}],
     "default": False,
-    "description": "Keep the frame only if the map does not cover its place yet, that is if the "
-    "distance to the nearest frame exceeds this share of the distance of unrelated frames; true: "
-    f"{NOVEL:g}. Otherwise the state becomes `redundant` and the upload is deleted.",
+    "description": "Keep the frame only if the map does not cover its place yet, that is, if the "
+    "distance to the nearest frame exceeds this share of the distance between unrelated frames; "
+    f"`true` means {NOVEL:g}. Otherwise, the state becomes `redundant` and the upload is deleted.",
 }
 OPTIONS = {"priority": _PRIORITY, "if_novel": _IF_NOVEL}
 _RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {"model": Added, "description": "The map already has this frame."},
+    200: {"model": Added, "description": "The map already contains this frame."},
     201: {"model": Added, "description": "With `Prefer: wait`: the frame has its final state."},
     **refusals(400, 404, 409, 413, 415, 422),
 }
 Prefer = Annotated[
     str | None,
-    Header(description="`wait=N`: respond when the frame is signed, or after N seconds."),
+    Header(
+        description="`wait=N`: respond when the frame is signed, but after N seconds at the latest."
+    ),
 ]
 
 
 def query_options(options: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the query parameters of upload options, for the OpenAPI document."""
-    text = f"The same as in the form. {bodies.BARE}"
+    text = f"The same as the field of the form. {bodies.BARE}"
     return [bodies.query_parameter(name, schema, text) for name, schema in options.items()]
 
 
@@ -143,7 +148,7 @@ _BATCH = {
                             "minItems": 1,
                             "maxItems": MOST_OF_BATCH,
                             "items": {"type": "string", "format": "binary"},
-                            "description": "One part `frame` for each frame.",
+                            "description": "One `frame` part for each frame.",
                         },
                         "metas": {
                             "anyOf": [
@@ -153,7 +158,8 @@ _BATCH = {
                                     "items": {"$ref": "#/components/schemas/FrameMeta"},
                                 },
                             ],
-                            "description": "One object for all frames, or a list in their order.",
+                            "description": "One object for all frames, or a list with one object "
+                            "for each frame, in the same order.",
                         },
                         **OPTIONS,
                     },
@@ -173,9 +179,10 @@ async def add_frame(
     map_name: str, request: Request, here: Here, caller: Sender, response: Response,
     prefer: Prefer = None, key: IdempotencyKey = None,
 ) -> Added:  # fmt: skip
-    """Add a frame to a map. It is stored durably before the response; a worker signs it next.
+    """Add a frame to a map. The frame is stored durably before the response; a worker then signs
+    it.
 
-    Send a form, or the image as the body with all options in the query string.
+    Send a form, or send the image as the body, with all options in the query string.
     """
     return await _add_frame(map_name, None, request, here, caller, response, prefer, key)
 
@@ -305,7 +312,7 @@ def _described_import() -> dict[str, Any]:
     schema_of = ImportOptions.model_json_schema(ref_template="#/components/schemas/{model}")
     own = schema_of["properties"]
     base = {one["name"]: one for one in bodies.parameters() if one["name"].startswith("base")}
-    text = "ImportOptions as JSON, in place of the parameters below."
+    text = "ImportOptions as JSON, instead of the parameters below."
     parameters = [bodies.query_parameter("options", {"type": "string"}, text)]
     for name in _PARAMETERS:
         own_schema = own.get(name, {})
@@ -341,8 +348,8 @@ async def add_import(
 
     With `as=map` the body is one cloud or mesh of a whole place (PCD, PLY, LAS, LAZ, OBJ, STL, glTF
     or E57), and `name` is the name of its file. A worker renders views of it and adds them as
-    frames with poses. It then queries the map with other views; the `result` of the job has the
-    number of views that were found (MapImportResult).
+    frames with poses. It then queries the map with other views; the `result` of the job
+    (MapImportResult) contains the number of views that were found.
     """
     if media_type(request) not in TYPES:
         raise UnsupportedType(
@@ -372,8 +379,8 @@ def list_import_items(
     cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[ImportItem]:
-    """List the result of each frame of an archive so far and of each skipped file, or of each view
-    of a map.
+    """List the results of an import so far, with one item for each frame and each skipped file of
+    an archive, or for each view of a map.
     """
     return here.imports.items(map_name, job_id, cursor, limit)
 

@@ -36,7 +36,7 @@ def list_jobs(
     caller: Sender,
     state: JobState | None = None,
     kind: Annotated[
-        str | None, Query(max_length=16, description="Only this kind, such as `associate`.")
+        str | None, Query(max_length=16, description="Only jobs of this kind, such as `associate`.")
     ] = None,
     map_name: Annotated[
         str | None, Query(alias="map", description="Only jobs of this map.")
@@ -108,8 +108,8 @@ def cancel_job(job_id: str, here: Here, caller: Sender) -> Job:
     },
 )
 def retry_job(job_id: str, here: Here, caller: Sender, response: Response) -> Job:
-    """Retry a dead, cancelled or failed job. A frame gets a new job; a long job continues from its
-    last progress under its own id.
+    """Retry a dead, cancelled or failed job. For a frame, a new job is created; a long job
+    continues from its last progress under its own id.
     """
     caller.require_job(lifecycle.get_job(here.context.store, job_id), "write")
     job, is_new = lifecycle.retry(here.context.store, here.context.bell, job_id)
@@ -151,29 +151,29 @@ async def events(
         str | None,
         Query(
             max_length=64,
-            description="Only events after the event of this id; `0`: all stored events. Default "
-            "for a stream: only new events.",
+            description="Only events after the event with this id; `0` returns all stored events. "
+            "By default, a stream has only new events.",
         ),
     ] = None,
     order: Annotated[
         Literal["newest", "oldest"] | None,
-        Query(description="Order of a page; default: `oldest` with `after`, `newest` without."),
+        Query(description="Order of a page; default: `oldest` with `after`, otherwise `newest`."),
     ] = None,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000, description="Number of events in a page.")] = 100,
     last_event_id: Annotated[
         str | None,
-        Header(description="Id of the last received event; the stream continues after it. It "
-               "overrides `after`."),
+        Header(description="Id of the last received event; the stream continues after this event. "
+        "The header overrides `after`."),
     ] = None,
 ) -> Response:  # fmt: skip
-    """List events, such as frames that were uploaded, indexed or deleted, and created or deleted
-    maps.
+    """List events, such as the upload, indexing and deletion of frames and the creation and
+    deletion of maps.
 
     With `Accept: text/event-stream`, events arrive within half a second, each once and in order,
     even if several processes use the store. After a lost connection, send the id of the last event
-    as `Last-Event-ID`, as browsers do automatically, to receive all events since. If some of them
-    have expired, the stream sends an event `events.missed`.
+    as `Last-Event-ID`, as browsers do automatically, to receive all events since that event. If
+    some of them have expired, the stream sends an `events.missed` event.
 
     The list contains events of the maps that the key may read. Events that belong to no map require
     `admin` for `*`.

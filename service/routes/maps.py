@@ -40,7 +40,7 @@ async def create_map(request: Request, here: Here, caller: Sender, response: Res
 
 @router.get("", responses=refusals())
 def list_maps(here: Here, caller: Sender) -> Page[Map]:
-    """List the maps that the key may read, by name."""
+    """List the maps that the key may read, sorted by name."""
     found = map_lifecycle.get_maps(here.context.store)
     return Page[Map](items=[one for one in found if caller.may("read", one.name)])
 
@@ -72,8 +72,8 @@ _KINDS = (MERGE_PATCH, "application/json")
 DryRun = Annotated[
     bool,
     Query(
-        description="Return the map as the edit would leave it, and change nothing. `overdue` is "
-        "the number of frames that `retention_days` would delete at once."
+        description="Return the map as it would be after the edit, but change nothing. `overdue` "
+        "is the number of frames that `retention_days` would delete immediately."
     ),
 ]
 
@@ -86,8 +86,8 @@ def _document(record: str) -> dict[str, Any]:
         "in": "header",
         "required": False,
         "schema": {"type": "string"},
-        "description": "The ETag of a previous response. 412 if the object has been edited since. "
-        "Without the header the last edit wins.",
+        "description": "The ETag of a previous response. If the object has been edited since, the "
+        "response is 412. Without the header, the last edit wins.",
     }
     body = {"required": True, "content": dict.fromkeys(_KINDS, schema)}
     return {"requestBody": body, "parameters": [if_match]}
@@ -103,7 +103,9 @@ def _document(record: str) -> dict[str, Any]:
 async def patch_frame(
     map_name: str, frame_id: str, request: Request, here: Here, response: Response
 ) -> Frame:
-    """Edit the metadata of a frame (JSON merge patch, RFC 7396). Filters use it at once."""
+    """Edit the metadata of a frame (JSON merge patch, RFC 7396). Filters use the new metadata
+    immediately.
+    """
     patch, tags = await read_json_object(request, "The edit", _KINDS), expected_tags(request)
     frame = await here.run(edit_frame, here.context.store, map_name, frame_id, patch, tags)
     response.headers["ETag"] = f'"{frame.etag}"'

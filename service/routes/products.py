@@ -73,18 +73,18 @@ def product_router(
     add(
         "", list_all, methods=["GET"], name=f"list_{path}", responses=refusals(404, 422),
         response_model=Page[record],  # type: ignore[valid-type]
-        description=f"The {noun} jobs of a map, newest first.",
+        description=f"List the {noun} jobs of a map, newest first.",
     )  # fmt: skip
     add(
         "/{job_id}", get, methods=["GET"], name=f"get_{noun}", responses=refusals(404),
         response_model=record,
-        description=f"The state of the {noun} job, and its result once it has succeeded.",
+        description=f"Return the state of the {noun} job, and its result once it has succeeded.",
     )  # fmt: skip
     add(
         "/{job_id}", delete, methods=["DELETE"], name=f"delete_{noun}", status_code=204,
         responses=refusals(404, 409), dependencies=writes,
-        description=f"Delete the {noun} job and its results, even while a worker runs it. 409 if "
-        "the map depends on it.",
+        description=f"Delete the {noun} job and its results, even while a worker runs it. The "
+        "response is 409 if the map depends on the job.",
     )  # fmt: skip
     return router
 
@@ -94,9 +94,9 @@ def product_router(
 coverage_router = product_router(
     lambda service: service.coverage, MapCoverage,
     "Measure where in the map localisation works. A job queries each frame, or every n-th, against "
-    "the rest of the map. For each cell of a plan it counts the frames that are found, found in a "
-    "wrong place, ambiguous and not found. It runs when no other job waits for a worker, and takes "
-    "as long as that number of queries.",
+    "the rest of the map. For each cell of a plan, it counts the frames that are found, found in a "
+    "wrong place, ambiguous or not found. The job runs when no other job is waiting for a worker, "
+    "and takes as long as the same number of queries.",
     optional=True,
 )  # fmt: skip
 
@@ -109,12 +109,12 @@ def list_coverage_frames(
     cursor: Cursor = None,
     limit: Limit = 100,
     outcome: Annotated[
-        CoverageOutcome | None, Query(description="Only frames of this outcome.")
+        CoverageOutcome | None, Query(description="Only frames with this outcome.")
     ] = None,
 ) -> Page[CoverageFrame]:
     """List the queried frames with their outcomes, even while the job runs.
 
-    Frames that have been deleted since are left out.
+    Frames that have been deleted since are omitted.
     """
     return here.coverage.frames(map_name, job_id, cursor, limit, outcome)
 
@@ -129,7 +129,9 @@ def get_coverage_changes(
         Query(max_length=64, description="Id of an earlier job of the map with the same options."),
     ],
 ) -> CoverageChanges:
-    """Return the cells that became better or worse since an earlier job. 409 until both succeed."""
+    """Return the cells that became better or worse since an earlier job. The response is 409 until
+    both jobs have succeeded.
+    """
     return here.coverage.changes(map_name, job_id, since)
 
 
@@ -137,9 +139,9 @@ def get_coverage_changes(
 
 differences_router = product_router(
     lambda service: service.differences, Difference,
-    "Compare two sessions whose frames have poses in one parent frame. A job fuses at most 500 "
-    "frames of each session into cells, and compares each cell with the frames of the other "
-    "session. It runs when no other job waits for a worker.",
+    "Compare two sessions whose frames have poses in the same parent frame. A job fuses at most "
+    "500 frames of each session into cells, and compares each cell with the frames of the other "
+    "session. The job runs when no other job is waiting for a worker.",
 )  # fmt: skip
 
 
@@ -149,13 +151,13 @@ differences_router = product_router(
     responses=file_responses(
         MEDIA_TYPE,
         description="Cells of both sessions in the format of `frames/{frame_id}/points`. The patch "
-        "index is the class of the cell: 0 same, 1 gone, 2 new, 3 only in `before` and unseen in "
-        "`after`, 4 the reverse. Points are sorted by class.",
+        "index is the class of the cell: 0 same, 1 gone, 2 new, 3 in `before` but unseen in "
+        "`after`, 4 in `after` but unseen in `before`. Points are sorted by class.",
         statuses=(404, 409),
     ),
 )
 def get_difference_points(map_name: str, job_id: str, request: Request, here: Here) -> Response:
-    """Return the cells of both sessions. 409 until the job has succeeded."""
+    """Return the cells of both sessions. The response is 409 until the job has succeeded."""
     find = partial(here.differences.file, map_name, job_id, POINTS)
     return send_product_file(request, here, find, f"{job_id[:12]}-points")
 
@@ -187,8 +189,8 @@ _Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Minimum overlap o
 )
 def undo_join(map_name: str, job_id: str, here: Here) -> Association:
     """Undo the join of an association. Poses return to the uploaded ones, or to the parent frame of
-    other joins. Without an active join nothing changes. Workers do not join the parent frames again
-    unless you request an association.
+    other joins. If there is no active join, nothing changes. Workers join the parent frames again
+    only if you request an association.
     """
     return here.associations.undo_join(map_name, job_id)
 
@@ -234,21 +236,21 @@ async def get_graph(
     min_overlap: _Overlap = 0.0,
     odometry: Annotated[
         bool,
-        Query(description="Add an edge between consecutive frames, from their poses."),
+        Query(description="Add an edge between consecutive frames, computed from their poses."),
     ] = False,
     consistent: Annotated[
         bool,
         Query(
-            description="`true`: only edges that a second edge of another viewpoint or a join "
+            description="`true`: only edges that a second edge from another viewpoint or a join "
             "supports. `false`: also unsupported edges, such as all edges of frames without poses."
         ),
     ] = True,
 ) -> Response:
     """Return the pose graph of an association that has succeeded, for an optimiser.
 
-    Vertices are all frames of the sessions, run by run in the order of time, numbered from 0. Their
-    poses are in one coordinate frame if the sessions are joined. By default, edges that no other
-    edge supports are left out, because two frames of different places may look alike. With
+    The vertices are all frames of the sessions, run by run in the order of time, numbered from 0.
+    Their poses are in one coordinate frame if the sessions are joined. By default, edges that no
+    other edge supports are omitted, because two frames of different places may look alike. With
     `format=json`, each vertex has the id of its frame.
     """
     kinds = {media: name for name, media in MEDIA_TYPES.items()}

@@ -166,7 +166,7 @@ def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
     properties = {
         "frame": {
             "type": "array", "minItems": 2, "maxItems": most, "items": file,
-            "description": "One part `frame` for each frame, in the order of time.",
+            "description": "One `frame` part for each frame, in the order of time.",
         },
         "metas": {**meta, "description": "One object for each frame, with its odometry `pose`."},
         **{name: as_text(one) for name, one in own.items()},
@@ -183,7 +183,7 @@ def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
 def _parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
     """Return the query parameter of an option, for requests whose body is the frame."""
     schema = {key: one for key, one in option.items() if key not in ("description", "title")}
-    text = f"{option.get('description', 'The same as in JSON.')} {bodies.BARE}"
+    text = f"{option.get('description', 'The same as the field in JSON.')} {bodies.BARE}"
     return query_parameter(name, schema, text)
 
 
@@ -329,11 +329,15 @@ router = v1_router(tag="queries")
 _ROBOT: dict[str, Any] = {
     "robot": {
         "type": "string", "maxLength": 128,
-        "description": "Name of the sender, for the log. An upload has it in `meta`.",
+        "description": "Name of the robot that sends the query, for the log. For an upload, "
+        "specify it in `meta`.",
     }
 }  # fmt: skip
 _FRAME_ID: dict[str, Any] = {
-    "frame_id": {"type": "string", "description": "Id of a frame of the map; replaces an upload."}
+    "frame_id": {
+        "type": "string",
+        "description": "Id of a frame of the map to query instead of an upload.",
+    }
 }
 _BODY = query_operation(Query, _FRAME_ID | _ROBOT, ["frame_id"])
 _SEVERAL = query_operation(SeveralQuery, _ROBOT, ["maps"])
@@ -374,10 +378,11 @@ _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
 async def localize_sequence(
     map_name: str, request: Request, here: Here, caller: Sender
 ) -> Localization:
-    """Find the pose of a robot in a map from its last frames. The pose is that of the last frame.
+    """Find the pose of a robot in a map from its most recent frames. The pose is that of the last
+    frame.
 
-    Send 2 to 10 frames in the order of time, each with its odometry as a `pose` in one common
-    parent frame. Each frame is queried, and all of them vote for the pose of the last.
+    Send 2 to 10 frames in the order of time, each with its odometry as `pose`, in the same parent
+    frame. Each frame is queried, and all frames vote for the pose of the last one.
     """
     since, at = time.perf_counter(), time.time()
     options = tuple(Query.model_fields)
@@ -399,10 +404,10 @@ async def localize_sequence(
 
 @router.post("/queries", responses=_STATUSES | refusals(409), openapi_extra=_SEVERAL)
 async def ask_several(request: Request, here: Here, caller: Sender) -> Answer:
-    """Find where a frame was taken in several maps, with one ranking over all of them.
+    """Search several maps for the place where a frame was taken, with one ranking over all maps.
 
-    The maps must have the same model. Poses are averaged only within one parent frame of one map,
-    which `location.map` names.
+    The maps must have the same model. Poses are averaged only within one parent frame of one map;
+    `location.map` is the name of this map.
     """
     since, at, queries = time.perf_counter(), time.time(), here.queries
     async with here.gate.place(), read_query(request, SeveralQuery, "frame") as body:
@@ -506,10 +511,12 @@ def _body() -> dict[str, Any]:
     openapi_extra={"requestBody": _body()},
 )
 async def compare(request: Request, here: Here, caller: Sender) -> Similarity:
-    """Return how similar two frames are and whether they show one place. Neither is stored.
+    """Return how similar two frames are and whether they show the same place. Neither frame is
+    stored.
 
-    Each frame is named or sent: in the file part `a` with `meta_a`, or `b` with `meta_b`. Stored
-    frames must have the same model; sent frames are signed with it. The transform maps b to a.
+    Name each frame in `frame_a` or `frame_b`, or send it in the file part `a` with `meta_a` or `b`
+    with `meta_b`. Stored frames must have the same model; sent frames are signed with this model.
+    The transform maps b to a.
     """
     async with here.gate.place(), read_pair(request) as body:
         a, b = body.a, body.b

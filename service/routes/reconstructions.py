@@ -29,7 +29,7 @@ async def reconstruct(
 ) -> Reconstruction:
     """Fuse the accepted matches of an answer into a surface in the query's camera frame.
 
-    A worker runs the job with Open3D, even if the answer expires meanwhile. GET the path in
+    A worker runs the job with Open3D, even if the answer expires in the meantime. GET the path in
     `Location` until `state` is `succeeded`, then download mesh.ply. Requires the scope `write`.
     """
     stored = await here.run(lambda: _stored_answer(here, caller, query_id))
@@ -56,7 +56,9 @@ def get_reconstruction(job_id: str, here: Here, caller: Sender) -> Reconstructio
     ),
 )
 async def get_mesh(job_id: str, request: Request, here: Here, caller: Sender) -> Response:
-    """Return the surface in the query's camera frame. 409 until the job has succeeded."""
+    """Return the surface in the query's camera frame. The response is 409 until the job has
+    succeeded.
+    """
     await here.run(_find_reconstruction, here, caller, job_id)
     async with here.gate.place():  # the whole file is read into memory
         find = partial(here.reconstructions.file, None, job_id, MESH)
@@ -66,7 +68,7 @@ async def get_mesh(job_id: str, request: Request, here: Here, caller: Sender) ->
 
 @router.delete("/reconstructions/{job_id}", status_code=204, responses=refusals(404))
 def delete_reconstruction(job_id: str, here: Here, caller: Sender) -> None:
-    """Delete a reconstruction with its files. A running job is cancelled."""
+    """Delete a reconstruction and its files. A running job is cancelled."""
     for name in _find_reconstruction(here, caller, job_id).maps:
         caller.require(name, "write")
     here.reconstructions.remove(None, job_id)

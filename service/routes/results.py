@@ -44,8 +44,8 @@ def _ply(description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
 def get_answer(query_id: str, here: Here, caller: Sender) -> Answer:
     """Return a stored answer.
 
-    Answers are stored for 30 days by default, or less if space runs out; with `keep` false they are
-    not stored.
+    By default, answers are stored for 30 days, or less if space runs out. If `keep` is false, the
+    answer is not stored.
     """
     require_readable(query_id, here, caller)
     return here.inspection.answer(query_id)
@@ -54,7 +54,7 @@ def get_answer(query_id: str, here: Here, caller: Sender) -> Answer:
 @router.get(
     "/cloud.ply",
     response_class=Response,
-    responses=_ply("Points and normals in the query's sensor's frame.", 404, 409, 422),
+    responses=_ply("Points and normals in the frame of the query's sensor.", 404, 409, 422),
 )
 async def get_query_cloud(query_id: str, here: Here, caller: Sender) -> Response:
     """Return the surface of the query that validation compares, as binary PLY in metres."""
@@ -72,7 +72,9 @@ async def get_similarities(
         int, Query(ge=1, le=200, description="Number of frames of the ranking, nearest first.")
     ] = 50,
 ) -> Similarities:
-    """Return the pairwise similarities of the query and its nearest frames for the selection."""
+    """Return the pairwise similarities of the query and its nearest frames, as used by the
+    selection.
+    """
     await here.run(require_readable, query_id, here, caller)
     return await here.gate.enter(lambda: here.inspection.similarities(query_id, limit))
 
@@ -94,7 +96,7 @@ async def get_match(
 @router.get(
     "/matches/{frame_id}/overlay.ply",
     response_class=Response,
-    responses=_ply("Both clouds in the match's sensor's frame, coloured.", 404, 409, 422),
+    responses=_ply("Both clouds, coloured, in the frame of the match's sensor.", 404, 409, 422),
 )
 async def get_overlay(
     query_id: str,
@@ -105,22 +107,22 @@ async def get_overlay(
     color: Annotated[
         OverlayColour,
         Query(
-            description="`source`: the query orange, the match blue. `normal`: normals. "
-            "`residual`: dark green up to a fifth of the distance that the model's validation "
-            "tolerates between surfaces (1 cm of 5 cm for close surfaces in rooms; more with "
-            "distance), light green up to two fifths, yellow up to the full tolerance, grey beyond "
-            "it or without a counterpart, red for points that the other frame saw through."
+            description="`source`: the query is orange, the match is blue. `normal`: the colours "
+            "show normals. `residual`: dark green up to a fifth of the distance that the model's "
+            "validation tolerates between surfaces (1 cm of 5 cm for close surfaces in rooms; more "
+            "with distance), light green up to two fifths, yellow up to the full tolerance, grey "
+            "beyond it or without a counterpart, red for points that the other frame saw through."
         ),
     ] = "source",
     transform: Annotated[
         OverlayTransform,
         Query(
-            description="`aligned`: the transform of the match. `rival`: the other transform that "
-            "fits best. `none`: the identity."
+            description="`aligned`: the transform of the match. `rival`: the best alternative "
+            "transform. `none`: the identity."
         ),
     ] = "aligned",
 ) -> Response:
-    """Return the clouds of the query and a match in one frame, as binary PLY in metres."""
+    """Return the clouds of the query and a match in a common frame, as binary PLY in metres."""
     await here.run(require_readable, query_id, here, caller)
     data = await here.gate.enter(
         lambda: here.inspection.overlay(query_id, frame_id, map_name, color, transform)
@@ -203,13 +205,18 @@ def list_queries(
     ] = None,
     status: Annotated[
         list[RecordStatus],
-        Query(max_length=len(RECORD_STATUSES), description="Only these statuses; repeatable."),
+        Query(
+            max_length=len(RECORD_STATUSES),
+            description="Only queries with this status; repeat the parameter for several statuses.",
+        ),
     ] = [],  # noqa: B006  (FastAPI copies it)
     robot: Annotated[Label | None, Query(description="Only queries of this robot.")] = None,
     since: Annotated[
-        AwareDatetime | None, Query(description="Earliest time, with a time zone.")
+        AwareDatetime | None, Query(description="Earliest time of the query, with time zone.")
     ] = None,
-    until: Annotated[AwareDatetime | None, Query(description="Latest time.")] = None,
+    until: Annotated[
+        AwareDatetime | None, Query(description="Latest time of the query, with time zone.")
+    ] = None,
     kept: Annotated[bool, Query(description="Only queries with kept answers.")] = False,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
@@ -217,8 +224,8 @@ def list_queries(
     """List past queries of the maps that the key may read, with sender, outcome and duration,
     newest first.
 
-    A query appears within a second and stays for 30 days by default. Queries with `record` false
-    and requests that were refused before their query started are not listed.
+    A query appears within a second and stays for 30 days by default. Queries whose `record` is
+    false and requests that were refused before their query started are not listed.
     """
     names = caller.named
     if map_name is not None:

@@ -35,9 +35,9 @@ _STATUSES = refusals(400, 404, 413, 415, 422)
 async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDeleted:
     """Delete frames by their ids, or all frames that match a filter.
 
-    Queries stop finding them at once. A call ends after ten seconds: repeat it while `remaining` is
-    not 0. POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it, within ten minutes by
-    default.
+    Queries stop finding them immediately. A call ends after ten seconds; repeat it while
+    `remaining` is not 0. POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes the
+    deletion, by default within ten minutes.
     """
     wanted = await read_record(request, FrameSelection, "The selection")
     return await here.upload_gate.enter(
@@ -50,9 +50,10 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdited:
-    """Move frames to a session, rename their robot, and add or remove tags, by ids or by a filter.
+    """Move frames to a session, change their robot, and add or remove tags. Select the frames by
+    their ids or by a filter.
 
-    A call edits at most 1000 frames: repeat it with `after` while `remaining` is not 0. `inverse`
+    A call edits at most 1000 frames; repeat it with `after` while `remaining` is not 0. `inverse`
     contains the requests that undo the edit.
     """
     edit = await read_record(request, FramesEdit, "The edit of the frames")
@@ -63,9 +64,10 @@ async def edit_frames(map_name: str, request: Request, here: Here) -> FramesEdit
     "/frames/{frame_id}/restore", responses=refusals(404, 409), dependencies=[Depends(may_write)]
 )
 def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
-    """Restore a deleted frame. Queries find it again at once.
+    """Restore a deleted frame. Queries find it again immediately.
 
-    404 if it has been purged or another frame has its id; 409 if its content was uploaded again.
+    The response is 404 if the frame has been purged or another frame has its id, and 409 if its
+    content was uploaded again.
     """
     here.tombstones.restore_one(map_name, frame_id)
     return get_frame(here.context.store, map_name, frame_id)
@@ -86,9 +88,9 @@ def list_deletions(
     "/deletions/{deletion_id}/restore", responses=refusals(404), dependencies=[Depends(may_write)]
 )
 async def restore_deletion(map_name: str, deletion_id: str, here: Here) -> FramesRestored:
-    """Restore the frames of a deletion with all their data. Queries find them again at once.
+    """Restore the frames of a deletion with all their data. Queries find them again immediately.
 
-    A call ends after ten seconds: repeat it while `remaining` is not 0. 403 if the frames exceed
-    the quota of the map.
+    A call ends after ten seconds; repeat it while `remaining` is not 0. The response is 403 if the
+    frames exceed the quota of the map.
     """
     return await here.upload_gate.enter(partial(here.tombstones.restore, map_name, deletion_id))

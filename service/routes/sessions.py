@@ -39,9 +39,9 @@ def get_sessions(
     cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Page[Session]:
-    """List the runs of a map by session and robot, with their number of frames, times and extent.
+    """List the runs of a map by session and robot, with the number of frames and the times of each.
 
-    Frames without a session and a robot form one run, which comes first.
+    Frames without a session and a robot form one run, which is listed first.
     """
     return list_sessions(here.context.store, map_name, cursor, limit)
 
@@ -59,8 +59,9 @@ async def delete_session_frames(
 ) -> SessionChange:
     """Delete all frames of a session.
 
-    A call ends after ten seconds: repeat it while `remaining` is not 0. POST
-    /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes it, within ten minutes by default.
+    A call ends after ten seconds; repeat it while `remaining` is not 0. POST
+    /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes the deletion, by default within ten
+    minutes.
     """
     return await here.upload_gate.enter(
         partial(delete_session, here.context.store, map_name, session, here.tombstones, robot)
@@ -83,9 +84,9 @@ async def patch_session(
         str | None, Query(description="`last_frame_id` of the previous call, to continue after it.")
     ] = None,
 ) -> SessionChange:
-    """Rename a session or its robot, and add or remove tags, in all its frames.
+    """Change the name, the robot or the tags of a session, in all its frames.
 
-    A call ends after ten seconds: repeat it with `after` while `remaining` is not 0.
+    A call ends after ten seconds; repeat it with `after` while `remaining` is not 0.
     """
     edit = await read_record(request, SessionEdit, "The edit of the session")
     return await here.upload_gate.enter(
@@ -99,8 +100,8 @@ async def get_trajectory(
 ) -> Response:
     """Return the sensor poses of a run in the order of time, in metres.
 
-    A response has at most 100,000 frames. For a longer run, request intervals of time, or use
-    `most` for that many frames, evenly spaced along the run.
+    A response has at most 100,000 frames. For a longer run, request intervals of time, or limit the
+    number of frames with `most`, which selects frames evenly spaced along the run.
     """
     kind = preferred_media_type(request, (_PLAIN, _JSON))
 

@@ -29,7 +29,7 @@ _PNG, _BYTES = "image/png", "application/octet-stream"
 #: Content under a digest never changes.
 _FOREVER = "private, max-age=31536000, immutable"
 Parent = Annotated[
-    Label | None, Query(description="Parent frame; default: that of the most frames.")
+    Label | None, Query(description="Parent frame; default: the parent frame with the most frames.")
 ]
 
 
@@ -52,8 +52,8 @@ def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
     """Build the surface of a map now, or add new frames to it.
 
     Workers do this automatically for new frames, unless `SCENEPRINT_BUILD_SURFACES` is
-    `on_request`. GET the path in `Location` until `state` is `ready`; existing tiles stay available
-    meanwhile. Requires the scope `write`.
+    `on_request`. GET the path in `Location` until `state` is `ready`; existing tiles remain
+    available in the meantime. Requires the scope `write`.
     """
     surface, begun = here.surfaces.begin(map_name)
     response.headers["Location"] = f"/v1/maps/{map_name}/surface"
@@ -77,7 +77,7 @@ def list_surface_tiles(
     cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 1000,
 ) -> Page[SurfaceTile]:
-    """List the tiles of a level by column, row and floor."""
+    """List the tiles of a level, sorted by column, row and floor."""
     return here.surfaces.tiles(map_name, parent, level, cursor, limit)
 
 
@@ -112,14 +112,14 @@ def list_surface_frames(
     box: Annotated[
         str | None,
         Query(
-            max_length=400, description="Box x0,y0,z0,x1,y1,z1 that contains viewpoints, metres."
+            max_length=400,
+            description="Box x0,y0,z0,x1,y1,z1 that contains the viewpoints, metres.",
         ),
     ] = None,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 20,
 ) -> Page[SurfaceSighting]:
-    """List frames that saw a point, from the nearest viewpoint on, or frames that were taken in a
-    box.
+    """List frames that saw a point, nearest viewpoint first, or frames that were taken in a box.
 
     Specify either `at` or `box`. A frame saw the point if one of its own points is within `radius`.
     Pages before the last may have fewer than `limit` items.
@@ -139,7 +139,9 @@ def list_surface_frames(
     "/plan.png",
     response_class=Response,
     responses=file_responses(
-        _PNG, description="View from above, transparent where it is empty.", statuses=(404, 422)
+        _PNG,
+        description="View from above, transparent where there is no surface.",
+        statuses=(404, 422),
     ),
 )
 async def get_surface_plan(
@@ -162,7 +164,7 @@ async def get_surface_plan(
         Query(ge=-FARTHEST_M, le=FARTHEST_M, description="Only cells below this height, metres."),
     ] = None,
 ) -> Response:
-    """Return a plan of a surface. `plan` of GET /v1/maps/{map_name}/surface has its position."""
+    """Return a plan of a surface. Its position is `plan` in GET /v1/maps/{map_name}/surface."""
     output = await here.run(lambda: here.surfaces.picture(map_name, parent, width, low, high))
     return await send_output(request, here, output, _PNG, "surface.png")
 

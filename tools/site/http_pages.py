@@ -14,7 +14,7 @@ ERRORS = "../../reference.md#problems"
 JSON = "application/json"
 PROBLEM = "application/problem+json"
 #: End of the descriptions of parameters that replace fields of a form.
-BARE = " Only if the body is the frame."
+BARE = " Allowed only if the request body is the frame itself."
 _METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "HEAD")
 #: Bounds of JSON Schema in words, which follow a type.
 _BOUNDS = {

@@ -20,14 +20,16 @@ class NewKey(Given):
     """A key to create."""
 
     name: Label = Field(
-        description="Name of its user; unique, and shown in the audit log.", examples=["robot-7"]
+        description="Unique name of the key, such as the name of its user; shown in the audit log.",
+        examples=["robot-7"],
     )
     grants: Annotated[
         dict[Annotated[str, StringConstraints(pattern=MAP_OR_EVERY)], Scope],
         Field(min_length=1, max_length=1000),
     ] = Field(
-        description="Scope by the name of a map, which need not exist yet; `*` stands for all "
-        "maps, and for operations on no map. `write` includes `read`, and `admin` everything.",
+        description="Scope for each map, by the name of the map. The map need not exist yet. `*` "
+        "stands for all maps and for operations that belong to no map. `write` includes `read`, "
+        "and `admin` includes both.",
         examples=[{"warehouse-2": "write"}],
     )
     expires_at: AwareDatetime | None = Field(
@@ -35,7 +37,8 @@ class NewKey(Given):
     )
     tenant: Label | None = Field(
         default=None,
-        description="Tenant that owns the key, which must exist; null: a tenant of the key's name.",
+        description="Tenant that owns the key; the tenant must exist. If null, the tenant has the "
+        "same name as the key.",
     )
 
 
@@ -43,20 +46,20 @@ class Key(ApiRecord):
     """An API key without its secret, which the service does not store."""
 
     name: str
-    grants: dict[str, Scope] = Field(description="Scope for each map; `*` for all maps.")
+    grants: dict[str, Scope] = Field(description="Scope for each map; `*` stands for all maps.")
     created_at: datetime
-    expires_at: datetime | None = Field(description="Expiry time; null if it does not expire.")
+    expires_at: datetime | None = Field(description="Expiry time; null if the key does not expire.")
     tenant: str = Field(
         description="Tenant that owns the key. Limits apply to all keys of a tenant together."
     )
     previous_until: datetime | None = Field(
         default=None,
-        description="Expiry time of the secret before the last rotation; null if there is no such "
-        "secret.",
+        description="Expiry time of the previous secret after a rotation; null if there is no "
+        "previous secret.",
     )
     last_used_at: datetime | None = Field(
         default=None,
-        description="Time of the last use, to the hour; null if the key was never used.",
+        description="Time of the last use, accurate to the hour; null if the key was never used.",
     )
 
 
@@ -73,9 +76,9 @@ class Me(ApiRecord):
     """The key of a request."""
 
     name: str | None = Field(description="Name of the key; null if no key is required.")
-    grants: dict[str, Scope] = Field(description="Scope for each map; `*` for all maps.")
+    grants: dict[str, Scope] = Field(description="Scope for each map; `*` stands for all maps.")
     expires_at: datetime | None = Field(
-        default=None, description="Expiry time; null if it does not expire."
+        default=None, description="Expiry time; null if the key does not expire."
     )
 
 
@@ -85,78 +88,81 @@ class AuditLine(ApiRecord):
     number: int = Field(description="Number of the line. Numbers increase, possibly with gaps.")
     at: datetime
     actor: str | None = Field(
-        description="Name of the key; null if no key is required; `command` for a command on the "
-        "data folder."
+        description="Name of the key; null if the service requires no keys; `command` for a change "
+        "by a command on the data folder."
     )
-    address: str | None = Field(description="IP address of the caller, or of its proxy.")
-    tenant: str = Field(description="Tenant of the key; empty without a key.")
+    address: str | None = Field(description="IP address of the caller or of the caller's proxy.")
+    tenant: str = Field(description="Tenant of the key; empty if there is no key.")
     action: str = Field(
-        description="Kind of the event, such as `map.deleted`, or an action without an event, such "
-        "as `job.cancelled`; `refused` for a refused request (401 or 403), which changed nothing."
+        description="Kind of the event, such as `map.deleted`, or name of an action that sends no "
+        "event, such as `job.cancelled`. `refused`: a request that was refused with 401 or 403 and "
+        "changed nothing."
     )
     map: str | None = Field(description="Name of the changed map.")
     target: str | None = Field(description="Id or name of the changed object.")
     request_id: str | None = Field(description="Id of the request, as in the log.")
-    data: dict[str, Any] = Field(description="More data, depending on the action.")
+    data: dict[str, Any] = Field(description="Additional data, depending on the action.")
 
 
 # Statistics and models.
 
 
 class Sizes(ApiRecord):
-    """Disk space of the parts of a store, bytes."""
+    """Disk space of a store and its parts, bytes."""
 
     database: int | None = Field(
-        description="Size of the database with its log; null if it is not a file. For one map: "
-        "size of its signatures."
+        description="Size of the database, including its log; null if the database is not a file. "
+        "For a single map, the size of its signatures."
     )
     blobs: int = Field(
-        description="Size of uploads and derived files, estimated from a sample if there are many. "
-        "For one map: size of its frames, without archives and meshes."
+        description="Size of uploads and derived files, estimated from a sample if there are many "
+        "files. For a single map, the size of its frames, excluding archives and meshes."
     )
-    index: int = Field(description="Size of the search indexes on this machine, which are a cache.")
-    free: int | None = Field(description="Free space on the data folder's disk; null for one map.")
+    index: int = Field(description="Size of the search indexes that are cached on this machine.")
+    free: int | None = Field(
+        description="Free space on the disk of the data folder; null for a single map."
+    )
     disk: int | None = Field(
         default=None,
-        description="Size of the data folder's disk; null for one map.",
+        description="Size of the disk of the data folder; null for a single map.",
     )
 
 
 class IndexRecall(ApiRecord):
-    """Recall of queries that use an index (without `exact`), measured at its publication."""
+    """Recall of queries with an index (without `exact`), measured when the index was published."""
 
     share: float = Field(
         description="Share of the `near` nearest frames that a query finds; 1 if a query compares "
         "every frame."
     )
-    near: int = Field(description="Number of nearest frames that each test query had to find.")
+    near: int = Field(description="Number of nearest frames that each test query should find.")
     sample: int = Field(
-        description="Number of test queries with frames of the map, each excluded from its own "
-        "search; 0 if a query compares every frame."
+        description="Number of test queries; 0 if a query compares every frame. Each test query "
+        "uses a frame of the map, which is excluded from that search."
     )
     probes: int = Field(
-        description="Minimum number of frames that a query compares in a large map: those with the "
-        "nearest sketches (one bit for each byte of a signature). 0 if a query compares every "
-        "frame."
+        description="Minimum number of frames that a query compares in a large map; 0 if a query "
+        "compares every frame. The query compares the frames with the nearest sketches (one bit "
+        "for each byte of a signature)."
     )
     frames: int = Field(description="Number of frames in the index at the time of the measurement.")
 
 
 class IndexState(ApiRecord):
-    """State of a map's search index. Queries compare frames that it lacks one by one."""
+    """State of a map's search index. Frames that are not in the index are compared one by one."""
 
     map: str
     version: int | None = Field(
-        description="Version of the index; null without an index, as for small maps and models "
-        "that store psi. Queries then compare every frame."
+        description="Version of the index; null if there is no index, as for small maps and models "
+        "that store psi. Without an index, queries compare every frame."
     )
     tail: int = Field(
-        description="Number of indexed frames that the version lacks. If it stays above the "
-        "setting `UNINDEXED_FRAMES`, check that workers run."
+        description="Number of searchable frames that are not in this version of the index. If the "
+        "number stays above the setting `UNINDEXED_FRAMES`, check that workers are running."
     )
     recall: IndexRecall | None = Field(
         default=None,
-        description="Recall with the index; null without an index.",
+        description="Recall with the index; null if there is no index.",
     )
 
 
@@ -178,18 +184,18 @@ class Latency(ApiRecord):
 class Counted(ApiRecord):
     """Counts over a period."""
 
-    received: int = Field(description="Number of frames that were stored or queued again.")
+    received: int = Field(description="Number of frames that were stored, or queued again.")
     indexed: int
     rejected: int = Field(description="Number of frames that cannot be signed.")
     redundant: int
     failed: int
     deleted: int
     queries: dict[str, int] | None = Field(
-        description="Number of queries by status of the answer, for the whole service. This and "
-        "the following fields are null for a single map."
+        description="Number of queries for each status of the answer, for the whole service. This "
+        "and the following fields are null for a single map."
     )
     latency: Latency | None = Field(
-        description="Latency of answered queries; null without queries."
+        description="Latency of answered queries; null if there were none."
     )
     requests: int | None = Field(description="Number of requests under /v1, answered or refused.")
     refused: int | None = Field(description="Number of these requests with a 4xx response.")
@@ -200,34 +206,42 @@ class Counted(ApiRecord):
 
 
 class Minute(Counted):
-    """Counts over one minute. A request may count up to ten seconds after its response."""
+    """Counts over one minute. A request may be counted up to ten seconds after its response."""
 
     at: datetime = Field(description="Start of the minute.")
 
 
 class MapUse(ApiRecord):
-    """A map's use of its quota and retention; see Map."""
+    """A map's usage, quota and retention; see Map."""
 
     frames: int = Field(description="Number of frames that count towards the quota.")
-    bytes: int = Field(description="Size of their uploads as received.")
-    quota_frames: int | None = Field(description="Maximum number of frames; null without a quota.")
-    quota_bytes: int | None = Field(description="Maximum size of uploads; null without a quota.")
-    retention_days: float | None = Field(description="Retention; null if frames do not expire.")
+    bytes: int = Field(description="Size of the uploads of these frames as received.")
+    quota_frames: int | None = Field(
+        description="Maximum number of frames; null if there is no quota."
+    )
+    quota_bytes: int | None = Field(
+        description="Maximum size of uploads; null if there is no quota."
+    )
+    retention_days: float | None = Field(
+        description="Retention time; null if frames do not expire."
+    )
 
 
 class ScrubSeen(ApiRecord):
     """Progress of the check of all stored data."""
 
-    began_at: datetime = Field(description="Start of the current or the last pass.")
+    began_at: datetime = Field(
+        description="Start of the current pass, or of the last pass if none is running."
+    )
     finished_at: datetime | None = Field(
-        description="End of the last complete pass; null if no pass has ended."
+        description="End of the last complete pass; null if no pass has been completed."
     )
     blobs: int = Field(description="Number of uploads and artifacts that this pass has read.")
     bytes: int = Field(description="Size of the uploads and artifacts that this pass has read.")
     damaged: int = Field(
-        description="Number of lost or damaged rows, signatures, uploads and artifacts in this "
-        "pass. Events `frame.damaged` name the frames with lost data, and `sceneprint fsck` lists "
-        "everything."
+        description="Number of lost or damaged rows, signatures, uploads and artifacts that this "
+        "pass has found. Events `frame.damaged` name the frames with lost data, and `sceneprint "
+        "fsck` lists everything."
     )
 
 
@@ -237,35 +251,37 @@ class Stats(ApiRecord):
     at: datetime
     counted_at: datetime | None = Field(
         default=None,
-        description="Time of the counts of frames, ended jobs, indexes and bytes. Above 100,000 "
-        "frames and jobs, counting takes at most 1 % of the time.",
+        description="Time at which frames, ended jobs, indexes and bytes were counted. If there "
+        "are more than 100,000 frames and jobs, counting takes at most 1 % of the time.",
     )
     map: str | None = Field(description="Name of the map; null for all maps.")
     maps: int
     frames: dict[str, int] = Field(description="Number of frames in each state.")
     jobs: dict[str, int] = Field(description="Number of jobs in each state.")
-    waiting: int = Field(description="Number of jobs that wait for a worker.")
+    waiting: int = Field(description="Number of jobs that are waiting for a worker.")
     oldest_waiting_s: dict[str, float] = Field(
         description="Age of the oldest waiting job of each kind, seconds."
     )
     indexes: list[IndexState] = Field(
-        description="Indexes of the recently changed maps, with the longest tails first; at most "
-        "200."
+        description="Indexes of at most 200 recently changed maps, longest tails first."
     )
     workers: list[WorkerSeen] | None = Field(
-        description="Workers on all hosts of a PostgreSQL database, or on this machine with "
-        "SQLite. Null for one map."
+        description="Workers on all hosts that share a PostgreSQL database, or on this machine if "
+        "the database is SQLite; null for a single map."
     )
     bytes: Sizes = Field(description="Disk space, measured at most twice per minute.")
     use: MapUse | None = Field(
-        default=None, description="Use of quota and retention; null for all maps."
+        default=None, description="Usage, quota and retention of the map; null for all maps."
     )
     scrub: ScrubSeen | None = Field(
-        default=None, description="State of the scrub; null before the first pass, and for one map."
+        default=None,
+        description="Progress of the check of all stored data; null before the first pass and for "
+        "a single map.",
     )
-    total: Counted = Field(description="Sum of all minutes.")
+    total: Counted = Field(description="Sum of the counts of all minutes.")
     minutes: list[Minute] = Field(
-        description="The last minutes, oldest first; the last one is not complete."
+        description="Counts of the most recent minutes, oldest first; the last minute is "
+        "incomplete."
     )
 
 
@@ -275,14 +291,14 @@ class ModelInfo(ApiRecord):
     model_id: str
     label: str = Field(description="Name and first digits of the id, as in maps and answers.")
     name: str
-    preset: bool = Field(description="Whether this version contains the model.")
+    preset: bool = Field(description="Whether the model is part of this version of the service.")
     components: int = Field(description="G, the number of components of the mixture.")
     levels: int = Field(description="Number of levels of the hierarchy of patches.")
     signature_bytes: int = Field(
         description="Length of a stored signature, bytes: d, or 25 G H if psi itself is stored."
     )
     metric: Literal["l1", "l2"] = Field(
-        description="Metric of distances: `l2`, squared, or `l1` if psi itself is stored."
+        description="Distance metric. `l2`: squared L2. `l1`: L1, if psi itself is stored."
     )
     unrelated_distance: float = Field(
         description="d0, the median distance of unrelated frames: similarity = 1 - distance / d0."
@@ -320,8 +336,10 @@ ImportPhase = Literal["read", "choose", "render", "sign", "test"]
 class Progress(ApiRecord):
     """The progress of a long job."""
 
-    done: int = Field(description="Number of completed steps: frames, or files of an archive.")
-    total: int | None = Field(default=None, description="Number of all steps, if known.")
+    done: int = Field(
+        description="Number of completed steps, which are frames or files of an archive."
+    )
+    total: int | None = Field(default=None, description="Total number of steps; null if unknown.")
     phase: ImportPhase | None = Field(
         default=None,
         description="Phase of a map import. This and the following fields are null for other jobs.",
@@ -343,10 +361,12 @@ class Product(ApiRecord):
     collection: ClassVar[str]
     request_type: ClassVar[type[Given]]
 
-    job_id: str = Field(description="Id of the product and of its job: GET /v1/jobs/{job_id}.")
-    map: str | None = Field(description="Map; null if the result may have several.")
+    job_id: str = Field(description="Id of this result and of its job; see GET /v1/jobs/{job_id}.")
+    map: str | None = Field(
+        description="Name of the map; null if the result may belong to several maps."
+    )
     state: JobState
-    progress: Progress | None = Field(description="Progress; null before the job starts.")
+    progress: Progress | None = Field(description="Progress of the job; null before it starts.")
     error: str | None
     created_at: datetime
     finished_at: datetime | None
@@ -373,7 +393,7 @@ class Job(ApiRecord):
     traceback: str | None
     progress: Progress | None = Field(
         default=None,
-        description="Progress of a long job, which runs in slices; null before the job starts.",
+        description="Progress of a long job, which runs in slices; null before it starts.",
     )
     result: dict[str, Any] | None = Field(
         default=None,
@@ -449,19 +469,20 @@ class Event(ApiRecord):
     """An event of the service."""
 
     id: str = Field(
-        description="Opaque id. Send it as `Last-Event-ID` to a stream, or as `after` to a "
-        "request. The ids themselves have no order, but lists of events do."
+        description="Opaque id. To continue after this event, send its id as `Last-Event-ID` to a "
+        "stream or as `after` in a request. Ids cannot be used to sort events; lists of events are "
+        "already in order."
     )
     at: datetime
     kind: str = Field(
         description="Kind, such as frame.indexed; docs/operations.md lists all kinds. Clients must "
-        "accept unknown kinds. `events.missed` replaces requested events that have expired: "
-        "refresh the state of your maps, then continue."
+        "accept unknown kinds. `events.missed` replaces requested events that have expired; reload "
+        "the state of your maps, then continue."
     )
     map: str | None = Field(description="Name of the map.")
     frame_id: str | None
     job_id: str | None
-    data: dict[str, Any] = Field(description="More data, depending on the kind.")
+    data: dict[str, Any] = Field(description="Additional data, depending on the kind.")
 
 
 class EventPage(Page[Event]):
@@ -469,5 +490,5 @@ class EventPage(Page[Event]):
 
     newest: str = Field(
         description="Id of the newest event of your maps, of any kind, at the time of the request; "
-        "0 if there is none. A stream with this id as `after` continues from here."
+        "0 if there are no events. To continue from here, open a stream with this id as `after`."
     )

@@ -106,17 +106,18 @@ class Page(ApiRecord, Generic[T]):
 
     items: list[T]
     next_cursor: str | None = Field(
-        default=None, description="Send it as `cursor` for the next page; null at the end."
+        default=None,
+        description="Cursor of the next page, to send as `cursor`; null on the last page.",
     )
 
 
 class Problem(ApiRecord):
-    """The reason why a request was refused (RFC 9457)."""
+    """Details of an error, as a problem document (RFC 9457)."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
-    type: str = Field(description="URI of the kind of problem.")
-    title: str = Field(description="Kind of problem in words.")
+    type: str = Field(description="URI that identifies the kind of problem.")
+    title: str = Field(description="Short name of the kind of problem.")
     status: int
     detail: str = Field(description="What happened, why, and what to do.")
     instance: str = Field(default="", description="Id of the request, as in the service's log.")
@@ -151,8 +152,9 @@ class Quaternion(ApiRecord):
 
 
 class Transform(ApiRecord):
-    """A rigid transform: x_parent = matrix @ x_child, in metres. Camera frames (`ID.optical`) have
-    x right, y down, z forward; a cloud (`ID.sensor`) has the axes of its sensor.
+    """A rigid transform in metres, with x_parent = matrix @ x_child. In camera frames
+    (`ID.optical`), x points right, y down and z forward; in the frames of clouds (`ID.sensor`), the
+    axes are those of the sensor.
     """
 
     parent_frame: str
@@ -431,7 +433,7 @@ class CameraIntrinsics(Given):
     distortion: list[float] = Field(
         default=[],
         max_length=5,
-        description="k1, k2, p1, p2[, k3] of OpenCV; no distortion by default.",
+        description="OpenCV distortion coefficients k1, k2, p1, p2[, k3]; default: no distortion.",
     )
 
 
@@ -457,10 +459,10 @@ class GivenTransform(Given):
     """A rigid transform, as `translation` and `rotation` or as `matrix`."""
 
     translation: GivenVector | None = Field(
-        default=None, description="Translation; the name `position` of ROS is also accepted."
+        default=None, description="Translation; the ROS name `position` is also accepted."
     )
     rotation: GivenQuaternion | None = Field(
-        default=None, description="Rotation; the name `orientation` of ROS is also accepted."
+        default=None, description="Rotation; the ROS name `orientation` is also accepted."
     )
     matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
 
@@ -485,12 +487,13 @@ class GivenPose(GivenTransform):
 
     parent_frame: Label | None = Field(
         default=None,
-        description="Parent frame. Poses are only combined within one; default: ROBOT/SESSION.",
+        description="Parent frame; default: ROBOT/SESSION. Poses are combined only within the same "
+        "parent frame.",
     )
     of: Literal["sensor", "base"] = Field(
         default="sensor",
-        description="Frame whose pose this is. `base` requires `T_base_sensor`; the pose is then "
-        "T_parent_base, and is stored as that of the sensor.",
+        description="Frame whose pose is given. `sensor`: the pose is T_parent_sensor. `base`: the "
+        "pose is T_parent_base, and is converted to that of the sensor; requires `T_base_sensor`.",
     )
 
 
@@ -505,62 +508,69 @@ class FrameMeta(Given):
 
     intrinsics: CameraIntrinsics | None = Field(
         default=None,
-        description="Camera of a depth image; point clouds do not have one.",
+        description="Camera intrinsics of a depth image; point clouds have none.",
     )
     depth_scale: float = Field(
         default=1000.0,
         gt=0,
-        description="Stored units per metre; ignored for floating-point NPY files in metres.",
+        description="Stored units per metre; ignored for floating-point NPY files, whose values "
+        "are in metres.",
     )
     depth_along_ray: bool = Field(
-        default=False, description="Whether samples are ranges along the pixel's ray."
+        default=False,
+        description="Whether samples are distances along the ray of the pixel instead of the "
+        "optical axis.",
     )
     trust_depth: bool = Field(
         default=False,
-        description="Whether to accept a depth image that fails the sanity check, such as one with "
-        "more noise than any known sensor has.",
+        description="Whether to accept a depth image that fails the sanity check, for example "
+        "because it has more noise than images of any known sensor.",
     )
     viewpoint: GivenVector | Literal["file"] | None = Field(
         default="file",
-        description="Viewpoint of a point cloud in its own axes, metres; null without a viewpoint, "
-        "as for clouds fused from many views. `file`: the viewpoint in the file (VIEWPOINT of a "
-        "PCD), otherwise the origin of its coordinates.",
+        description="Viewpoint of a point cloud in its own coordinates, metres; null if the cloud "
+        "has no single viewpoint, for example because it was fused from many views. `file`: the "
+        "viewpoint in the file (VIEWPOINT in a PCD file), otherwise the origin of the file's "
+        "coordinates.",
     )
     units_per_metre: float = Field(
-        default=1.0, gt=0, description="Units per metre of a point cloud: 1000 for millimetres."
+        default=1.0,
+        gt=0,
+        description="Units per metre of a point cloud, such as 1000 for millimetres.",
     )
     format: CloudFormat | None = Field(
         default=None,
-        description="Format of a point cloud; default: recognised. KITTI files require `kitti`.",
+        description="Format of a point cloud; default: detected automatically. KITTI files require "
+        "`kitti`.",
     )
     robot: Label | None = Field(default=None, description="Robot that took the frame.")
-    session: Label | None = Field(default=None, description="Name of the run.")
+    session: Label | None = Field(default=None, description="Session in which the frame was taken.")
     captured_at: AwareDatetime | None = Field(
         default=None,
-        description="Time of capture, with its time zone.",
+        description="Capture time, with time zone.",
     )
     name: FileName | None = Field(
         default=None,
-        description="Name of the original file or message, such as `frame-000123.depth.png`. It is "
-        "a searchable label, and never used as a path.",
+        description="Name of the original file or message, such as `frame-000123.depth.png`. The "
+        "name is a searchable label and is never used as a path.",
     )
     sequence: Place | None = Field(
         default=None,
-        description="Index in the session, such as the number of the file or message. It orders "
-        "frames without `captured_at`, independently of the order of upload.",
+        description="Index in the session, such as the number of the file or message. It "
+        "determines the order of frames without `captured_at`, regardless of the order of upload.",
     )
     pose: GivenPose | None = None
     T_base_sensor: GivenBase | None = Field(
         default=None,
-        description="Pose of the sensor on the robot; answers then also contain the pose of the "
-        "robot's base. For a cloud with a `viewpoint` other than its origin, the default is the "
-        "base frame `cloud`, the coordinates of the upload.",
+        description="Pose of the sensor on the robot. If specified, answers also contain the pose "
+        "of the robot's base. For a cloud whose `viewpoint` is not its origin, the default base "
+        "frame is `cloud`, the coordinate frame of the upload.",
     )
     up: Up | None = Field(
         default=None,
-        description="Up direction as an IMU measures it: a unit vector in the sensor's axes (for a "
-        "camera x right, y down, z forward; a level camera has (0, -1, 0)). It excludes transforms "
-        "that tilt a query against a frame.",
+        description="Unit vector that points up, in the sensor's axes, for example from an IMU. "
+        "For a level camera (x right, y down, z forward), it is (0, -1, 0). Transforms that tilt a "
+        "query relative to a frame are excluded.",
     )
     tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
 

@@ -21,7 +21,7 @@ class CopyRequest(ApiRecord):
 
 
 class CopyPart(ApiRecord):
-    """A part of a map: the rows of consecutive frames in the order of their upload."""
+    """A part of a map, with the rows of consecutive frames in the order of their upload."""
 
     digest: Digest = Field(description="SHA-256 of the bytes of the part.")
     bytes: int
@@ -30,7 +30,7 @@ class CopyPart(ApiRecord):
 
 
 class MapCopy(ApiRecord):
-    """The header of a copy: the state of the map at one moment, and all parts of its rows."""
+    """The header of a copy, with the state of the map at one point in time and all its parts."""
 
     name: str
     title: str | None

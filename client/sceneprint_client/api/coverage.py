@@ -23,7 +23,7 @@ CELL_TRENDS: tuple[CellTrend, ...] = ("better", "worse", "same", "new", "gone")
 
 
 class NewMapCoverage(Given):
-    """Frames of a map to query against the others, and tolerances for a right answer."""
+    """Frames of a map to query against the other frames, and tolerances of a correct pose."""
 
     session: Label | None = Field(
         default=None, description="Query only frames of this session; default: all sessions."
@@ -33,24 +33,25 @@ class NewMapCoverage(Given):
         default=1,
         ge=1,
         le=1_000_000,
-        description="Query every n-th frame, in the order of session, robot and time.",
+        description="Query every n-th frame, ordered by session, robot and time.",
     )
     most: int = Field(
         default=1000,
         ge=1,
         le=MOST_QUERIED,
-        description="Maximum number of queried frames, evenly spaced.",
+        description="Maximum number of queried frames, which are evenly spaced.",
     )
     not_within_s: float = Field(
         default=10.0,
         ge=0.0,
         le=1e9,
-        description="Exclude frames of the queried frame's own session within this number of "
-        "seconds; 0 excludes only the frame itself, as do frames without a session or time.",
+        description="Exclude frames of the same session that were taken within this number of "
+        "seconds of the queried frame. If it is 0, or if the queried frame has no session or time, "
+        "only the frame itself is excluded.",
     )
     other_sessions: bool = Field(
         default=False,
-        description="Exclude all frames of the queried frame's own session and robot, as if the "
+        description="Exclude all frames with the session and robot of the queried frame, as if the "
         "robot came back on another day.",
     )
     tolerance_m: float = Field(
@@ -60,15 +61,18 @@ class NewMapCoverage(Given):
         description="Maximum distance of a correct pose from the frame's own pose, metres.",
     )
     tolerance_deg: float = Field(
-        default=15.0, gt=0.0, le=180.0, description="Maximum rotation of a correct pose, degrees."
+        default=15.0,
+        gt=0.0,
+        le=180.0,
+        description="Maximum angle between a correct pose and the frame's own pose, degrees.",
     )
     cell_m: float | None = Field(
         default=None,
         ge=0.1,
         le=1000.0,
-        description="Width of the plan's cells, metres; default: one of 0.25, 0.5, 1, 2, 5 m and "
-        "so on, for approximately 20 cells along the longer side. Only results with equal widths "
-        "can be compared.",
+        description="Width of the plan's cells, metres; default: the width from the series 0.25, "
+        "0.5, 1, 2, 5 m and so on that gives approximately 20 cells along the longer side. Only "
+        "results with the same cell width can be compared.",
     )
     seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of the queries' random choices.")
 
@@ -82,14 +86,15 @@ class NewMapCoverage(Given):
 class OutcomeCounts(ApiRecord):
     """Number of queried frames with each outcome."""
 
-    found: int = Field(description="Number of frames that were found at the right pose.")
+    found: int = Field(description="Number of frames that were found at the correct pose.")
     wrong: int = Field(description="Number of frames that were found at a wrong pose.")
     ambiguous: int
     not_found: int
     unchecked: int = Field(
         default=0,
-        description="Number of frames that were found but cannot be checked, because frame and "
-        "answer have no poses in one parent frame. Exclude them from percentages.",
+        description="Number of frames that were found but cannot be checked, because the frame and "
+        "its answer do not both have a pose in the same parent frame. Exclude these frames from "
+        "percentages.",
     )
 
 
@@ -98,8 +103,8 @@ class CoverageResult(OutcomeCounts):
 
     frames: int = Field(description="Number of queried frames.")
     skipped: int = Field(
-        description="Number of frames that could not be queried: deleted, damaged or edited "
-        "meanwhile."
+        description="Number of frames that could not be queried because they were deleted, damaged "
+        "or edited in the meantime."
     )
     model: str = Field(description="Model of the signatures.")
     revision: int = Field(
@@ -107,8 +112,8 @@ class CoverageResult(OutcomeCounts):
         "that is indexed or deleted."
     )
     last_revision: int = Field(
-        description="Revision of the map when the job ended. If it differs, frames were indexed or "
-        "deleted meanwhile."
+        description="Revision of the map when the job ended. If it differs from `revision`, frames "
+        "were indexed or deleted in the meantime."
     )
     map_frames: int = Field(description="Number of indexed frames of the map when the job ended.")
     cell_m: float = Field(description="Width of the cells, metres.")
@@ -121,7 +126,7 @@ class CoverageCell(OutcomeCounts):
         description="Index along `x_axis`: the cell extends from `column` * `cell_m` to "
         "(`column` + 1) * `cell_m`."
     )
-    row: int = Field(description="Index along `y_axis`, like `column`.")
+    row: int = Field(description="Index along `y_axis`; see `column`.")
     frames: int = Field(
         description="Number of the map's indexed frames whose sensor was in the cell."
     )
@@ -132,14 +137,17 @@ class CoveragePlan(ApiRecord):
 
     parent_frame: str
     x_axis: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector to the right, in the parent frame."
+        min_length=3,
+        max_length=3,
+        description="Unit vector that points to the right of the plan, in the parent frame.",
     )
     y_axis: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector to the top of the plan."
+        min_length=3, max_length=3, description="Unit vector that points to the top of the plan."
     )
     up_from: UpSource = Field(
-        description="Source of the up axis. `map`: the map's `up`. `frames`: the `up` of its "
-        "frames. `cameras`: an estimate, the axis nearest to the vertical of the camera images."
+        description="Source of the up direction. `map`: the map's `up`. `frames`: the `up` of its "
+        "frames. `cameras`: an estimate, namely the axis nearest to the vertical of the camera "
+        "images."
     )
     cells: list[CoverageCell] = Field(
         description="The cells in which frames were taken, by row, then by column."
@@ -157,22 +165,22 @@ class MapCoverage(Product):
     plans: list[CoveragePlan] | None = Field(
         default=None,
         description="One plan for each parent frame, sorted by number of queried frames; null in "
-        "lists, and until the job has succeeded.",
+        "lists and until the job has succeeded.",
     )
 
 
 class CoverageFrame(ApiRecord):
     """A queried frame and its outcome."""
 
-    number: int = Field(description="Index in the order of the queries, from 0.")
+    number: int = Field(description="Index in the order of the queries, starting at 0.")
     frame_id: str
     robot: str | None
     session: str | None
     outcome: CoverageOutcome
     reason: str = Field(description="Explanation of the answer in a sentence.")
-    cause: Cause | None = Field(description="Most likely cause of a `not_found`.")
+    cause: Cause | None = Field(description="Most likely cause if the outcome is `not_found`.")
     parent_frame: str | None = Field(
-        description="Parent frame of its own pose; null without a pose."
+        description="Parent frame of the frame's own pose; null if the frame has no pose."
     )
     position: Vector | None = Field(
         description="Position of the frame's sensor in the parent frame at the time of the query."
@@ -183,8 +191,8 @@ class CoverageFrame(ApiRecord):
     )
     error_deg: float | None = Field(description="Angle between the two poses, degrees.")
     look_alikes: list[str] = Field(
-        description="Ids of frames of similar places: if `ambiguous`, the match for each wrong "
-        "pose; if `wrong`, the match at the found pose."
+        description="Ids of frames of places that look alike. If the outcome is `ambiguous`, the "
+        "match for each wrong pose; if it is `wrong`, the match at the found pose."
     )
 
 
@@ -195,11 +203,15 @@ class CellChange(ApiRecord):
     row: int
     trend: CellTrend = Field(
         description="Change of the mean score of the cell's queried frames (1 for found, -1 for "
-        "wrong, 0 otherwise). `new` and `gone`: only one of the jobs has queried frames in the "
-        "cell."
+        "wrong, 0 otherwise). `new`: only the later job queried frames in the cell. `gone`: only "
+        "the earlier job did."
     )
-    before: CoverageCell | None = Field(description="Earlier counts; null without frames.")
-    after: CoverageCell | None = Field(description="Later counts; null without frames.")
+    before: CoverageCell | None = Field(
+        description="Counts of the earlier job; null if the cell has no frames."
+    )
+    after: CoverageCell | None = Field(
+        description="Counts of the later job; null if the cell has no frames."
+    )
 
 
 class PlanChanges(ApiRecord):

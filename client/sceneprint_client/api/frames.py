@@ -61,7 +61,7 @@ class SampleRange(ApiRecord):
     near: float = Field(description="5th percentile, metres.")
     median: float
     far: float = Field(description="95th percentile, metres.")
-    count: int = Field(description="Number of pixels with depth, or of points.")
+    count: int = Field(description="Number of pixels with depth, or number of points.")
     valid: float | None = Field(
         default=None, description="Share of the pixels with depth; null for a cloud."
     )
@@ -116,13 +116,12 @@ class UploadSummary(ApiRecord):
 
     frames: int = Field(description="Number of frames that were sent or found in an archive.")
     poses: int = Field(description="Number of these frames with a pose in the map.")
-    without_pose: dict[str, int] = Field(
-        description="Number of frames without a pose, by the reason."
-    )
+    without_pose: dict[str, int] = Field(description="Number of frames without a pose, by reason.")
     left_out: list[str] = Field(default=[], description="Omitted data, with the reasons.")
     lost: int = Field(
         default=0,
-        description="Number of frames with depth or points that were omitted by no option.",
+        description="Number of frames with depth or points that were omitted although no option "
+        "excluded them.",
     )
     depth: SampleRange | None = Field(
         default=None, description="Pooled range of all depth images: medians of their ranges."
@@ -167,10 +166,12 @@ class Added(ApiRecord):
     """The result of an upload."""
 
     frame_id: str
-    job_id: str = Field(description="Id of the job that signs the frame: GET /v1/jobs/{job_id}.")
+    job_id: str = Field(
+        description="Id of the job that signs the frame; see GET /v1/jobs/{job_id}."
+    )
     state: FrameState
     reason: str | None = Field(
-        default=None, description="Why the frame was rejected, failed or was not kept."
+        default=None, description="Reason why the frame was rejected, failed or was not kept."
     )
     samples: SampleRange | None = Field(
         default=None, description="Range of the frame's samples; see Frame."
@@ -184,23 +185,27 @@ class Frame(ApiRecord):
     frame_id: str
     map: str
     state: FrameState
-    reason: str | None = Field(description="Why the frame was rejected, failed or was not kept.")
+    reason: str | None = Field(
+        description="Reason why the frame was rejected, failed or was not kept."
+    )
     job_id: str
     content_id: str | None = Field(
-        description="Hash of samples and camera, or of points and viewpoint; null after deletion."
+        description="Hash of the samples and the camera, or of the points and the viewpoint; null "
+        "after the frame was deleted."
     )
     kind: Kind = "depth"
     bytes: int = Field(description="Size of the upload.")
-    intrinsics: CameraIntrinsics | None = Field(description="Camera; null for a cloud.")
+    intrinsics: CameraIntrinsics | None = Field(description="Camera intrinsics; null for a cloud.")
     depth_scale: float | None = Field(description="Stored units per metre; null for a cloud.")
     depth_along_ray: bool | None = Field(
-        description="Whether samples are ranges along the pixel's ray; null for a cloud."
+        description="Whether samples are distances along the ray of the pixel instead of the "
+        "optical axis; null for a cloud."
     )
     trust_depth: bool | None = Field(
         default=None, description="Whether the sanity check of depth images was skipped."
     )
     samples: SampleRange | None = Field(
-        default=None, description="Range of the samples; null after a purge."
+        default=None, description="Range of the samples; null after the frame was purged."
     )
     points: int | None = Field(default=None, description="Number of points of a cloud.")
     viewpoint: Vector | None = Field(
@@ -210,7 +215,9 @@ class Frame(ApiRecord):
         default=None, description="Units per metre of a cloud; null for a depth image."
     )
     note: str | None = Field(
-        default=None, description="Changes of a cloud's points during reading; null if none."
+        default=None,
+        description="Changes that were made to a cloud's points when it was read; null if there "
+        "were none.",
     )
     robot: str | None
     session: str | None
@@ -222,8 +229,8 @@ class Frame(ApiRecord):
     pose: Transform | None
     sent_pose: Transform | None = Field(
         default=None,
-        description="Pose as uploaded, if the map joined its parent frame to that of `pose`; "
-        "otherwise null.",
+        description="Pose as uploaded, if its parent frame was joined to that of `pose`; otherwise "
+        "null.",
     )
     base_frame: str | None = Field(default=None, description="Name of the robot's base frame.")
     T_base_sensor: Transform | None = Field(
@@ -296,28 +303,30 @@ class ImportOptions(Given):
     as_: Literal["frames", "map"] = Field(
         default="frames",
         alias="as",
-        description="`frames`: an archive of sequences, whose frames are added. `map`: a cloud or "
-        "mesh of a whole place; rendered views of it are added, with the tag `virtual`.",
+        description="`frames`: an archive of sequences; their frames are added. `map`: a cloud or "
+        "mesh of a whole place; rendered views of the place are added, with the tag `virtual`.",
     )
     name: FolderName = Field(
         default="import",
-        description="Name of the sequence that lies outside of any folder in the archive. For a "
-        "map, the name of its file.",
+        description="Name for a sequence that is not in a folder of the archive. For a map, the "
+        "name of its file.",
     )
     robot: Label | None = Field(
-        default=None, description="Robot that took the frames; also a prefix of the parent frame."
+        default=None,
+        description="Robot that took the frames; also the prefix of the default parent frame.",
     )
     session: Label | None = Field(
         default=None,
-        description="Session of the frames; default: name of each sequence, or of the map's file.",
+        description="Session of the frames; default: the name of each sequence, or of the map's "
+        "file.",
     )
     tags: list[Label] = Field(default=[], max_length=MOST_TAGS, description="Tags of all frames.")
     parent_frame: Label | None = Field(
         default=None,
-        description="Parent frame of all poses; default: name of the scene or of the map's file, "
-        "after ROBOT/ if there is a robot.",
+        description="Parent frame of all poses; default: the name of the scene or of the map's "
+        "file, with the prefix ROBOT/ if `robot` is specified.",
     )
-    with_poses: bool = Field(default=True, description="Whether to use poses of the archive.")
+    with_poses: bool = Field(default=True, description="Whether to use the poses in the archive.")
     every: int = Field(default=1, ge=1, description="Import every n-th frame of a sequence.")
     trust_depth: bool = Field(default=False, description="See FrameMeta; applies to all frames.")
     T_base_sensor: GivenBase | None = Field(
@@ -325,31 +334,31 @@ class ImportOptions(Given):
     )
     up: AxisOrUp | None = Field(
         default=None,
-        description="Up direction in the sensor's axes, for all frames of a sensor that is carried "
-        "level. For a map, the axis of its file that points up, such as `z` or `-y`; default: the "
-        "file's own, otherwise an estimate.",
+        description="Up direction in the sensor's axes, for all frames; specify it if the sensor "
+        "is carried level. For a map, the axis of its file that points up, such as `z` or `-y`; "
+        "default: the up axis that the file specifies, otherwise an estimate.",
     )
     heights: list[Annotated[float, Field(gt=0, le=1000)]] = Field(
         default=[],
         max_length=8,
         description="For a map: heights of the robot's sensor above the floor, metres; default: "
-        "those of the model's sensors.",
+        "typical heights of the model's sensors.",
     )
     units_per_metre: float | None = Field(
         default=None,
         gt=0,
-        description="For a map: units per metre, such as 1000 for millimetres; default: the "
-        "file's own, otherwise an estimate.",
+        description="For a map: units per metre, such as 1000 for millimetres; default: the unit "
+        "that the file specifies, otherwise an estimate.",
     )
     offset: GivenVector | None = Field(
         default=None,
-        description="For a map: metres to subtract from the coordinates of its file. Files in one "
-        "parent frame need the same offset. Default: none, but the centre of a file that is more "
-        "than a kilometre from its origin.",
+        description="For a map: offset to subtract from the coordinates of its file, metres. Files "
+        "in the same parent frame need the same offset. Default: the centre of the file if it is "
+        "more than a kilometre from the origin, otherwise no offset.",
     )
     camera: CameraIntrinsics | None = Field(
         default=None,
-        description="For a map of depth images: the robot's camera, whose views are rendered.",
+        description="For a map of depth images: the robot's camera, for which views are rendered.",
     )
     priority: int = Field(
         default=0, ge=-MOST_PRIORITY, le=MOST_PRIORITY, description="Priority of the frames' jobs."
@@ -416,7 +425,7 @@ class WeakArea(ApiRecord):
     centre: Vector = Field(description="Centre on the floor, in the parent frame of the map.")
     width_m: float
     views: int = Field(description="Number of test views in the square.")
-    found: int = Field(description="Number of these that were found at their poses.")
+    found: int = Field(description="Number of these views that were found at their poses.")
 
 
 class MapImportResult(ApiRecord):
@@ -429,10 +438,10 @@ class MapImportResult(ApiRecord):
     up: Direction = Field(description="Up direction in the axes of the file.")
     up_from: str = Field(description="Source of `up`: `stated`, `file` or `estimated`.")
     offset: Vector = Field(
-        description="Offset in metres: coordinates of the file are poses plus offset. It is zero "
-        "unless the file is far from its origin."
+        description="Offset, metres. Coordinates in the file are coordinates of the poses plus "
+        "this offset. It is zero unless it was specified or the file is far from its origin."
     )
-    notes: list[str] = Field(description="Changes of the file's content during the import.")
+    notes: list[str] = Field(description="Changes that the import made to the content of the file.")
     session: str
     parent_frame: str = Field(description="Parent frame of the poses of all views.")
     views: int = Field(description="Number of views that were added as frames.")
@@ -447,10 +456,10 @@ class MapImportResult(ApiRecord):
     not_found: int
     coverage: float | None = Field(
         description="`found` / `tested`, an upper bound for the share of real frames that will be "
-        "found; null without test views."
+        "found; null if there were no test views."
     )
     weak: list[WeakArea] = Field(
-        description="Areas with fewer than half of the test views found, worst first."
+        description="Areas in which fewer than half of the test views were found, worst first."
     )
 
 
@@ -465,7 +474,9 @@ class ImportItem(ApiRecord):
     samples: SampleRange | None = Field(
         default=None, description="Range of the frame's samples; see Frame."
     )
-    has_pose: bool = Field(default=False, description="Whether the archive has a pose for it.")
+    has_pose: bool = Field(
+        default=False, description="Whether the archive contains a pose of the frame."
+    )
 
 
 def problem_of(error: SceneprintError) -> Problem:

@@ -48,33 +48,40 @@ _Prefix = Annotated[str, Field(min_length=1, max_length=MOST_OF_NAME, pattern=ON
 
 
 class FrameListing(Given):
-    """Conditions on the frames of a list; all of them must hold.
+    """Conditions on the listed frames, all of which must hold.
 
-    Frames without the property of a condition, such as a time, do not match.
+    A frame does not match a condition on a property that it lacks, such as a time.
     """
 
     state: FrameState | None = Field(
-        default=None, description="State; default: any state but `deleted`."
+        default=None, description="State; default: any state except `deleted`."
     )
-    robot: _Names = Field(default=[], description="Robot; repeat it for any of several.")
-    session: _Names = Field(default=[], description="Session; repeat it for any of several.")
-    tag: _Names = Field(default=[], description="Tag; repeat it for frames with all of several.")
+    robot: _Names = Field(
+        default=[], description="Robot; repeat the parameter to match any of several robots."
+    )
+    session: _Names = Field(
+        default=[], description="Session; repeat the parameter to match any of several sessions."
+    )
+    tag: _Names = Field(
+        default=[],
+        description="Tag; repeat the parameter to match frames that have all of several tags.",
+    )
     captured_after: AwareDatetime | None = Field(
-        default=None, description="Earliest time of capture, with a time zone."
+        default=None, description="Earliest capture time, with time zone."
     )
     captured_before: AwareDatetime | None = Field(
-        default=None, description="Latest time of capture, with a time zone."
+        default=None, description="Latest capture time, with time zone."
     )
     received_after: AwareDatetime | None = Field(
-        default=None, description="Earliest time of upload, with a time zone."
+        default=None, description="Earliest upload time, with time zone."
     )
     received_before: AwareDatetime | None = Field(
-        default=None, description="Latest time of upload, with a time zone."
+        default=None, description="Latest upload time, with time zone."
     )
     parent_frame: Label | None = Field(default=None, description="Parent frame of the pose.")
     has_pose: bool | None = Field(default=None, description="Whether the frame has a pose.")
     content_id: Annotated[str, Field(pattern=DIGEST)] | None = Field(
-        default=None, description="Hash of samples and camera."
+        default=None, description="Hash of the samples and the camera; see Frame."
     )
     name: _Prefix | None = Field(default=None, description="Prefix of the name; case-sensitive.")
     find: _Prefix | None = Field(
@@ -82,8 +89,9 @@ class FrameListing(Given):
     )
     order: Literal["asc", "desc", "taken"] = Field(
         default="asc",
-        description="`asc`: by time of upload; `desc`: newest upload first; `taken`, for one "
-        "session: by `captured_at`, frames without it by `sequence`, others by time of upload.",
+        description="`asc`: by upload time. `desc`: newest upload first. `taken`, only for a "
+        "single session: by `captured_at`, frames without it by `sequence`, and frames without "
+        "both by upload time.",
     )
 
     @field_validator("order")
@@ -111,10 +119,10 @@ class Session(ApiRecord):
     first_captured_at: datetime | None
     last_captured_at: datetime | None
     parent_frames: list[str] = Field(
-        description="Parent frames of the poses, by number of frames; at most 20."
+        description="At most 20 parent frames of the poses, sorted by number of frames."
     )
     tags: list[str] = Field(
-        default=[], description="Tags of the frames, by number of frames; at most 20."
+        default=[], description="At most 20 tags of the frames, sorted by number of frames."
     )
 
 
@@ -125,36 +133,36 @@ Clock = Literal["taken", "captured", "sequence", "received"]
 
 
 class Run(Given):
-    """The run whose poses a trajectory has."""
+    """The run and the poses that a trajectory contains."""
 
     session: Label = Field(description="Session of the frames.")
     robot: Label | None = Field(
-        default=None, description="Robot; required if several robots have a session of this name."
+        default=None, description="Robot; required if several robots have a session with this name."
     )
     parent_frame: Label | None = Field(
-        default=None, description="Parent frame; required if the poses have several."
+        default=None, description="Parent frame; required if the poses have several parent frames."
     )
     captured_after: AwareDatetime | None = Field(
-        default=None, description="Earliest time of capture, with a time zone."
+        default=None, description="Earliest capture time, with time zone."
     )
     captured_before: AwareDatetime | None = Field(
-        default=None, description="Latest time of capture, with a time zone."
+        default=None, description="Latest capture time, with time zone."
     )
     most: Annotated[int, Field(ge=2, le=10_000)] | None = Field(
         default=None,
-        description="Maximum number of poses, evenly spaced along the run, including the first and "
-        "the last. The run may then have any length.",
+        description="Maximum number of poses, which are evenly spaced along the run and include "
+        "the first and the last. With `most`, the run may have any length.",
     )
     clock: Clock = Field(
         default="taken",
-        description="Source of the stamps: `captured_at`; `sequence`; `received`, the order of "
-        "upload, which every frame has. `taken`: `captured_at`, or `sequence` if no frame with a "
-        "pose has a time.",
+        description="Source of the timestamps. `captured`: `captured_at`. `sequence`: the index in "
+        "the session. `received`: the upload time, which every frame has. `taken`: `captured_at`, "
+        "or the index in the session if no frame with a pose has a capture time.",
     )
 
 
 class Trajectory(ApiRecord):
-    """The poses of one run in the order of their stamps."""
+    """The poses of one run in the order of their timestamps."""
 
     map: str
     session: str
@@ -164,25 +172,27 @@ class Trajectory(ApiRecord):
     )
     child_frame: str = Field(
         default="optical",
-        description="Frame of each sensor: for a camera x right, y down, z forward; for a cloud "
-        "the axes of its sensor.",
+        description="Coordinate frame of each sensor. A camera has x right, y down, z forward; a "
+        "cloud keeps the axes of its sensor.",
     )
     frame_ids: list[str]
     poses: list[list[float]] = Field(
-        description="One row for each frame, as in a TUM file: t tx ty tz qx qy qz qw, with the "
-        "stamp t, metres and a unit quaternion."
+        description="One row for each frame, t tx ty tz qx qy qz qw as in a TUM file, with the "
+        "timestamp t, metres and a unit quaternion."
     )
     stamps: Stamp | None = Field(
         default=None,
-        description="Meaning of t: `captured` and `received` are seconds since 1970, `sequence` is "
-        "the index in the session. Null if no pose has a stamp.",
+        description="Meaning of t. `captured` and `received`: seconds since 1970. `sequence`: "
+        "index in the session. Null if no pose has a timestamp.",
     )
-    posed: int = Field(description="Number of poses, including those beyond `most`.")
+    posed: int = Field(description="Number of poses, including those omitted because of `most`.")
     left_out: int = Field(
-        description="Number of omitted frames of the run: without pose or stamp, in another parent "
-        "frame, with a duplicate stamp, or beyond `most`."
+        description="Number of frames of the run that were omitted because they have no pose or "
+        "timestamp, have a duplicate timestamp, are in another parent frame, or exceed `most`."
     )
-    reason: str | None = Field(default=None, description="Why there is no pose; null if there is.")
+    reason: str | None = Field(
+        default=None, description="Reason why there are no poses; null if there are poses."
+    )
 
 
 # Filters of queries.
@@ -209,10 +219,11 @@ Names = Annotated[_Several, BeforeValidator(_as_list, json_schema_input_type=Lab
 
 
 class Region(Given):
-    """A box along the axes of a parent frame, including its faces."""
+    """An axis-aligned box in a parent frame, including its faces."""
 
     parent_frame: Label = Field(
-        description="Parent frame of the box. Frames without a pose in it are outside."
+        description="Parent frame of the box. Frames without a pose in this parent frame are "
+        "outside the box."
     )
     min: GivenVector
     max: GivenVector
@@ -232,18 +243,22 @@ class Region(Given):
 
 
 class Filter(Given):
-    """Conditions on the frames that a query may find; all of them must hold.
+    """Conditions on the frames that a query may find, all of which must hold.
 
-    Frames without the property of a condition, such as a time, do not match.
+    A frame does not match a condition on a property that it lacks, such as a time.
     """
 
-    robot: Names | None = Field(default=None, description="Robot, or any of a list.")
-    session: Names | None = Field(default=None, description="Session, or any of a list.")
+    robot: Names | None = Field(
+        default=None, description="Robot, or a list of robots, any of which may match."
+    )
+    session: Names | None = Field(
+        default=None, description="Session, or a list of sessions, any of which may match."
+    )
     captured_after: AwareDatetime | None = Field(
-        default=None, description="Earliest time of capture, with a time zone."
+        default=None, description="Earliest capture time, with time zone."
     )
     captured_before: AwareDatetime | None = Field(
-        default=None, description="Latest time of capture, with a time zone."
+        default=None, description="Latest capture time, with time zone."
     )
     tags: list[Label] = Field(
         default=[], max_length=MOST_TAGS, description="Tags; a frame must have all of them."
@@ -251,13 +266,13 @@ class Filter(Given):
     not_within_s: float | None = Field(
         default=None,
         gt=0,
-        description="Exclude frames of the query's own session within this number of seconds, and "
-        "frames of that session without a time, for loop closure. Sessions of different robots "
-        "are different sessions, if both robots are known.",
+        description="For loop closures: exclude frames of the query's own session that were taken "
+        "within this number of seconds of the query or have no capture time. Sessions with the "
+        "same name are different sessions if both robots are known and differ.",
     )
     region: Region | None = Field(default=None, description="Region that contains the pose.")
     exclude_frames: list[Label] = Field(
-        default=[], max_length=1000, description="Ids of excluded frames."
+        default=[], max_length=1000, description="Ids of frames to exclude."
     )
 
     @field_validator("captured_before")
@@ -273,19 +288,20 @@ class Filter(Given):
 
 
 class FrameEdit(Given):
-    """Changes to a frame. Omitted fields stay; null removes a value.
+    """Changes to a frame. Omitted fields are unchanged; null removes a value.
 
-    Samples, camera and their interpretation cannot be edited; delete and upload the frame again.
+    The samples, the camera and their interpretation cannot be edited. To change them, delete the
+    frame and upload it again.
     """
 
     robot: Label | None = Field(default=None, description="Robot that took the frame.")
     session: Label | None = Field(
         default=None,
         description="Name of the session. A parent frame that was named after the previous session "
-        "stays.",
+        "keeps its name.",
     )
     captured_at: AwareDatetime | None = Field(
-        default=None, description="Time of capture, with its time zone."
+        default=None, description="Capture time, with time zone."
     )
     name: FileName | None = Field(default=None, description="Name of the original file or message.")
     sequence: Place | None = Field(default=None, description="Index in the session.")
@@ -294,23 +310,24 @@ class FrameEdit(Given):
     )
     pose: GivenPose | None = Field(
         default=None,
-        description="T_parent_sensor. `parent_frame` alone renames it; `translation` or `rotation` "
-        "alone leaves the other unchanged; each is replaced as a whole.",
+        description="T_parent_sensor. `parent_frame`, `translation` and `rotation` can be edited "
+        "separately, and each is replaced as a whole.",
     )
     T_base_sensor: GivenBase | None = Field(
         default=None,
-        description="Pose of the sensor on the robot; its parts are edited like those of `pose`.",
+        description="Pose of the sensor on the robot; its parts can be edited separately, as for "
+        "`pose`.",
     )
     up: Up | None = Field(default=None, description="Up direction in the sensor's axes.")
 
 
 class SessionEdit(Given):
-    """Changes to all frames of a session. Omitted fields stay."""
+    """Changes to all frames of a session. Omitted fields are unchanged."""
 
     session: Label | None = Field(
         default=None,
-        description="New name. The name of another session merges the two. A parent frame that was "
-        "named after the session stays.",
+        description="New name of the session. If another session has this name, the two are "
+        "merged. A parent frame that was named after the session keeps its name.",
     )
     robot: Label | None = Field(default=None, description="Robot that took the frames.")
     add_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
@@ -328,7 +345,7 @@ class FrameDeletion(ApiRecord):
 
     deletion_id: str
     at: datetime
-    until: datetime = Field(description="Time until which its frames can be restored.")
+    until: datetime = Field(description="Time until which the frames can be restored.")
     frames: int = Field(description="Number of frames that can be restored.")
 
 
@@ -337,36 +354,38 @@ class SessionChange(ApiRecord):
 
     map: str
     session: str = Field(description="Present name of the session.")
-    robot: str | None = Field(description="Robot in the request, or null.")
+    robot: str | None = Field(description="Robot in the request; null if there is none.")
     frames: int = Field(description="Number of frames that this call deleted or edited.")
     remaining: int = Field(
         default=0,
-        description="Number of frames left after the time limit. If not 0, repeat the call.",
+        description="Number of frames that the call did not process within the time limit. If it "
+        "is not 0, repeat the call.",
     )
     last_frame_id: str | None = Field(
         default=None, description="Value for `after` in the next call, if frames remain."
     )
     deletion: FrameDeletion | None = Field(
-        default=None, description="Deletion that undoes this call; null if it cannot be undone."
+        default=None,
+        description="Deletion with which this call can be undone; null if it cannot be undone.",
     )
 
 
 class MapEdit(Given):
-    """Changes to a map. Omitted fields stay; null removes a value."""
+    """Changes to a map. Omitted fields are unchanged; null removes a value."""
 
-    title: Note | None = Field(default=None, description="A label for people.")
+    title: Note | None = Field(default=None, description="Human-readable title.")
     quota_frames: Quota | None = Field(
         default=None,
-        description="Maximum number of frames. Existing frames beyond it stay. It requires `admin` "
-        "for `*`.",
+        description="Maximum number of frames. Existing frames beyond the limit are kept. Changing "
+        "it requires `admin` for `*`.",
     )
     quota_bytes: Quota | None = Field(
         default=None, description="Maximum size of the uploads, bytes; see `quota_frames`."
     )
     retention_days: Days | None = Field(
         default=None,
-        description="Number of days after the upload at which a frame is permanently deleted. "
-        "Workers delete expired frames within minutes.",
+        description="Time after the upload at which a frame is permanently deleted, days. Workers "
+        "delete expired frames within minutes.",
     )
     up: Up | None = Field(
         default=None, description="Up direction in the parent frames of the poses; see NewMap."
@@ -394,7 +413,7 @@ class FrameSelection(Given):
     )
     filter: FrameListing | None = Field(
         default=None,
-        description="Conditions as for GET /frames, at least one; `order` is ignored.",
+        description="At least one condition, as for GET /frames; `order` is ignored.",
     )
 
     @model_validator(mode="after")
@@ -410,11 +429,11 @@ class FrameSelection(Given):
 
 
 class FramesEdit(FrameSelection):
-    """Changes to the selected frames. Omitted fields stay; null removes a value."""
+    """Changes to the selected frames. Omitted fields are unchanged; null removes a value."""
 
     session: Label | None = Field(
         default=None,
-        description="New session of the frames. The parent frame of their poses stays.",
+        description="New session of the frames. The parent frame of their poses does not change.",
     )
     robot: Label | None = Field(default=None, description="Robot that took the frames.")
     add_tags: list[Label] = Field(default=[], max_length=MOST_TAGS)
@@ -435,18 +454,19 @@ class FramesEdited(ApiRecord):
 
     map: str
     frames: int = Field(
-        description="Number of frames that this call changed; others already had the values."
+        description="Number of frames that this call changed, excluding frames that already had "
+        "the new values."
     )
     remaining: int = Field(
-        description="Number of frames left; a call edits at most 1000. If not 0, repeat the call "
-        "with `after`."
+        description="Number of frames that still have to be edited. A call edits at most 1000 "
+        "frames; if `remaining` is not 0, repeat the call with `after`."
     )
     last_frame_id: str | None = Field(
         default=None, description="Value for `after` in the next call, if frames remain."
     )
     inverse: list[dict[str, Any]] = Field(
-        description="Bodies of requests that undo the edit. Send each to the same path. They name "
-        "the frames by id."
+        description="Request bodies that undo the edit. Send each to the same path. They refer to "
+        "the frames by their ids."
     )
 
 
@@ -456,10 +476,11 @@ class FramesDeleted(ApiRecord):
     map: str
     frames: int = Field(description="Number of frames that this call deleted.")
     remaining: int = Field(
-        description="Number of frames left after the time limit. If not 0, repeat the call."
+        description="Number of frames that the call did not process within the time limit. If it "
+        "is not 0, repeat the call."
     )
     deletion: FrameDeletion | None = Field(
-        description="Deletion that undoes this call; null if it cannot be undone."
+        description="Deletion with which this call can be undone; null if it cannot be undone."
     )
 
 
@@ -475,13 +496,15 @@ class FramesRestored(ApiRecord):
 
     map: str
     frames: int = Field(
-        description="Number of frames that this call restored. Queries find the indexed ones at "
-        "once, unless the map has switched to another model; workers then sign them again."
+        description="Number of frames that this call restored. Queries find the indexed frames "
+        "immediately, unless the map has switched to another model; in that case, workers first "
+        "sign the frames again."
     )
     refused: list[RefusedFrame] = Field(
-        description=f"Frames that were not restored, at most {MOST_REFUSED}, because the same "
-        "content was uploaded again."
+        description=f"Frames that were not restored because the same content was uploaded again; "
+        f"at most {MOST_REFUSED} are listed."
     )
     remaining: int = Field(
-        description="Number of frames left after the time limit. If not 0, repeat the call."
+        description="Number of frames that the call did not process within the time limit. If it "
+        "is not 0, repeat the call."
     )

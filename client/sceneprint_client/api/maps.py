@@ -34,42 +34,44 @@ MOST_QUOTA = 2**53 - 1
 MOST_DAYS = 36_525.0
 Quota = Annotated[int, Field(ge=0, le=MOST_QUOTA)]
 Days = Annotated[float, Field(gt=0, le=MOST_DAYS)]
-_INHERITED = "omitted: the quota of a deleted map of the same name."
+_INHERITED = "If omitted, a map keeps the quota of a deleted map with the same name."
 
 
 class NewMap(Given):
     """A map to create."""
 
     name: Slug = Field(
-        description="At most 63 lower-case letters, digits, - and _. It cannot be changed.",
+        description="Name of the map, with at most 63 lower-case letters, digits, hyphens and "
+        "underscores. It cannot be changed later.",
         examples=["warehouse-2"],
     )
-    title: Note | None = Field(default=None, description="A label for people.")
+    title: Note | None = Field(default=None, description="Human-readable title.")
     model: Preset = Field(
         default="depth",
-        description="Model that signs the frames; `sceneprint reencode` changes it later. `depth` "
-        "is for depth cameras indoors, `lidar` for LiDAR scanners, and `paper` for research: it "
-        "stores the long signatures of the paper and compares all of them.",
+        description="Model that signs the frames; it can be changed later with `sceneprint "
+        "reencode`. `depth` is for depth cameras indoors, and `lidar` for LiDAR scanners. `paper` "
+        "is for research; it stores the long signatures of the paper and compares all of them.",
     )
     quota_frames: Quota | None = Field(
         default=None,
-        description="Maximum number of frames; null: no limit; "
-        f"{_INHERITED} It requires `admin` for `*`.",
+        description=f"Maximum number of frames; null: no limit. {_INHERITED} Setting it requires "
+        "`admin` for `*`.",
     )
     quota_bytes: Quota | None = Field(
         default=None,
-        description="Maximum size of the uploads, bytes: frames as received, and archives until "
+        description="Maximum size of the uploads as received, bytes, including archives until "
         "their imports end; see `quota_frames`.",
     )
     retention_days: Days | None = Field(
         default=None,
-        description="Number of days after the upload at which a frame is permanently deleted; "
-        "null: never.",
+        description="Time after the upload at which a frame is permanently deleted, days; null if "
+        "frames do not expire.",
     )
     up: Up | None = Field(
         default=None,
         description="Up direction in the parent frames of the poses, such as (0, 0, 1) if z points "
-        "up, for frames with a pose but without `up`. Null: estimated from frames with both.",
+        "up. It applies to frames that have a pose but no `up`. If null, it is estimated from the "
+        "frames that have both.",
     )
 
 
@@ -79,9 +81,9 @@ class Reencoding(ApiRecord):
     model: str = Field(description="Label of the next model: name and first digits of its id.")
     model_id: str
     done: int = Field(description="Number of frames signed with the next model.")
-    left: int = Field(description="Number of frames that wait.")
+    left: int = Field(description="Number of frames that still have to be signed.")
     failed: int = Field(
-        description="Number of frames that cannot be signed; the switch rejects them."
+        description="Number of frames that the next model cannot sign; the switch rejects them."
     )
     dead: int = Field(
         description="Number of frames whose jobs failed in every attempt. The switch waits until "
@@ -97,47 +99,53 @@ class Map(ApiRecord):
     model: str = Field(description="Label of the model: name and first digits of its id.")
     model_id: str
     reencoding: Reencoding | None = Field(
-        default=None, description="Progress of a switch to another model; null without a switch."
+        default=None,
+        description="Progress of the switch to another model; null if there is no switch.",
     )
     created_at: datetime
-    revision: int = Field(description="Counter of indexed and deleted frames.")
+    revision: int = Field(
+        description="Counter that increases with each frame that is indexed or deleted."
+    )
     frames: dict[str, int] = Field(description="Number of frames in each state.")
     posed_frames: int = Field(
         default=0,
-        description="Number of indexed frames with a pose. At 0, answers have no pose.",
+        description="Number of indexed frames with a pose. If it is 0, answers have no pose.",
     )
     parent_frames: int = Field(
         default=0,
         description="Number of parent frames of the poses. If there are several, answers use the "
-        "parent frame of their matches, until an association joins them.",
+        "parent frame of their matches until an association joins the parent frames.",
     )
     used_frames: int = Field(
         default=0,
-        description="Number of frames that count towards the quota: all but deleted and redundant.",
+        description="Number of frames that count towards the quota (all except deleted and "
+        "redundant frames).",
     )
     used_bytes: int = Field(
         default=0,
-        description="Size of the uploads as received, and of archives during their import, without "
-        "signatures, artifacts and indexes.",
+        description="Size of the uploads as received and of archives during their import, "
+        "excluding signatures, artifacts and indexes.",
     )
     quota_frames: int | None = Field(
-        default=None, description="Maximum number of frames; null without a quota."
+        default=None, description="Maximum number of frames; null if there is no quota."
     )
     quota_bytes: int | None = Field(
-        default=None, description="Maximum size of the uploads; null without a quota."
+        default=None, description="Maximum size of the uploads; null if there is no quota."
     )
     retention_days: float | None = Field(
-        default=None, description="Days until a frame is permanently deleted; null: never."
+        default=None,
+        description="Time after the upload at which a frame is permanently deleted, days; null if "
+        "frames do not expire.",
     )
     up: Direction | None = Field(
         default=None,
-        description="Up direction in the parent frames of the poses; null: estimated from the "
-        "frames.",
+        description="Up direction in the parent frames of the poses; null if it is estimated from "
+        "the frames.",
     )
     overdue: int | None = Field(
         default=None,
         description="Number of frames older than `retention_days`, which workers delete next; null "
-        "without retention.",
+        "if frames do not expire.",
     )
     etag: str | None = Field(
         default=None,

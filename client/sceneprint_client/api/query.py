@@ -47,40 +47,46 @@ class Diversity(Given):
         default=1.0,
         ge=0.01,
         le=100.0,
-        description="Factor of the median distance within the ranking. A greater factor makes more "
+        description="Factor of the median distance within the ranking. With a greater factor, more "
         "frames count as similar.",
     )
     omega: float = Field(
         default=4.0,
         ge=0.01,
         le=1000.0,
-        description="Factor of the range of distances in the ranking. A greater factor gives "
-        "diversity more weight than rank.",
+        description="Factor of the range of distances in the ranking. With a greater factor, "
+        "diversity has more weight relative to rank.",
     )
 
 
 class ValidationOptions(Given):
     """Requirements on accepted matches.
 
-    Omitted values are those of the map's model; the defaults below are those of `depth`.
+    Omitted options have the values of the map's model; the defaults below are those of `depth`.
     """
 
     mode: Literal["full", "paper"] = Field(
         default="full",
-        description="`full`: all checks. `paper`: only the residual of the two directions, which "
-        "accepts more wrong matches.",
+        description="`full`: apply all checks. `paper`: check only the residual between the two "
+        "search directions; this mode accepts more wrong matches.",
     )
     residual_m: float = Field(
-        default=0.08, gt=0, le=1.0, description="Maximum distance of the two directions, metres."
+        default=0.08,
+        gt=0,
+        le=1.0,
+        description="Maximum distance between the transforms of the two search directions, metres.",
     )
     residual_deg: float = Field(
-        default=5.0, gt=0, le=45.0, description="Maximum angle between the two directions, degrees."
+        default=5.0,
+        gt=0,
+        le=45.0,
+        description="Maximum angle between the transforms of the two search directions, degrees.",
     )
     evidence: Share = Field(
         default=0.2,
         description="Minimum of `overlap` - `violation_weight` x `free_space_violations`. By "
-        "default, half of it is enough for a weak match if the frames share little but agree in "
-        "all of it.",
+        "default, half of this minimum is enough for a weak match if the frames have little "
+        "surface in common but agree in all of it.",
     )
     violation_weight: float = Field(
         default=5.0, ge=0.0, le=100.0, description="Weight of `free_space_violations`."
@@ -92,16 +98,17 @@ class ValidationOptions(Given):
         default=0.3, description="Evidence below which an accepted match is weak."
     )
     weak: Share = Field(
-        default=0.05, description="`ambiguity` at and above which an accepted match is weak."
+        default=0.05, description="`ambiguity` at or above which an accepted match is weak."
     )
     ambiguous: Share = Field(
-        default=0.14, description="`ambiguity` at and above which no match is accepted."
+        default=0.14, description="`ambiguity` at or above which a match is not accepted."
     )
     ambiguous_share: float = Field(
         default=0.5,
         ge=0.0,
         le=10.0,
-        description="Share of `plane_overlap` at and above which no match is accepted.",
+        description="Limit of `ambiguity` as a share of `plane_overlap`. At or above it, a match "
+        "is not accepted.",
     )
 
 
@@ -111,7 +118,7 @@ ValidationStatus = Literal["accepted", "rejected", "ambiguous", "skipped"]
 
 
 class Residual(ApiRecord):
-    """Composition of both directions, which is the identity if they agree."""
+    """Composition of the transforms of the two search directions; the identity if they agree."""
 
     translation_m: float
     rotation_deg: float
@@ -125,7 +132,7 @@ class Validation(ApiRecord):
     """
 
     status: ValidationStatus = Field(
-        description="`skipped`: validation was not tried, for the given `reason`."
+        description="`skipped`: the match was not validated; see `reason`."
     )
     strength: Literal["strong", "weak"] | None = Field(
         default=None, description="Strength of an accepted match."
@@ -133,7 +140,7 @@ class Validation(ApiRecord):
     reason: str
     residual: Residual | None = None
     overlap: float | None = Field(
-        default=None, description="Share of both frames' points that agree."
+        default=None, description="Share of the points of both frames that agree."
     )
     plane_overlap: float | None = Field(
         default=None, description="`overlap` if every plane has the same weight."
@@ -154,37 +161,37 @@ class Validation(ApiRecord):
     )
     ambiguity: float | None = Field(
         default=None,
-        description="Share of the points that the best rival transform explains.",
+        description="Share of the points that the best alternative transform explains.",
     )
     search: Literal["correspondences", "plans", "guided"] | None = Field(
         default=None,
-        description="Source of the transform: `correspondences` of patches with similar "
-        "surroundings, or `plans` of two scans. `guided`: other matches and the map's poses; the "
-        "transform was refined and checked, but is not an independent vote.",
+        description="Source of the transform. `correspondences`: patches with similar "
+        "surroundings. `plans`: the plans of two scans. `guided`: other matches and the map's "
+        "poses; the transform was refined and checked, but is not an independent vote.",
     )
     directions: list[Literal["query_to_match", "match_to_query"]] = Field(
         default=[],
-        description="Search directions that found the transform. With only one, an accepted match "
-        "is weak.",
+        description="Search directions that found the transform. If there is only one, an accepted "
+        "match is weak.",
     )
     tilt_deg: float | None = Field(
         default=None,
-        description="Angle by which the transform tilts the query's `up` against the match's; "
-        "null if either is unknown.",
+        description="Angle by which the transform tilts the query's `up` relative to the match's "
+        "`up`; null if either is unknown.",
     )
 
 
 class FreeDirection(ApiRecord):
-    """A direction in which a transform is poorly constrained, as along a corridor.
+    """A direction in which a transform is poorly constrained, for example along a corridor.
 
-    The two parts together have unit length: metres of translation and radians of rotation.
+    The translation in metres and the rotation in radians together form a vector of unit length.
     """
 
     translation: Vector
     rotation: Vector
     deviation: float = Field(
-        description="Standard deviation along the direction: metres for a translation, radians for "
-        "a rotation; at most 10, if nothing constrains it."
+        description="Standard deviation along the direction, metres for a translation and radians "
+        "for a rotation; at most 10, the value if nothing constrains the direction."
     )
 
 
@@ -193,11 +200,13 @@ class Uncertainty(ApiRecord):
 
     Errors are (x, y, z, rx, ry, rz): the displacement of the child's origin along the axes of the
     transform's parent frame in metres, then a rotation vector about the parent's axes in radians,
-    multiplied from the left. PoseWithCovariance of ROS has the same order and meaning.
+    multiplied from the left. PoseWithCovariance in ROS has the same order and meaning.
     """
 
     covariance: list[float] = Field(
-        min_length=36, max_length=36, description="6 x 6 matrix, row by row, in this order."
+        min_length=36,
+        max_length=36,
+        description="6 x 6 covariance matrix, row by row, in the order x, y, z, rx, ry, rz.",
     )
     method: Literal["information-scaled", "votes-and-spread"] = Field(
         description="`information-scaled`, for one match: inverse information of the refinement, "
@@ -223,8 +232,9 @@ class Match(ApiRecord):
     distance: int = Field(description="Distance of the signatures.")
     similarity: float = Field(description="1 - distance / distance of unrelated frames, 0 to 1.")
     selected: bool | None = Field(
-        description="Whether the match is in the diverse selection C; null without that stage. "
-        "False: a frame of another place that was validated because it also resembles the query."
+        description="Whether the match is in the diverse selection C; null if that stage was not "
+        "requested. If false, the match is a frame of another place, which was validated because "
+        "it also resembles the query."
     )
     diversity_gain: float | None = Field(
         description="Diversity of the match: 1 for the first one, near 0 for a duplicate."
@@ -240,19 +250,20 @@ class Match(ApiRecord):
     )
     parent_frame: str | None = Field(
         default=None,
-        description="Parent frame of the frame's pose as uploaded; null without a pose. If the map "
-        "joined it to another parent frame, `pose_in_map` uses that one.",
+        description="Parent frame of the frame's pose as uploaded; null if the frame has no pose. "
+        "If the map joined this parent frame to another one, `pose_in_map` uses the other one.",
     )
     pose_in_map: Transform | None = Field(
-        description="Pose of the query in the parent frame of the match's pose; null without a "
-        "pose or if the match is rejected."
+        description="Pose of the query in the parent frame of the match's pose; null if the match "
+        "has no pose or is rejected."
     )
     uncertainty: Uncertainty | None = Field(
         default=None, description="Uncertainty of `transform` for an accepted match."
     )
     base_in_map: Transform | None = Field(
         default=None,
-        description="Pose of the robot's base like `pose_in_map`, if the query has T_base_sensor.",
+        description="Pose of the robot's base in the parent frame of `pose_in_map`, if the query "
+        "has `T_base_sensor`.",
     )
 
 
@@ -278,11 +289,11 @@ class EvidenceRecord(ApiRecord):
     viewpoints: int = Field(description="Number of different viewpoints of these frames.")
     excess: float = Field(
         description="Share of the surface that should be visible in the query or the map but is "
-        "missing, beyond what the map's own frames miss among themselves."
+        "missing, in excess of what is missing between the map's own frames."
     )
     weight: float = Field(
-        description="Total weight of the matches that vote for the pose, one for each viewpoint: 1 "
-        "for a strong match, 0.4 for a weak or ambiguous one."
+        description="Total weight of the matches that vote for the pose, with one match for each "
+        "viewpoint. A strong match has the weight 1, a weak or ambiguous match 0.4."
     )
     strong: int = Field(
         description="Number of different viewpoints of strong matches that vote for the pose."
@@ -300,16 +311,16 @@ class EvidenceRecord(ApiRecord):
         "candidates, 0 to 1."
     )
     rival: float = Field(
-        description="Score of the best pose at another place divided by `score`; 0 without one. If "
-        "the prior decided, only among places that the prior expects."
+        description="Score of the best pose at another place, divided by `score`; 0 if there is no "
+        "such pose. If the prior decided, only places that the prior expects are considered."
     )
     rival_weight: float = Field(
         description="Maximum weight of the matches that vote for another place."
     )
     rendered: bool = Field(
         default=False,
-        description="Whether most of these frames are rendered views of an imported map, for which "
-        "the same evidence means another confidence.",
+        description="Whether most of the frames that agree are rendered views of an imported map. "
+        "For rendered views, the same evidence means a different confidence.",
     )
 
 
@@ -345,12 +356,12 @@ class Location(ApiRecord):
     )
     map: str | None = Field(default=None, description="Map of the matches.")
     support: int = Field(
-        description="Number of matches that agree on the pose: 1 is a single view, and 0 means "
-        "that only the map confirms it."
+        description="Number of matches that agree on the pose. 1 means that only a single view "
+        "does, and 0 that only the map confirms the pose."
     )
     guided: int = Field(
         default=0,
-        description="Number of these matches that were guided by the others. They make the pose "
+        description="Number of these matches that were guided by other matches. They make the pose "
         "more precise, but are not independent evidence.",
     )
     votes: int = Field(description="Number of accepted matches, for any pose.")
@@ -368,7 +379,8 @@ class Location(ApiRecord):
     uncertainty: Uncertainty | None = Field(default=None, description="Uncertainty of `pose`.")
     base: Transform | None = Field(
         default=None,
-        description="Pose of the robot's base like `pose`, if the query has T_base_sensor.",
+        description="Pose of the robot's base in the parent frame of `pose`, if the query has "
+        "`T_base_sensor`.",
     )
 
 
@@ -406,7 +418,7 @@ class ExplainedFrame(ApiRecord):
     name: str | None = Field(default=None, description="Name of the original file or message.")
     state: str = Field(description="State of the frame. Only indexed frames are searched.")
     passes_filter: bool | None = Field(
-        description="Whether the frame matches the filter; null if it is not searchable."
+        description="Whether the frame matches the filter; null if the frame is not searchable."
     )
     distance: int | None = Field(
         description="Exact distance, whether or not the query computed it."
@@ -418,13 +430,13 @@ class ExplainedFrame(ApiRecord):
     )
     of: int | None = Field(description="Number of frames that match the filter.")
     shortlisted: bool | None = Field(
-        description="False if the approximate index missed a frame that is near enough for the "
-        "ranking."
+        description="False if the approximate index missed the frame although it is near enough "
+        "for the ranking."
     )
     ranked: bool | None = Field(description="Whether the frame is in the ranking R.")
     selected: bool | None = Field(
-        description="Whether the frame is a candidate: in the selection C, or, without that stage, "
-        "among the first frames of R."
+        description="Whether the frame is a candidate: in the selection C or, if that stage was "
+        "not requested, among the first frames of R."
     )
     validation: Validation | None = Field(
         description="Validation of the frame, computed for this explanation even if the query did "
@@ -433,8 +445,8 @@ class ExplainedFrame(ApiRecord):
     transform: Transform | None = Field(description="Transform from the query to the frame.")
     lost_at: Lost | None = Field(
         description="Stage at which the frame was dropped; null for a match. `turn`: enough frames "
-        "were accepted before it, or `k` others are listed before it. `query`: the frame is the "
-        "query itself."
+        "were accepted before this one, or `k` other frames are listed before it. `query`: the "
+        "frame is the query itself."
     )
     reason: str
 
@@ -461,25 +473,26 @@ class Prior(Given):
 
     pose: GivenPose = Field(
         description="Pose of the query's sensor in a parent frame of the map. It requires "
-        f"`parent_frame`, and is at most {FARTHEST_PRIOR:,.0f} m from the origin along each axis."
+        f"`parent_frame`. Each coordinate is at most {FARTHEST_PRIOR:,.0f} m from the origin."
     )
     covariance: Annotated[list[float], Field(min_length=36, max_length=36)] | None = Field(
         default=None,
-        description="6 x 6 matrix, row by row, of errors (x, y, z, rx, ry, rz) along the parent's "
-        "axes in metres and radians, as in PoseWithCovariance of ROS. The square roots of its "
-        f"diagonal are from {LEAST_DEVIATION} to {MOST_DEVIATION:.0f}.",
+        description="6 x 6 covariance matrix, row by row, of the errors (x, y, z, rx, ry, rz) "
+        "along the parent's axes in metres and radians, as in PoseWithCovariance in ROS. The "
+        f"square roots of its diagonal must be between {LEAST_DEVIATION} and {MOST_DEVIATION:.0f}.",
     )
     deviation_m: float = Field(
         default=0.3,
         ge=LEAST_DEVIATION,
         le=20,
-        description="Standard deviation along each axis, metres; replaces `covariance`.",
+        description="Standard deviation along each axis, metres; used if there is no `covariance`.",
     )
     deviation_deg: float = Field(
         default=10.0,
         ge=1e-4,
         le=180,
-        description="Standard deviation about each axis, degrees; replaces `covariance`.",
+        description="Standard deviation about each axis, degrees; used if there is no "
+        "`covariance`.",
     )
 
     @model_validator(mode="after")
@@ -500,18 +513,18 @@ class Query(Given):
         default=5,
         ge=1,
         le=50,
-        description="Maximum number of accepted matches in the answer (of all matches, without "
-        "validation). Status and pose do not depend on it: they use the first 5 accepted matches.",
+        description="Maximum number of accepted matches in the answer or, without validation, of "
+        "all matches. Status and pose do not depend on `k`; they use the first 5 accepted matches.",
     )
     stages: tuple[Stage, ...] = Field(
         default=STAGES,
-        description="Stages in their order, starting with `retrieve`: R, DR, VR or VDR of the "
-        "paper.",
+        description="Stages in order, starting with `retrieve`. The paper calls the combinations "
+        "R, DR, VR and VDR.",
     )
     exact: bool = Field(
         default=False,
         description="Whether to compare every frame that matches the filter. Most queries do so "
-        "anyway; only in a large map are frames left out.",
+        "anyway; only in a large map are some frames skipped by default.",
     )
     filter: Filter | None = Field(
         default=None,
@@ -525,9 +538,9 @@ class Query(Given):
         default=None,
         ge=1,
         le=200,
-        description="Number of frames of the ranking that are selected and validated until 5 are "
-        "accepted, approximately 20 ms each; default: 10. If `k` exceeds 5, validation continues "
-        "until `k` are accepted, by default among `k` candidates. Without validation, `k` applies.",
+        description="Maximum number of frames of the ranking that are selected and validated, "
+        "approximately 20 ms each; default: 10, or `k` if it is greater. Validation ends when 5 "
+        "frames, or `k` if it is greater, are accepted. Without validation, `k` applies instead.",
     )
     diversity: Annotated[Diversity | None, JsonText] = Field(
         default=None, description="Scales of the selection."
@@ -537,16 +550,16 @@ class Query(Given):
     )
     prior: Annotated[Prior | None, JsonText] = Field(
         default=None,
-        description="Expected pose of the robot. Candidates near it are tried first, and it is "
-        "refined on the map beside the global search. It decides only between poses that the map "
-        "supports equally.",
+        description="Expected pose of the robot. Candidates near this pose are tried first, and "
+        "the pose is refined on the map in addition to the global search. It decides only between "
+        "poses that the map supports equally.",
     )
     confidence: float = Field(
         default=0.99,
         ge=0.5,
         le=0.999,
         description="Minimum confidence of a `found` pose. All other places together have at most "
-        "the remainder.",
+        "the remaining probability.",
     )
     deadline_ms: int | None = Field(
         default=None,
@@ -556,12 +569,14 @@ class Query(Given):
         "exceed it are not validated; ranking and selection are always completed.",
     )
     explain: bool = Field(
-        default=False, description="Whether to explain how far each frame of the ranking came."
+        default=False,
+        description="Whether to explain which stage each frame of the ranking reached.",
     )
     explain_frame: Named | None = Field(
         default=None,
-        description="Id of a frame of the map for which to explain the result. It is compared and "
-        "validated even if the query did not reach it. With several maps, the first such frame.",
+        description="Id of a frame of the map whose result is explained. The frame is compared and "
+        "validated even if the query did not reach it. If several maps are queried, the first "
+        "frame with this id is used.",
     )
     keep: bool = Field(
         default=True,
@@ -569,7 +584,8 @@ class Query(Given):
     )
     record: bool = Field(
         default=True,
-        description="Whether to list the query in GET /v1/queries, send an event and count it.",
+        description="Whether to list the query in GET /v1/queries, send an event for it, and count "
+        "it.",
     )
 
     @field_validator("stages", mode="before", json_schema_input_type=str | tuple[Stage, ...])
@@ -602,16 +618,18 @@ class SeveralQuery(Query):
     """Options of a query in several maps of one model."""
 
     maps: Literal["*"] | Annotated[list[Named], Field(min_length=1, max_length=MOST_MAPS)] = Field(
-        description=f"Names of the maps, at most {MOST_MAPS}, or `*` for all that you may read. "
-        "Forms and query strings separate them by commas."
+        description=f"Names of at most {MOST_MAPS} maps, or `*` for all maps that you may read. In "
+        "forms and query strings, separate the names with commas."
     )
     frame: NamedFrame | None = Field(
-        default=None, description="Stored frame in place of an upload. It does not match itself."
+        default=None,
+        description="Stored frame to query instead of an upload. The frame is not compared with "
+        "itself.",
     )
     query_id: str | None = Field(
         default=None,
-        description="Id of an earlier query in place of an upload. Its stored frame is queried "
-        "again with these options; the answer has its own id.",
+        description="Id of an earlier query to repeat instead of an upload. Its stored frame is "
+        "queried again with these options; the new answer has its own id.",
     )
 
     @field_validator("maps", mode="before")
@@ -626,8 +644,11 @@ class Counts(ApiRecord):
     """Number of frames at each stage."""
 
     map: int = Field(description="Number of searchable frames in the map.")
-    passed: int = Field(description="Number of these that match the filter; all without a filter.")
-    compared: int = Field(description="Number of these whose distance was computed.")
+    passed: int = Field(
+        description="Number of these frames that match the filter; all of them if there is no "
+        "filter."
+    )
+    compared: int = Field(description="Number of these frames whose distance was computed.")
     ranked: int
     selected: int
     validated: int
@@ -637,7 +658,9 @@ class Counts(ApiRecord):
 class OfMap(ApiRecord):
     """The result of a query in one of several maps."""
 
-    index_version: int = Field(description="Index that was searched; 0 without one on this node.")
+    index_version: int = Field(
+        description="Version of the index that was searched; 0 if this node has no index."
+    )
     counts: Counts
 
 
@@ -646,19 +669,23 @@ class Answer(ApiRecord):
 
     query_id: str
     status: AnswerStatus = Field(
-        description="`found`: the confidence of one pose reaches that of the query; or, if no "
-        "accepted match has a pose, at least one match is accepted. `ambiguous`: the evidence "
-        "supports one or several poses, but none with that confidence; never drive on it. "
-        "`not_found`: the evidence supports no pose; see `cause`. `unvalidated`: validation was "
-        "not requested, or the deadline passed before a match was accepted."
+        description="`found`: the confidence of one pose reaches the `confidence` of the query or, "
+        "if no accepted match has a pose, at least one match is accepted. `ambiguous`: the "
+        "evidence supports one or several poses, but none with this confidence; never navigate by "
+        "them. `not_found`: the evidence supports no pose; see `cause`. `unvalidated`: validation "
+        "was not requested, or the deadline passed before a match was accepted."
     )
     reason: str = Field(
-        default="", description="Explanation in a sentence; for `not_found`, with advice."
+        default="",
+        description="Explanation in one sentence, with advice if the status is `not_found`.",
     )
-    cause: Cause | None = Field(default=None, description="Most likely cause of a `not_found`.")
+    cause: Cause | None = Field(
+        default=None, description="Most likely cause if the status is `not_found`."
+    )
     matches: list[Match] = Field(
-        description="Accepted matches, strong before weak, then the most precise first (for "
-        "full-turn scans, the nearest first), followed by the other validated matches."
+        description="Accepted matches, followed by the other validated matches. Strong matches "
+        "precede weak ones; among these, the most precise are first (for full-turn scans, the "
+        "nearest)."
     )
     location: Location | None = Field(
         description="Pose of the query if the answer is `found` and the matches have poses."
@@ -670,27 +697,29 @@ class Answer(ApiRecord):
     seed: int
     model: str
     index_version: int = Field(
-        description="Index that was searched; 0 for a small map, a search by PostgreSQL, or a "
-        "model that stores psi. With several maps, the minimum."
+        description="Version of the index that was searched; 0 for a small map, a search by "
+        "PostgreSQL, or a model that stores psi. If several maps were searched, the minimum of "
+        "their versions."
     )
     exact: bool = Field(description="Whether every frame that matches the filter was compared.")
     counts: Counts
     milliseconds: dict[str, float] = Field(
-        description="Time of each stage: `prepare` (signature and geometry of the query), "
+        description="Duration of each stage: `prepare` (signature and geometry of the query), "
         "`retrieve`, `diversify`, `validate`, `locate`, `explain` if requested, `earlier` for the "
-        "earlier frames of a sequence, `total`."
+        "earlier frames of a sequence, and `total`."
     )
     maps: list[str] = Field(default=[], description="Names of the searched maps.")
     frame: FrameName | None = Field(
         default=None,
         description="Stored frame of the query; null for an upload. In transforms, its sensor is "
-        "named after its id if only its own map was searched, and `query` otherwise.",
+        "named after the id of the frame if only the map of the frame was searched, and `query` "
+        "otherwise.",
     )
     kind: Kind = Field(
         default="depth",
         description="Kind of the query's frame. In transforms, the sensor of a depth image is "
-        "`ID.optical` (x right, y down, z forward), and that of a cloud, which keeps its axes, is "
-        "`ID.sensor`.",
+        "`ID.optical` (x right, y down, z forward), and the sensor of a cloud is `ID.sensor`, with "
+        "the cloud's own axes.",
     )
     frames: int = Field(
         default=1,
@@ -698,16 +727,17 @@ class Answer(ApiRecord):
         "last frame.",
     )
     per_map: dict[str, OfMap] | None = Field(
-        default=None, description="Result of each map if several were searched; null for one."
+        default=None, description="Result for each map; null if only one map was searched."
     )
     deadline_reached: bool | None = Field(
         default=None,
-        description="Whether candidates were left out because of the deadline; null without a "
+        description="Whether candidates were skipped because of the deadline; null if there was no "
         "deadline.",
     )
     explanations: list[Explanation] | None = Field(
         default=None,
-        description="Explanations of all frames of the ranking, nearest first, with `explain`.",
+        description="Explanations of all frames of the ranking, nearest first, if `explain` was "
+        "requested.",
     )
     explained_frame: ExplainedFrame | None = Field(
         default=None, description="Explanation of the frame in `explain_frame`."
@@ -723,44 +753,52 @@ class Localization(ApiRecord):
     """The pose of the query and its reliability."""
 
     status: LocalizationStatus = Field(
-        description="`found`: the confidence of one pose reaches that of the query. `ambiguous`: "
-        "no pose reaches it; see `alternatives`, move, and query again. `not_found`: no pose is "
-        "supported, or the deadline passed; see `cause`."
+        description="`found`: the confidence of one pose reaches the `confidence` of the query. "
+        "`ambiguous`: no pose reaches it; see `alternatives`, move, and query again. `not_found`: "
+        "the evidence supports no pose, or the deadline passed; see `cause`."
     )
     reason: str
-    cause: Cause | None = Field(default=None, description="Most likely cause of a `not_found`.")
+    cause: Cause | None = Field(
+        default=None, description="Most likely cause if the status is `not_found`."
+    )
     map: str
     pose: Transform | None = Field(
         description="T_parent_query, the pose of the query's sensor in the parent frame of its "
-        "matches' poses. Null unless `found`, or if no accepted match has a pose; see `best`."
+        "matches' poses. Null if the status is not `found` or no accepted match has a pose; see "
+        "`best`."
     )
     confidence: float | None = Field(
         default=None,
         description="Probability that `pose` is right, 0 to 1; for `ambiguous`, that of the first "
-        "alternative. Null without a pose, or if the pose was not compared with the map.",
+        "alternative. Null if there is no pose, or if the pose was not compared with the map.",
     )
     evidence: EvidenceRecord | None = Field(
         default=None,
         description="Evidence behind `confidence`; null if `confidence` is null.",
     )
     support: int = Field(
-        description="Number of matches that agree on the pose: 1 is a single view, and 0 means "
-        "that only the map confirms it."
+        description="Number of matches that agree on the pose. 1 means that only a single view "
+        "does, and 0 that only the map confirms the pose."
     )
     votes: int = Field(description="Number of accepted matches, for any pose.")
-    spread_m: float | None = Field(description="Spread of the votes, metres; null without a pose.")
+    spread_m: float | None = Field(
+        description="Spread of the votes, metres; null if there is no pose."
+    )
     spread_deg: float | None
     uncertainty: Uncertainty | None = Field(default=None, description="Uncertainty of `pose`.")
     base: Transform | None = Field(
         default=None,
-        description="Pose of the robot's base like `pose`, if the query has T_base_sensor.",
+        description="Pose of the robot's base in the parent frame of `pose`, if the query has "
+        "`T_base_sensor`.",
     )
     strength: Literal["strong", "weak"] | None = Field(
-        description="`strong` if a strong match votes for the pose; null unless `found`."
+        description="`strong` if a strong match votes for the pose; null if the status is not "
+        "`found`."
     )
     verified_by: Verifier | None = Field(
         default=None,
-        description="Evidence that decided, as in `location`; null unless `found`.",
+        description="Evidence that decided on the pose, as in `location`; null if the status is "
+        "not `found`.",
     )
     alternatives: list[Alternative] = Field(
         default=[],
@@ -769,7 +807,7 @@ class Localization(ApiRecord):
     best: Match | None = Field(description="Best accepted match, with its transform.")
     matches: list[str] = Field(description="Ids of the accepted matches, best first.")
     frames: int = Field(
-        default=1, description="Number of frames in the query; for a sequence, of all its frames."
+        default=1, description="Number of frames in the query, including all frames of a sequence."
     )
     query_id: str
     seed: int

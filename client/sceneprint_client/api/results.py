@@ -46,7 +46,7 @@ class RecordedPose(ApiRecord):
 class KeepOptions(Given):
     """Options for keeping an answer."""
 
-    title: Note | None = Field(default=None, description="Title of the answer, for people.")
+    title: Note | None = Field(default=None, description="Human-readable title of the answer.")
 
 
 class QueryRecord(ApiRecord):
@@ -57,21 +57,22 @@ class QueryRecord(ApiRecord):
     )
     at: datetime = Field(description="Time of the query.")
     map: str = Field(
-        description="Map that was searched. With several maps: that of the found pose, of the "
-        "first alternative or match, or the first in the request."
+        description="Map that was searched. If several maps were searched, the map of the found "
+        "pose, otherwise of the first alternative or match, otherwise the first map in the "
+        "request."
     )
     maps: list[str] = Field(description="Searched maps that you may read.")
     robot: str | None = Field(description="Robot that sent the query, if known.")
     session: str | None
     key: str | None = Field(
-        description="Name of the API key; null without a key, or after its revocation."
+        description="Name of the API key; null if there was no key or the key was revoked."
     )
     status: RecordStatus = Field(
         description="Status of the answer. `failed`: there is no answer, and `reason` says why."
     )
     cause: str | None = Field(
-        description="Cause of `not_found`, or of a deadline, as in the answer; for `failed`, the "
-        "type of the problem, such as `busy`."
+        description="Cause as in the answer, for `not_found` or a deadline that passed; for "
+        "`failed`, the type of the problem, such as `busy`."
     )
     reason: str
     pose: RecordedPose | None = Field(
@@ -86,10 +87,10 @@ class QueryRecord(ApiRecord):
         description="Number of poses of an `ambiguous` answer that the evidence supports."
     )
     milliseconds: float
-    kind: Kind | None = Field(description="Kind of the frame; null if it was not read.")
+    kind: Kind | None = Field(description="Kind of the frame; null if the frame was not read.")
     frame: FrameName | None = Field(
-        description="Stored frame of the query; null for an upload, and if you may not read its "
-        "map."
+        description="Stored frame of the query; null for an upload, or if you may not read the map "
+        "of the frame."
     )
     stored: bool = Field(description="Whether the answer is still stored.")
     expires_at: datetime | None = Field(
@@ -104,12 +105,12 @@ class StoredQuery(QueryRecord):
     """A past query whose answer is stored, with its options."""
 
     validates: bool = Field(
-        description="Whether the points of the query are stored, so that it can be repeated with "
-        "the stage `validate`."
+        description="Whether the points of the query are stored, so that the query can be repeated "
+        "with the stage `validate`."
     )
     model: str
     options: dict[str, Any] = Field(
-        description="Options in the request; all others had their defaults."
+        description="Options in the request; all other options had their defaults."
     )
 
 
@@ -143,7 +144,8 @@ class PatchLevel(ApiRecord):
     normal: list[Triple] = Field(description="Unit normal towards the sensor.")
     area_m2: list[float]
     size: list[int] = Field(
-        description="Number of pixels in the surface map, which has approximately 160 x 120."
+        description="Number of pixels of the patch in the surface map, which has approximately 160 "
+        "x 120 pixels."
     )
 
 
@@ -152,7 +154,9 @@ class FramePatches(ApiRecord):
 
     frame_id: str
     map: str
-    frame: str = Field(description="Name of the sensor's frame, which the coordinates refer to.")
+    frame: str = Field(
+        description="Name of the sensor's frame, in which the coordinates are given."
+    )
     model: str
     levels: list[PatchLevel] = Field(
         description="Levels of the hierarchy that the signature describes, finest first."
@@ -174,8 +178,8 @@ class FrameSignature(ApiRecord):
     n_patches: list[int] = Field(description="Number of patches at each level, finest first.")
     n_pairs: list[int] = Field(description="Number of ordered pairs of patches at each level.")
     base64: str = Field(
-        description="Bytes of the signature. The distance of two is the sum of absolute "
-        "differences."
+        description="Bytes of the signature. The distance between two signatures is the sum of the "
+        "absolute differences of their bytes."
     )
 
 
@@ -198,14 +202,15 @@ class Similarities(ApiRecord):
     query_id: str
     model: str
     frames: list[FrameName] = Field(
-        description="Frames of the ranking, nearest first, without frames deleted since."
+        description="Frames of the ranking, nearest first, except frames that have been deleted "
+        "since."
     )
     names: list[str | None] = Field(
         default=[], description="Names of the files of `frames`, in the same order."
     )
     similarity: list[list[float]] = Field(
         description="1 - distance / distance of unrelated frames, 0 to 1. The first row and column "
-        "are the query's, the others those of `frames` in the same order."
+        "belong to the query, and the others to `frames`, in the same order."
     )
 
 
@@ -225,7 +230,8 @@ class Coincidences(ApiRecord):
     )
     match_normal: list[Triple]
     distance_m: list[float] = Field(
-        description="Distance of the means under the transform, metres, in increasing order."
+        description="Distance between the two means under the transform, metres, in increasing "
+        "order."
     )
 
 
@@ -242,7 +248,7 @@ class Points(ApiRecord):
 
 
 class MatchDetails(ApiRecord):
-    """One match of a query, validated again with its options, and its evidence."""
+    """One match of a query, validated again with the options of the query, and its evidence."""
 
     query_id: str
     frame_id: str
@@ -251,16 +257,16 @@ class MatchDetails(ApiRecord):
     sequence: int | None = Field(default=None, description="Index in the session.")
     validation: Validation
     transform: Transform | None = Field(
-        description="Transform from query to match; null without a hypothesis."
+        description="Transform from query to match; null if there is no hypothesis."
     )
     uncertainty: Uncertainty | None = Field(
         description="Uncertainty of `transform` for an accepted match."
     )
     rival: Transform | None = Field(
-        description="Best other transform that explains the frames and is not refuted."
+        description="Best alternative transform that explains the frames and is not refuted."
     )
     patches: Coincidences | None = Field(
-        description="Coincident patches; null without a transform."
+        description="Coincident patches; null if there is no transform."
     )
     query: Points | None
     match: Points | None
@@ -274,15 +280,15 @@ class Comparison(Given):
     """Two frames to compare, and options."""
 
     frame_a: Annotated[NamedFrame | None, JsonText] = Field(
-        default=None, description="Stored frame in place of an upload `a`."
+        default=None, description="Stored frame to compare instead of an upload `a`."
     )
     frame_b: Annotated[NamedFrame | None, JsonText] = Field(
-        default=None, description="Stored frame in place of an upload `b`."
+        default=None, description="Stored frame to compare instead of an upload `b`."
     )
     aligned: bool = Field(
         default=True,
         alias="validate",
-        description="Whether to align the frames and decide whether they show one place.",
+        description="Whether to align the frames and decide whether they show the same place.",
     )
     validation: Annotated[ValidationOptions | None, JsonText] = Field(
         default=None, description="Requirements on an accepted alignment."
@@ -307,15 +313,17 @@ class Similarity(ApiRecord):
     model: str
     a: FrameName | None = Field(description="Stored frame a; null for an upload.")
     b: FrameName | None = Field(description="Stored frame b; null for an upload.")
-    validation: Validation | None = Field(description="Validation; null if not requested.")
+    validation: Validation | None = Field(
+        description="Result of the validation; null if validation was not requested."
+    )
     transform: Transform | None = Field(
         description="x_a = matrix @ x_b. An accepted transform is right if both frames show the "
-        "same place, which one pair cannot prove."
+        "same place; a single pair cannot prove that they do."
     )
     uncertainty: Uncertainty | None = Field(
         default=None, description="Uncertainty of an accepted `transform`."
     )
     seed: int
     milliseconds: dict[str, float] = Field(
-        description="Time of each stage: `prepare` (both frames), `validate`, `total`."
+        description="Duration of each stage: `prepare` (both frames), `validate` and `total`."
     )

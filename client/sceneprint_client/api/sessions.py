@@ -22,8 +22,9 @@ class NewAssociation(Given):
     """Sessions of a map to associate, frame by frame."""
 
     sessions: Annotated[list[Label], Field(min_length=1, max_length=2)] = Field(
-        description="Two sessions: each frame of the first is queried against the second. One "
-        "session, for loop closures: each frame is queried against earlier frames."
+        description="If there are two sessions, each frame of the first is queried against the "
+        "second. If there is one session, each frame is queried against earlier frames, to find "
+        "loop closures."
     )
     robots: Annotated[list[Label], Field(min_length=1, max_length=2)] | None = Field(
         default=None,
@@ -37,24 +38,24 @@ class NewAssociation(Given):
         default=None,
         ge=1,
         le=1_000_000,
-        description="For one session: minimum number of frames in between, in the order of time; "
-        f"default: {APART}, or 1 with `not_within_s`.",
+        description="For one session: minimum number of frames between the two frames of an edge, "
+        f"in the order of time; default: {APART}, or 1 with `not_within_s`.",
     )
     not_within_s: float | None = Field(
         default=None,
         gt=0,
-        description="For one session: minimum time in between, seconds. Frames without a time are "
-        "omitted.",
+        description="For one session: minimum time between the two frames of an edge, seconds. "
+        "Frames without a capture time are skipped.",
     )
     k: int = Field(
-        default=3, ge=1, le=10, description="Maximum number of accepted edges of each frame."
+        default=3, ge=1, le=10, description="Maximum number of accepted edges for each frame."
     )
     candidates: int = Field(
         default=10,
         ge=1,
         le=100,
-        description="Number of frames of each ranking that are selected and validated until `k` "
-        "are accepted, approximately 20 ms each.",
+        description="Maximum number of frames of each ranking that are selected and validated, "
+        "approximately 20 ms each. Validation ends when `k` are accepted.",
     )
     join: bool = Field(
         default=True,
@@ -85,12 +86,12 @@ class NewAssociation(Given):
 
 
 class Edge(ApiRecord):
-    """Two frames that seem to show one place, and the transform between them.
+    """Two frames that seem to show the same place, and the transform between them.
 
     A single edge shows only that two places look alike. Use edges only if `consistent` is true.
     """
 
-    number: int = Field(description="Index in the order of discovery, from 0.")
+    number: int = Field(description="Index in the order of discovery, starting at 0.")
     from_frame: str = Field(description="Frame that was queried.")
     to_frame: str = Field(description="Frame that was found.")
     from_session: str | None
@@ -99,35 +100,44 @@ class Edge(ApiRecord):
     to_robot: str | None
     transform: Transform = Field(description="x_to = matrix @ x_from, between the sensors' frames.")
     information: list[float] | None = Field(
-        description="36 numbers, row by row in the order x y z rx ry rz, metres and radians: "
-        "inverse covariance of an error along the axes of `from_frame`, applied after the "
-        "transform: T_true = matrix @ exp(error)."
+        description="Inverse covariance of the error, as 36 numbers, row by row in the order x y z "
+        "rx ry rz, metres and radians. The error is along the axes of `from_frame`, with T_true = "
+        "matrix @ exp(error)."
     )
-    overlap: float = Field(description="Share of both frames' points that agree.")
+    overlap: float = Field(description="Share of the points of both frames that agree.")
     residual_m: float = Field(
-        description="Distance between the two directions, metres; 0 if they agree."
+        description="Distance between the transforms of the two search directions, metres; 0 if "
+        "they agree."
     )
-    residual_deg: float = Field(description="Angle between the two directions, degrees.")
+    residual_deg: float = Field(
+        description="Angle between the transforms of the two search directions, degrees."
+    )
     strength: Literal["strong", "weak"]
     inliers: int = Field(description="Number of points of both frames that agree.")
     ambiguity: float = Field(
-        description="Share of the points that the best other transform explains."
+        description="Share of the points that the best alternative transform explains."
     )
     similarity: float = Field(description="Similarity of the signatures, 0 to 1.")
     from_pose: Transform | None = Field(
-        default=None, description="Pose of `from_frame` in its present parent frame."
+        default=None, description="Pose of `from_frame` in its current parent frame."
     )
-    to_pose: Transform | None = Field(default=None, description="Pose of `to_frame`.")
+    to_pose: Transform | None = Field(
+        default=None, description="Pose of `to_frame` in its current parent frame."
+    )
     from_name: str | None = Field(default=None, description="Name of the file of `from_frame`.")
     to_name: str | None = Field(default=None, description="Name of the file of `to_frame`.")
     consistent: bool | None = Field(
         description="Whether other evidence supports the edge. `true`: it closes a loop with a "
-        "nearby edge from another viewpoint, or agrees with the join. `false`: it was outvoted, "
-        "and is omitted from graphs and joins. Null: no other viewpoint checks it, there are no "
-        "poses, or the association has not ended."
+        "nearby edge from another viewpoint, or agrees with the join. `false`: it was outvoted and "
+        "is omitted from graphs and joins. Null: no edge from another viewpoint can check it, "
+        "there are no poses, or the association has not ended."
     )
-    loops: int | None = Field(description="Number of nearby edges that were compared with it.")
-    closed: int | None = Field(description="Number of these edges that agree with it.")
+    loops: int | None = Field(
+        description="Number of nearby edges that were compared with this edge."
+    )
+    closed: int | None = Field(
+        description="Number of these nearby edges that agree with this edge."
+    )
 
 
 class Join(ApiRecord):
@@ -145,27 +155,28 @@ class Join(ApiRecord):
     )
     strength: Literal["strong", "weak"] | None = Field(
         description="`strong` if many edges of several frames agree and extend over more than a "
-        "metre; null without a transform."
+        "metre; null if there is no transform."
     )
     support: int = Field(description="Number of edges that agree with the transform.")
     votes: int = Field(
         description="Number of edges between the two parent frames that were not outvoted."
     )
-    rival: int = Field(description="Number of edges that agree on the best other transform.")
+    rival: int = Field(description="Number of edges that agree on the best alternative transform.")
     spread_m: float | None = Field(
-        description="Root mean square deviation of the agreeing edges at their frames, metres."
+        description="Root mean square deviation of the agreeing edges from the transform, at the "
+        "positions of their frames, metres."
     )
     spread_deg: float | None = Field(description="The same deviation as an angle, degrees.")
     reason: str
     root: str | None = Field(
         default=None,
-        description="Parent frame of all poses after the join, that of the session uploaded first; "
-        "null if no pose was moved or the join was undone.",
+        description="Parent frame of all poses after the join, which is that of the session that "
+        "was uploaded first; null if no pose was moved or the join was undone.",
     )
     undone: bool = Field(
         default=False,
-        description="Whether poses were moved and moved back. Graphs and automatic associations do "
-        "not join these parent frames.",
+        description="Whether the join moved poses and was undone. Graphs and automatic "
+        "associations do not join these parent frames again.",
     )
 
 
@@ -173,15 +184,17 @@ class AssociationResult(ApiRecord):
     """The result of an association."""
 
     frames: int = Field(description="Number of queried frames.")
-    skipped: int = Field(description="Number of skipped frames, which were deleted meanwhile.")
+    skipped: int = Field(
+        description="Number of frames that were skipped because they were deleted in the meantime."
+    )
     validated: int = Field(description="Number of pairs of frames that were validated.")
     edges: int = Field(
-        description="Number of accepted pairs, which look alike. Treat only `consistent` ones as "
-        "the same place."
+        description="Number of accepted pairs of frames, which look alike. Treat only `consistent` "
+        "edges as showing the same place."
     )
     consistent: int = Field(
-        description="Number of edges that a second edge from another viewpoint, or a join, "
-        "supports."
+        description="Number of edges that are supported by a second edge from another viewpoint or "
+        "by a join."
     )
     inconsistent: int = Field(description="Number of edges that were outvoted.")
     unchecked: int = Field(
@@ -214,8 +227,9 @@ class Vertex(ApiRecord):
     name: str | None = Field(default=None, description="Name of the original file or message.")
     sequence: int | None = Field(default=None, description="Index in the session.")
     pose: Transform | None = Field(
-        description="Pose in `frame` of the graph if the sessions are joined, otherwise in its own "
-        "parent frame. Null without a pose, unless edges lead to a frame with a pose."
+        description="Pose in `frame` of the graph if the sessions are joined, otherwise in the "
+        "frame's own parent frame. Null if the frame has no pose, unless edges connect it to a "
+        "frame with a pose."
     )
 
 
@@ -227,8 +241,8 @@ class GraphEdge(ApiRecord):
     second: int
     matrix: list[list[float]] = Field(description="T_first_second, a 4 x 4 matrix.")
     information: list[float] = Field(
-        description="36 numbers, row by row in the order x y z rx ry rz, metres and radians, "
-        "along the axes of `second`."
+        description="Inverse covariance of the error along the axes of `second`, as 36 numbers, "
+        "row by row in the order x y z rx ry rz, metres and radians."
     )
 
 
@@ -257,8 +271,8 @@ class NewDifference(Given):
     after: Label = Field(description="The later session.")
     parent_frame: Label | None = Field(
         default=None,
-        description="Parent frame of the compared poses; default: the one with the most frames of "
-        "both sessions.",
+        description="Parent frame of the compared poses; default: the parent frame with the most "
+        "frames of both sessions.",
     )
 
     @model_validator(mode="after")
@@ -269,7 +283,7 @@ class NewDifference(Given):
 
 
 class DifferenceResult(ApiRecord):
-    """Numbers of cells of two sessions by class."""
+    """Number of cells of two sessions in each class."""
 
     same: int = Field(description="Number of cells of `after` that are also in `before`.")
     gone: int = Field(description="Number of cells of `before` that frames of `after` saw through.")
@@ -288,7 +302,10 @@ class DifferenceResult(ApiRecord):
     )
     frames_before: int = Field(description="Number of frames of `before` that were compared.")
     frames_after: int = Field(description="Number of frames of `after` that were compared.")
-    skipped: int = Field(description="Number of frames that are damaged or were deleted meanwhile.")
+    skipped: int = Field(
+        description="Number of frames that were skipped because they are damaged or were deleted "
+        "in the meantime."
+    )
 
 
 class Difference(Product):

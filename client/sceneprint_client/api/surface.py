@@ -23,17 +23,18 @@ class SurfaceLevel(ApiRecord):
     """All tiles of a parent frame whose cells have the same width."""
 
     level: int = Field(
-        description="Level; 0 has the finest cells, and each next level has cells 4 times as wide."
+        description="Number of the level. Level 0 has the finest cells; on each further level, "
+        "cells are 4 times as wide."
     )
     cell_m: float = Field(description="Width of a cell, metres.")
     tile_m: float = Field(description="Width of a tile (64 cells), metres.")
     tiles: int
-    cells: int = Field(description="Number of cells of all tiles.")
+    cells: int = Field(description="Number of cells in all tiles.")
     bytes: int
 
 
 class SurfacePlan(ApiRecord):
-    """Position of the plan of a parent frame, as in `plan.png` with the default width."""
+    """Scale, size and position of a parent frame's plan (`plan.png` with the default width)."""
 
     m_per_pixel: float
     width: int = Field(description="Width, pixels.")
@@ -41,7 +42,7 @@ class SurfacePlan(ApiRecord):
     left: float = Field(
         description="Position of the picture's upper left corner along `x_axis`, metres."
     )
-    top: float = Field(description="Position of the same corner along `y_axis`, metres.")
+    top: float = Field(description="Position of this corner along `y_axis`, metres.")
 
 
 class SurfaceParent(ApiRecord):
@@ -51,17 +52,20 @@ class SurfaceParent(ApiRecord):
     frames: int = Field(description="Number of fused frames.")
     up: Vector = Field(description="Unit vector that points up, in the parent frame.")
     up_from: UpSource = Field(
-        description="Source of the up axis. `map`: the map's `up`. `frames`: the `up` of its "
-        "frames. `cameras`: an estimate, the axis nearest to the vertical of the camera images."
+        description="Source of the up direction. `map`: the map's `up`. `frames`: the `up` of its "
+        "frames. `cameras`: an estimate, namely the axis nearest to the vertical of the camera "
+        "images."
     )
     x_axis: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector to the right of the plan."
+        min_length=3, max_length=3, description="Unit vector that points to the right of the plan."
     )
     y_axis: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector to the top of the plan."
+        min_length=3, max_length=3, description="Unit vector that points to the top of the plan."
     )
-    low: Vector = Field(description="Lowest corner of the box that contains all cells.")
-    high: Vector = Field(description="Highest corner of that box.")
+    low: Vector = Field(
+        description="Corner with the minimum coordinates of the box that contains all cells."
+    )
+    high: Vector = Field(description="Corner with the maximum coordinates of that box.")
     levels: list[SurfaceLevel] = Field(description="Levels, finest first.")
     plan: SurfacePlan
 
@@ -71,27 +75,30 @@ class MapSurface(ApiRecord):
 
     map: str
     state: SurfaceState = Field(
-        description="`none`: not built. `building`: a job builds it; existing tiles are available. "
-        "`ready`: it contains all indexed frames with poses. `stale`: frames were added, deleted "
-        "or moved since."
+        description="`none`: the surface has not been built. `building`: a job is building the "
+        "surface; existing tiles are available. `ready`: the surface contains all indexed frames "
+        "with poses. `stale`: frames have been added, deleted or moved since the last update."
     )
-    job_id: str | None = Field(description="Id of the latest job: GET /v1/jobs/{job_id}.")
-    error: str | None = Field(description="Error of the latest job, if it failed.")
+    job_id: str | None = Field(description="Id of the latest job; see GET /v1/jobs/{job_id}.")
+    error: str | None = Field(description="Error of the latest job, if the job failed.")
     frames: int = Field(description="Number of fused frames.")
-    frames_left: int = Field(description="Approximate number of frames to add or remove.")
+    frames_left: int = Field(
+        description="Approximate number of frames that still have to be added or removed."
+    )
     updated_at: datetime | None = Field(description="Time of the last change of a tile.")
     sessions: list[str] = Field(
-        description="Names of the sessions; a cell has the index of its session in this list."
+        description="Names of the sessions. Each cell contains the index of its session in this "
+        "list."
     )
     first_taken: datetime | None = Field(description="Earliest `captured_at` of the fused frames.")
     last_taken: datetime | None
     taken_from: datetime | None = Field(
-        description="Time scale of cells: a cell was last seen at `taken_from` + `taken` * "
-        "`taken_step_s`. Null if no fused frame has `captured_at`."
+        description="Start of the time scale of cells. A cell was last seen at `taken_from` + "
+        "`taken` * `taken_step_s`. Null if no fused frame has `captured_at`."
     )
     taken_step_s: float
     parents: list[SurfaceParent] = Field(
-        description="Surface in each parent frame, by number of frames; at most 20."
+        description="Surface in each of at most 20 parent frames, sorted by number of frames."
     )
 
 
@@ -102,8 +109,8 @@ class SurfaceTile(ApiRecord):
         description="Index along the x axis of the parent frame: the tile extends from `column` * "
         "`tile_m` to (`column` + 1) * `tile_m`."
     )
-    row: int = Field(description="Index along the y axis, like `column`.")
-    floor: int = Field(description="Index along the z axis, like `column`.")
+    row: int = Field(description="Index along the y axis; see `column`.")
+    floor: int = Field(description="Index along the z axis; see `column`.")
     cells: int = Field(description="Number of cells that are not empty.")
     bytes: int
     digest: str = Field(
@@ -141,22 +148,23 @@ class NewReconstruction(Given):
         default=None,
         min_length=1,
         max_length=64,
-        description="Ids of accepted matches; default: the first accepted matches of the ranking, "
-        f"at most {MOST_VIEWS - 1}.",
+        description="Ids of accepted matches to fuse; default: the first accepted matches of the "
+        f"ranking, at most {MOST_VIEWS - 1}.",
     )
     strength: Literal["strong", "any"] = Field(
-        default="any", description="`strong`: exclude weak matches."
+        default="any", description="Strength of the fused matches; `strong` excludes weak matches."
     )
     include_query: bool = Field(
         default=True,
-        description="Whether to fuse the query as the first view. Clouds cannot be fused.",
+        description="Whether to fuse the query as the first view. A query with a cloud cannot be "
+        "fused.",
     )
     voxel_m: float | None = Field(
         default=None,
         ge=0.002,
         le=0.5,
-        description="Edge of a voxel, metres; default: the spacing of the samples, at least 0.01, "
-        "as far as memory allows.",
+        description="Edge of a voxel, metres; default: the spacing of the samples, but at least "
+        "0.01, and more if memory is insufficient.",
     )
     output: Literal["mesh", "cloud"] = Field(
         default="mesh", description="Content of mesh.ply: triangles, or points only."
@@ -172,16 +180,18 @@ class FusedView(ApiRecord):
     strength: Literal["strong", "weak"] | None = Field(description="Strength of the match.")
     source: Literal["upload", "geometry"] = Field(
         description="`upload`: the uploaded depth. `geometry`: the reduced depth that validation "
-        "compares, for the query and for lost uploads."
+        "compares, which is used for the query and for frames whose upload is lost."
     )
     samples: int = Field(description="Number of depth samples within the fused range.")
     added_m2: float = Field(
-        description="Area that this view sees and no earlier view does, square metres."
+        description="Area that this view sees and no earlier view sees, square metres."
     )
 
 
 class LeftOut(ApiRecord):
-    """A match that was not fused. Clouds cannot be fused, because they do not carve space."""
+    """A match that was not fused. Clouds cannot be fused, because they do not show which space is
+    empty.
+    """
 
     frame_id: str
     map: str
@@ -197,8 +207,8 @@ class Coverage(ApiRecord):
     left_out: list[LeftOut]
     area_m2: float = Field(description="Area of the fused surface, the sum of all `added_m2`.")
     observed_volume_m3: float = Field(
-        description="Volume that is known to be empty or surface, between the cameras and the "
-        "surfaces that they saw."
+        description="Volume between the cameras and the surfaces that they saw, which is known to "
+        "be empty or part of a surface."
     )
     query_explained: float = Field(
         description="Share of the query's points that other views also see, 0 to 1."
@@ -217,8 +227,8 @@ class Reconstruction(Product):
     maps: list[str] = Field(description="Maps of the fused frames.")
     request: NewReconstruction
     parent_frame: str = Field(
-        description="Frame of the coordinates in mesh.ply: that of the query's sensor, for a "
-        "camera with x right, y down, z forward."
+        description="Coordinate frame of mesh.ply, which is the frame of the query's sensor (for a "
+        "camera x right, y down, z forward)."
     )
     result: Coverage | None = Field(
         description="Result of a job that has succeeded. GET "
