@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
 import time
@@ -24,20 +25,23 @@ def main() -> int:
     parser.add_argument("operation", nargs="*", help=f"of {', '.join(OPERATIONS)} (default: all)")
     parser.add_argument("--fault", action="append", choices=FAULTS, help="only these faults")
     parser.add_argument("--store", action="append", choices=("sqlite", "postgresql"))
+    parser.add_argument("--first", type=int, default=1, help="number of the first call that fails")
+    parser.add_argument("--step", type=int, default=1, help="calls from one failure to the next")
+    parser.add_argument("--json", action="store_true", help="print the counts of calls as JSON")
     parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
     options = parser.parse_args()
-    lines, broken = [measured_on("`make faults`"), ""], 0
+    lines, counts, broken = [measured_on("`make faults`"), ""], dict[str, dict[str, int]](), 0
     for store in options.store or ("sqlite", "postgresql"):
         start = time.monotonic()
-        trials = _enumerate(
-            store, options.operation or list(OPERATIONS), options.fault or [*FAULTS]
-        )
+        trials = _enumerate(store, options)
         found = [one for each in trials.values() for one in each.violations]
         broken += len(found)
+        for (operation, fault), one in trials.items():
+            counts.setdefault(operation, {})[fault] = one.calls
         lines += [f"**{store}**, {time.monotonic() - start:.0f} s:", "", *report(trials), ""]
         lines += [*(f"* {one}" for one in found), ""] if found else []
     text = "\n".join(lines)
-    sys.stdout.write(f"{text}\n")
+    sys.stdout.write(json.dumps(counts) if options.json and not broken else f"{text}\n")
     if options.page is not None:
         begin, end = "<!-- faults:begin -->", "<!-- faults:end -->"
         head, rest = options.page.read_text().split(begin)
@@ -45,9 +49,8 @@ def main() -> int:
     return 1 if broken else 0
 
 
-def _enumerate(
-    store: str, operations: list[str], faults: list[str]
-) -> dict[tuple[str, str], Trials]:
+def _enumerate(store: str, options: argparse.Namespace) -> dict[tuple[str, str], Trials]:
+    operations, faults = options.operation or list(OPERATIONS), options.fault or list(FAULTS)
     with ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sceneprint-faults-")))
         server = None
@@ -61,7 +64,9 @@ def _enumerate(
         for operation in operations:
             for fault in faults:
                 progress.set_description(f"{store}: {operation}, {fault}")
-                found[operation, fault] = enumeration.run(operation, fault)
+                found[operation, fault] = enumeration.run(
+                    operation, fault, first=options.first, step=options.step
+                )
                 progress.update()
         return found
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks.postgres import Server
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.errors import SceneprintError
-from tests.faults.injection import FAULTS, Injector
+from tests.faults.injection import Injector
 from tests.faults.operations import (
     ACKNOWLEDGED,
     OPERATIONS,
@@ -112,13 +112,10 @@ class Enumeration:
         url = None if self._server is None else self._server.create(name, template)
         return Store(folder, url, self._uploads)
 
-    def run(
-        self, operation: str, fault: str, *, first: int = 1, step: int = 1,
-        until: Callable[[], bool] = lambda: False,
-    ) -> Trials:  # fmt: skip
+    def run(self, operation: str, fault: str, *, first: int = 1, step: int = 1) -> Trials:
         """Try a fault at calls `first`, `first + step` and so on, to the end of the operation."""
         trials, at = Trials(), first
-        while not until():
+        while True:
             failed, broken = self._try(operation, fault, at)
             if not failed:
                 break
@@ -169,15 +166,15 @@ class Enumeration:
 
 def report(trials: dict[tuple[str, str], Trials]) -> Iterator[str]:
     """Yield the rows of a table: calls tried for each operation, and violations."""
-    totals = Counter[str]()
-    yield "| operation | " + " | ".join(FAULTS) + " | violations |"
-    yield "|---|" + "--:|" * (len(FAULTS) + 1)
+    totals, faults = Counter[str](), list(dict.fromkeys(fault for _, fault in trials))
+    yield "| operation | " + " | ".join(faults) + " | violations |"
+    yield "|---|" + "--:|" * (len(faults) + 1)
     for operation in dict.fromkeys(name for name, _ in trials):
-        own = {fault: trials[operation, fault] for fault in FAULTS}
+        own = {fault: trials[operation, fault] for fault in faults}
         totals.update({fault: one.calls for fault, one in own.items()})
         broken = sum(len(one.violations) for one in own.values())
         totals["violations"] += broken
         counts = " | ".join(str(one.calls) for one in own.values())
         yield f"| {operation} | {counts} | {broken} |"
-    counts = " | ".join(str(totals[name]) for name in (*FAULTS, "violations"))
+    counts = " | ".join(str(totals[name]) for name in (*faults, "violations"))
     yield f"| all | {counts} |"
