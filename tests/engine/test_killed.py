@@ -34,7 +34,7 @@ def stand_still(*given):
     time.sleep(600)
 
 setattr(signature_job, sys.argv[2], stand_still)
-engine = Engine(Settings(data_dir=Path(sys.argv[1]), lease_s=2))
+engine = Engine(Settings(data_dir=Path(sys.argv[1]), job_lease_s=2))
 engine.run(engine.claim("doomed"))
 """
 

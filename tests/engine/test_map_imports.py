@@ -224,7 +224,7 @@ def test_a_surface_needs_room_beyond_that_of_its_file(empty: Engine) -> None:
     job = begun(empty, data.encode())
     edit_map(empty.store, "hall", {"quota_bytes": len(data) + 10})
     assert empty.run(claimed(empty)) == JobState.FAILED
-    assert "quota allows" in str(empty.get_job(job.job_id).error)
+    assert "its quota is" in str(empty.get_job(job.job_id).error)
     assert used_bytes(empty) == len(data)
 
 
