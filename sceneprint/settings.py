@@ -306,8 +306,8 @@ class Settings(BaseSettings):
         default=1_000_000, ge=1000,
     )  # fmt: skip
     audit_log_days: float = _setting(
-        "Time for which entries of the audit log are stored, days. The log contains at most "
-        "200,000 changes and 200,000 refusals per tenant.",
+        "Time for which entries of the audit log are stored, days. At most the newest "
+        "million entries of each tenant are kept.",
         "According to the requirements of your auditors.",
         default=365.0, gt=0, le=36_500,
     )  # fmt: skip

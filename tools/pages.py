@@ -43,8 +43,8 @@ def settings_page() -> str:
     parts = [
         "# Settings",
         f"For operators: the {len(fields)} environment variables that service and workers read "
-        "when they start. All have defaults. An invalid value stops the start with a message of "
-        "one line. The names in the tables follow `SCENEPRINT_`, as in `SCENEPRINT_PORT`.",
+        "when they start. All have defaults. An invalid value prevents the start, and a one-line "
+        "message is printed. The names in the tables follow `SCENEPRINT_`: `SCENEPRINT_PORT`.",
         "Secrets can come from files of one line. Append `_FILE` to the variable and set it to the "
         "path: `SCENEPRINT_DATABASE_URL_FILE`, `PGPASSWORD_FILE`, `AWS_ACCESS_KEY_ID_FILE`, "
         "`AWS_SECRET_ACCESS_KEY_FILE` and `AZURE_STORAGE_ACCOUNT_KEY_FILE`.",

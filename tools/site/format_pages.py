@@ -24,10 +24,9 @@ def formats_page() -> str:
     """Return Markdown with a table of the formats of each kind."""
     return page(
         "# File formats",
-        "For anyone who asks whether a file can be read: every format, and the data that is read.",
+        "For anyone with files to read: every supported format, and the data that is read from it.",
         *(f"## {title}\n\n{_rows(kind)}" for kind, title in _TITLES.items()),
-        "What becomes of them: [point clouds](clouds.md), [recordings](recordings.md), "
-        "[captures](exports.md).",
+        "See also [point clouds](clouds.md), [recordings](recordings.md), [captures](exports.md).",
     )
 
 
