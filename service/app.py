@@ -133,10 +133,12 @@ ROUTERS = (
 
 DESCRIPTION = """\
 Where have I seen this before? Upload depth frames or point clouds to a map, and query where another
-frame was taken: pure geometry, no colour, no pose prior. docs/api.md is a tour with curl.
+frame was taken. Queries use only geometry, and need neither colour nor a pose prior. docs/api.md is
+a tour with curl.
 
-Lengths are metres. Camera frames are optical (x right, y down, z forward), clouds keep the axes of
-their sensor. Refusals are problem documents (RFC 9457) that say what happened, why, and what to do.
+Lengths are in metres. Camera frames are optical (x right, y down, z forward); clouds keep the axes
+of their sensor. Errors are problem documents (RFC 9457) that say what happened, why, and what to
+do.
 """
 
 

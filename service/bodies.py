@@ -113,7 +113,7 @@ def parameters() -> list[dict[str, Any]]:
         "name": (text, "Name of the original file or message."),
         "sequence": ({"type": "integer", "minimum": 0}, "Index within the session."),
         "tags": (text, "Tags, separated by commas."),
-        "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}: metres, unit quaternion."),
+        "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}, in metres with a unit quaternion."),
         "parent_frame": (text, "Parent frame of `pose`; default: ROBOT/SESSION."),
         "base": (text, "T_base_sensor, the mounting pose of the sensor, in the format of `pose`."),
         "base_frame": (text, "Name of the robot's base frame; default: base_link."),
@@ -323,9 +323,9 @@ FRAME_BODY: dict[str, Any] = {
                     "frame": {
                         "type": "string",
                         "format": "binary",
-                        "description": "A depth image: "
+                        "description": "A depth image as "
                         + ", ".join(f"{one.title} ({one.content})" for one in formats_of("depth"))
-                        + f". Or a point cloud: {titles_of('cloud', last='or')}.",
+                        + f". Or a point cloud as {titles_of('cloud', last='or')}.",
                     },
                     "meta": {"$ref": "#/components/schemas/FrameMeta"},
                 },

@@ -139,7 +139,7 @@ async def create_key(request: Request, here: Here, response: Response) -> MadeKe
 
 @keys_router.get("/keys", responses=refusals(422), dependencies=[Depends(administers)])
 def list_keys(here: Here, cursor: Cursor = None, limit: Limit = 100) -> Page[Key]:
-    """List keys by name, without their secrets."""
+    """List keys, sorted by name, without their secrets."""
     return operations.list_keys(here.context.store, cursor, limit)
 
 
@@ -209,7 +209,8 @@ def list_changes(
 ) -> Page[AuditLine]:
     """List changes and refused requests (401, 403) with their keys, newest first.
 
-    The log keeps lines for `SCENEPRINT_AUDIT_LOG_DAYS`, and at most a million per tenant.
+    The log keeps lines for `SCENEPRINT_AUDIT_LOG_DAYS` days, and at most a million lines per
+    tenant.
     """
     return here.audit.page(AuditFilter(actor, map_name, action), cursor, limit)
 
@@ -239,7 +240,7 @@ def stats(
 
 @operations_router.get("/models", responses=refusals())
 def models(here: Here, caller: Sender) -> Page[ModelInfo]:
-    """List the models for maps, which are the presets and all models that maps have or had."""
+    """List the models for maps (the presets, and all models that maps have or had)."""
     found = here.catalogue.list_all(lambda name: caller.may("read", name))
     if not caller.reads_every:  # a model of unreadable maps would reveal them
         found = [one for one in found if one.preset or one.maps]

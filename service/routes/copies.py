@@ -38,7 +38,7 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
 def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
-    """Return the geometry of an indexed frame, which validation compares."""
+    """Return the geometry that validation compares for an indexed frame."""
     return _response(here.copies.artifact(map_name, digest))
 
 

@@ -42,8 +42,8 @@ router = v1_router("/maps/{map_name}/frames/{frame_id}", "frames", may_read)
     response_class=Response,
     responses=file_responses(
         PLY,
-        description="Points and normals, binary little-endian, 32-bit; a comment names the frame "
-        "of the coordinates.",
+        description="Points and normals, binary little-endian, 32-bit; a comment names the "
+        "coordinate frame.",
         statuses=(404, 409, 422),
     ),
 )
@@ -87,7 +87,7 @@ async def get_preview(
             "are 127.5 (1 + n) for x right, y down, z forward. `patches`: one colour for each "
             "patch of the finest level. Pixels without data are dark grey. A cloud is shown as "
             "seen from its viewpoint, with normals along its own axes; without a viewpoint, it is "
-            "shown from above, with heights in place of depth."
+            "shown from above, with heights instead of depth."
         ),
     ] = "depth",
     width: Annotated[
@@ -178,7 +178,7 @@ _BYTES = "A header of 48 bytes, then 12 bytes per point; see docs/reference.md, 
     response_class=Response,
     responses=file_responses(
         MEDIA_TYPE,
-        description=f"{_BYTES}Points have normals and validation patches.",
+        description=f"{_BYTES}Normals and validation patches are included.",
         statuses=(404, 409, 422),
     ),
 )
@@ -203,7 +203,7 @@ async def get_frame_points(
     response_class=Response,
     responses=file_responses(
         MEDIA_TYPE,
-        description=f"{_BYTES}Points have normals and validation patches.",
+        description=f"{_BYTES}Normals and validation patches are included.",
         statuses=(404, 409, 422),
     ),
 )
@@ -222,8 +222,8 @@ async def get_query_points(
     response_class=Response,
     responses=file_responses(
         MEDIA_TYPE,
-        description=f"{_BYTES}Points have normals, validation patches and, if there is a "
-        "transform, residuals.",
+        description=f"{_BYTES}Normals, validation patches and, if there is a transform, "
+        "residuals are included.",
         statuses=(404, 409, 422),
     ),
 )

@@ -214,7 +214,7 @@ async def add_batch(
 ) -> Batch:  # fmt: skip
     """Add up to 64 frames to a map at once. An invalid frame does not affect the others.
 
-    All valid frames are added in one transaction: if the request fails, none is added.
+    All valid frames are added in one transaction. If the request fails, no frame is added.
     """
     async with here.upload_gate.place(), read_frames(request, "priority", "if_novel") as batch:
 
@@ -343,8 +343,9 @@ async def add_import(
     """Import an archive of sequences, or a map in one file. The body is the file itself.
 
     An archive is a zip or tar file (plain, .gz, .bz2 or .xz) of a 7-Scenes scene or sequence, a TUM
-    RGB-D folder, or depth images with their intrinsics.json. It is stored durably before the
-    response. A worker then adds its frames one by one; an invalid frame does not affect the others.
+    RGB-D folder, or depth images with their intrinsics.json. The archive is stored durably before
+    the response. A worker then adds its frames one by one; an invalid frame does not affect the
+    others.
 
     With `as=map` the body is one cloud or mesh of a whole place (PCD, PLY, LAS, LAZ, OBJ, STL, glTF
     or E57), and `name` is the name of its file. A worker renders views of it and adds them as

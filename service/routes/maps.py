@@ -73,7 +73,7 @@ DryRun = Annotated[
     bool,
     Query(
         description="Return the map as it would be after the edit, but change nothing. `overdue` "
-        "is the number of frames that `retention_days` would delete immediately."
+        "is the number of frames that would be deleted immediately because of `retention_days`."
     ),
 ]
 

@@ -170,7 +170,7 @@ associations_router = product_router(
     "revisits, to close its loops. A job queries each frame of the first session against the "
     "second. Each match that passes validation is an edge. Edges of neighbouring frames must agree "
     "with the motion of the robots; the remaining edges vote for the transform between the parent "
-    "frames of the sessions. The job takes approximately 0.1 s per frame and worker.",
+    "frames of the sessions. Each frame takes one worker approximately 0.1 s.",
 )  # fmt: skip
 
 _TEXT_SCHEMA = {"schema": {"type": "string"}}
@@ -188,9 +188,9 @@ _Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Minimum overlap o
     "/{job_id}/join", responses=refusals(404, 409), dependencies=[Depends(may_write)]
 )
 def undo_join(map_name: str, job_id: str, here: Here) -> Association:
-    """Undo the join of an association. Poses return to the uploaded ones, or to the parent frame of
-    other joins. If there is no active join, nothing changes. Workers join the parent frames again
-    only if you request an association.
+    """Undo the join of an association. Poses are reset to the uploaded ones, or to the parent frame
+    of other joins. If there is no active join, nothing changes. Workers join the parent frames
+    again only if you request an association.
     """
     return here.associations.undo_join(map_name, job_id)
 

@@ -483,7 +483,7 @@ similarity_router = v1_router(tag="queries")
 def _body() -> dict[str, Any]:
     """Return the body of a comparison, for the OpenAPI document."""
     own = Comparison.model_json_schema(ref_template=TEMPLATE)["properties"]
-    file = {"type": "string", "format": "binary", "description": "A depth image: PNG or NPY."}
+    file = {"type": "string", "format": "binary", "description": "A depth image as PNG or NPY."}
     meta = {
         "type": "string",
         "contentMediaType": JSON,

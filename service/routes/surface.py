@@ -89,7 +89,7 @@ def list_surface_tiles(
     ),
 )
 def get_surface_tile(map_name: str, digest: str, request: Request, here: Here) -> Response:
-    """Return the cells of a tile. A tile with other cells has another digest."""
+    """Return the cells of a tile. Tiles with different cells have different digests."""
     found = here.surfaces.tile(map_name, digest)
     headers = {"ETag": f'"{found.tag}"', "Cache-Control": _FOREVER}
     if is_known(request, found.tag):

@@ -138,7 +138,7 @@ class IndexRecall(ApiRecord):
     near: int = Field(description="Number of nearest frames that each test query should find.")
     sample: int = Field(
         description="Number of test queries; 0 if a query compares every frame. Each test query "
-        "uses a frame of the map, which is excluded from that search."
+        "uses a frame of the map and excludes this frame from the search."
     )
     probes: int = Field(
         description="Minimum number of frames that a query compares in a large map; 0 if a query "
@@ -174,7 +174,7 @@ class WorkerSeen(ApiRecord):
 
 
 class Latency(ApiRecord):
-    """Percentiles of the response time in seconds, accurate to a tenth."""
+    """Percentiles of the response time in seconds, accurate to within 10 %."""
 
     p50: float
     p95: float
@@ -195,12 +195,13 @@ class Counted(ApiRecord):
         "and the following fields are null for a single map."
     )
     latency: Latency | None = Field(
-        description="Latency of answered queries; null if there were none."
+        description="Latency of answered queries; null if there were no queries."
     )
     requests: int | None = Field(description="Number of requests under /v1, answered or refused.")
     refused: int | None = Field(description="Number of these requests with a 4xx response.")
     busy: int | None = Field(
-        description="Number of these requests with a 503 response, which asks for a retry."
+        description="Number of these requests with a 503 response, after which a client should "
+        "retry."
     )
     broken: int | None = Field(description="Number of these requests with any other 5xx response.")
 
@@ -240,7 +241,7 @@ class ScrubSeen(ApiRecord):
     bytes: int = Field(description="Size of the uploads and artifacts that this pass has read.")
     damaged: int = Field(
         description="Number of lost or damaged rows, signatures, uploads and artifacts that this "
-        "pass has found. Events `frame.damaged` name the frames with lost data, and `sceneprint "
+        "pass has found. `frame.damaged` events name the frames with lost data, and `sceneprint "
         "fsck` lists everything."
     )
 
@@ -286,7 +287,7 @@ class Stats(ApiRecord):
 
 
 class ModelInfo(ApiRecord):
-    """A model: everything that determines signatures."""
+    """A model, which contains everything that determines signatures."""
 
     model_id: str
     label: str = Field(description="Name and first digits of the id, as in maps and answers.")
@@ -295,13 +296,14 @@ class ModelInfo(ApiRecord):
     components: int = Field(description="G, the number of components of the mixture.")
     levels: int = Field(description="Number of levels of the hierarchy of patches.")
     signature_bytes: int = Field(
-        description="Length of a stored signature, bytes: d, or 25 G H if psi itself is stored."
+        description="Length of a stored signature (d, or 25 G H if psi itself is stored), bytes."
     )
     metric: Literal["l1", "l2"] = Field(
         description="Distance metric. `l2`: squared L2. `l1`: L1, if psi itself is stored."
     )
     unrelated_distance: float = Field(
-        description="d0, the median distance of unrelated frames: similarity = 1 - distance / d0."
+        description="d0, the median distance between unrelated frames, with similarity = 1 - "
+        "distance / d0."
     )
     parameters: dict[str, Any] = Field(description="Parameters of every stage.")
     provenance: dict[str, Any] = Field(description="Training data and method.")
@@ -336,9 +338,7 @@ ImportPhase = Literal["read", "choose", "render", "sign", "test"]
 class Progress(ApiRecord):
     """The progress of a long job."""
 
-    done: int = Field(
-        description="Number of completed steps, which are frames or files of an archive."
-    )
+    done: int = Field(description="Number of completed steps (frames, or files of an archive).")
     total: int | None = Field(default=None, description="Total number of steps; null if unknown.")
     phase: ImportPhase | None = Field(
         default=None,
@@ -373,7 +373,7 @@ class Product(ApiRecord):
 
 
 class Job(ApiRecord):
-    """A job of the queue."""
+    """A job in the queue."""
 
     job_id: str
     kind: str = Field(
@@ -419,7 +419,7 @@ class RetriedJobs(ApiRecord):
     retried: list[Job] = Field(description="Jobs that retry the dead jobs.")
     refused: list[RefusedRetry]
     next_cursor: str | None = Field(
-        description="Send it as `cursor` for the next page; null at the end."
+        description="Cursor of the next page, to send as `cursor`; null on the last page."
     )
 
 

@@ -46,8 +46,8 @@ class NewMapCoverage(Given):
         ge=0.0,
         le=1e9,
         description="Exclude frames of the same session that were taken within this number of "
-        "seconds of the queried frame. If it is 0, or if the queried frame has no session or time, "
-        "only the frame itself is excluded.",
+        "seconds of the queried frame. If this number is 0, or if the queried frame has no session "
+        "or time, only the frame itself is excluded.",
     )
     other_sessions: bool = Field(
         default=False,
@@ -123,8 +123,8 @@ class CoverageCell(OutcomeCounts):
     """A square cell of a plan."""
 
     column: int = Field(
-        description="Index along `x_axis`: the cell extends from `column` * `cell_m` to "
-        "(`column` + 1) * `cell_m`."
+        description="Index along `x_axis`. The cell extends from `column` * `cell_m` to (`column` "
+        "+ 1) * `cell_m`."
     )
     row: int = Field(description="Index along `y_axis`; see `column`.")
     frames: int = Field(
@@ -177,7 +177,7 @@ class CoverageFrame(ApiRecord):
     robot: str | None
     session: str | None
     outcome: CoverageOutcome
-    reason: str = Field(description="Explanation of the answer in a sentence.")
+    reason: str = Field(description="Explanation of the answer in one sentence.")
     cause: Cause | None = Field(description="Most likely cause if the outcome is `not_found`.")
     parent_frame: str | None = Field(
         description="Parent frame of the frame's own pose; null if the frame has no pose."

@@ -271,8 +271,10 @@ class BatchItem(ApiRecord):
         description="Status code as for a single upload: 202 received, 200 already in the map, 403 "
         "quota exceeded, 409 or 422 refused."
     )
-    frame: Added | None = Field(description="Added frame; null if it was refused.")
-    problem: Problem | None = Field(description="Problem of a refused frame; otherwise null.")
+    frame: Added | None = Field(description="Added frame; null if the frame was refused.")
+    problem: Problem | None = Field(
+        description="Details of the error if the frame was refused; otherwise null."
+    )
 
 
 class Batch(ApiRecord):
@@ -334,9 +336,9 @@ class ImportOptions(Given):
     )
     up: AxisOrUp | None = Field(
         default=None,
-        description="Up direction in the sensor's axes, for all frames; specify it if the sensor "
-        "is carried level. For a map, the axis of its file that points up, such as `z` or `-y`; "
-        "default: the up axis that the file specifies, otherwise an estimate.",
+        description="Up direction in the sensor's axes, for all frames; specify it only if the "
+        "sensor is carried level. For a map, the axis of its file that points up, such as `z` or "
+        "`-y`; default: the up axis that the file specifies, otherwise an estimate.",
     )
     heights: list[Annotated[float, Field(gt=0, le=1000)]] = Field(
         default=[],
@@ -468,9 +470,11 @@ class ImportItem(ApiRecord):
 
     name: str = Field(description="Name of the file in the archive, or of a sequence.")
     status: int = Field(description="Status code as for an item of a batch.")
-    frame_id: str | None = Field(description="Id of the frame; null if it was refused.")
+    frame_id: str | None = Field(description="Id of the frame; null if the frame was refused.")
     job_id: str | None = Field(description="Id of the job that signs the frame.")
-    problem: Problem | None = Field(description="Problem of a refused frame; otherwise null.")
+    problem: Problem | None = Field(
+        description="Details of the error if the frame was refused; otherwise null."
+    )
     samples: SampleRange | None = Field(
         default=None, description="Range of the frame's samples; see Frame."
     )

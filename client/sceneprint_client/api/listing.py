@@ -177,7 +177,7 @@ class Trajectory(ApiRecord):
     )
     frame_ids: list[str]
     poses: list[list[float]] = Field(
-        description="One row for each frame, t tx ty tz qx qy qz qw as in a TUM file, with the "
+        description="One row for each frame, as in a TUM file (t tx ty tz qx qy qz qw), with the "
         "timestamp t, metres and a unit quaternion."
     )
     stamps: Stamp | None = Field(
@@ -353,7 +353,7 @@ class SessionChange(ApiRecord):
     """The result of changing a session."""
 
     map: str
-    session: str = Field(description="Present name of the session.")
+    session: str = Field(description="Current name of the session.")
     robot: str | None = Field(description="Robot in the request; null if there is none.")
     frames: int = Field(description="Number of frames that this call deleted or edited.")
     remaining: int = Field(

@@ -78,7 +78,7 @@ class NewMap(Given):
 class Reencoding(ApiRecord):
     """The progress of a map's switch to another model."""
 
-    model: str = Field(description="Label of the next model: name and first digits of its id.")
+    model: str = Field(description="Label of the next model (name and first digits of its id).")
     model_id: str
     done: int = Field(description="Number of frames signed with the next model.")
     left: int = Field(description="Number of frames that still have to be signed.")
@@ -96,7 +96,7 @@ class Map(ApiRecord):
 
     name: str
     title: str | None
-    model: str = Field(description="Label of the model: name and first digits of its id.")
+    model: str = Field(description="Label of the model (name and first digits of its id).")
     model_id: str
     reencoding: Reencoding | None = Field(
         default=None,
@@ -144,8 +144,8 @@ class Map(ApiRecord):
     )
     overdue: int | None = Field(
         default=None,
-        description="Number of frames older than `retention_days`, which workers delete next; null "
-        "if frames do not expire.",
+        description="Number of frames that are older than `retention_days` and will be deleted "
+        "next; null if frames do not expire.",
     )
     etag: str | None = Field(
         default=None,

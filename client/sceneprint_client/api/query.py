@@ -84,7 +84,7 @@ class ValidationOptions(Given):
     )
     evidence: Share = Field(
         default=0.2,
-        description="Minimum of `overlap` - `violation_weight` x `free_space_violations`. By "
+        description="Minimum value of `overlap` - `violation_weight` x `free_space_violations`. By "
         "default, half of this minimum is enough for a weak match if the frames have little "
         "surface in common but agree in all of it.",
     )
@@ -229,12 +229,14 @@ class Match(ApiRecord):
     name: str | None = Field(default=None, description="Name of the original file or message.")
     sequence: int | None = Field(default=None, description="Index in the session.")
     rank: int = Field(description="Position in the ranking R, from 1.")
-    distance: int = Field(description="Distance of the signatures.")
-    similarity: float = Field(description="1 - distance / distance of unrelated frames, 0 to 1.")
+    distance: int = Field(description="Distance between the signatures.")
+    similarity: float = Field(
+        description="1 - distance / distance between unrelated frames, 0 to 1."
+    )
     selected: bool | None = Field(
         description="Whether the match is in the diverse selection C; null if that stage was not "
-        "requested. If false, the match is a frame of another place, which was validated because "
-        "it also resembles the query."
+        "requested. If false, the match shows another place and was validated because it also "
+        "resembles the query."
     )
     diversity_gain: float | None = Field(
         description="Diversity of the match: 1 for the first one, near 0 for a duplicate."
@@ -356,8 +358,8 @@ class Location(ApiRecord):
     )
     map: str | None = Field(default=None, description="Map of the matches.")
     support: int = Field(
-        description="Number of matches that agree on the pose. 1 means that only a single view "
-        "does, and 0 that only the map confirms the pose."
+        description="Number of matches that agree on the pose. 1 means a single view; 0 means that "
+        "only the map confirms the pose."
     )
     guided: int = Field(
         default=0,
@@ -472,8 +474,8 @@ class Prior(Given):
     """The expected pose of a robot, T_parent_query, and its uncertainty."""
 
     pose: GivenPose = Field(
-        description="Pose of the query's sensor in a parent frame of the map. It requires "
-        f"`parent_frame`. Each coordinate is at most {FARTHEST_PRIOR:,.0f} m from the origin."
+        description="Pose of the query's sensor in a parent frame of the map. `parent_frame` "
+        f"is required. Each coordinate is at most {FARTHEST_PRIOR:,.0f} m from the origin."
     )
     covariance: Annotated[list[float], Field(min_length=36, max_length=36)] | None = Field(
         default=None,
@@ -523,8 +525,8 @@ class Query(Given):
     )
     exact: bool = Field(
         default=False,
-        description="Whether to compare every frame that matches the filter. Most queries do so "
-        "anyway; only in a large map are some frames skipped by default.",
+        description="Whether to compare every frame that matches the filter. By default, only "
+        "queries in large maps skip some frames.",
     )
     filter: Filter | None = Field(
         default=None,
@@ -551,8 +553,8 @@ class Query(Given):
     prior: Annotated[Prior | None, JsonText] = Field(
         default=None,
         description="Expected pose of the robot. Candidates near this pose are tried first, and "
-        "the pose is refined on the map in addition to the global search. It decides only between "
-        "poses that the map supports equally.",
+        "the pose is refined on the map in addition to the global search. The prior decides only "
+        "between poses that the map supports equally.",
     )
     confidence: float = Field(
         default=0.99,
@@ -566,7 +568,7 @@ class Query(Given):
         ge=1,
         le=600_000,
         description="Time limit from the arrival of the request. Candidates that would probably "
-        "exceed it are not validated; ranking and selection are always completed.",
+        "exceed the limit are not validated; ranking and selection are always completed.",
     )
     explain: bool = Field(
         default=False,
@@ -684,8 +686,8 @@ class Answer(ApiRecord):
     )
     matches: list[Match] = Field(
         description="Accepted matches, followed by the other validated matches. Strong matches "
-        "precede weak ones; among these, the most precise are first (for full-turn scans, the "
-        "nearest)."
+        "precede weak ones; within each group, the most precise matches are first (for full-turn "
+        "scans, the nearest)."
     )
     location: Location | None = Field(
         description="Pose of the query if the answer is `found` and the matches have poses."
@@ -777,8 +779,8 @@ class Localization(ApiRecord):
         description="Evidence behind `confidence`; null if `confidence` is null.",
     )
     support: int = Field(
-        description="Number of matches that agree on the pose. 1 means that only a single view "
-        "does, and 0 that only the map confirms the pose."
+        description="Number of matches that agree on the pose. 1 means a single view; 0 means that "
+        "only the map confirms the pose."
     )
     votes: int = Field(description="Number of accepted matches, for any pose.")
     spread_m: float | None = Field(

@@ -53,7 +53,8 @@ class QueryRecord(ApiRecord):
     """A past query and its outcome, without the data of its frame."""
 
     query_id: str = Field(
-        description="Id of the query. GET /v1/queries/{query_id} returns the answer if `stored`."
+        description="Id of the query. GET /v1/queries/{query_id} returns the answer if `stored` is "
+        "true."
     )
     at: datetime = Field(description="Time of the query.")
     map: str = Field(
@@ -144,8 +145,8 @@ class PatchLevel(ApiRecord):
     normal: list[Triple] = Field(description="Unit normal towards the sensor.")
     area_m2: list[float]
     size: list[int] = Field(
-        description="Number of pixels of the patch in the surface map, which has approximately 160 "
-        "x 120 pixels."
+        description="Number of pixels of the patch in the surface map of approximately 160 x 120 "
+        "pixels."
     )
 
 
@@ -209,8 +210,8 @@ class Similarities(ApiRecord):
         default=[], description="Names of the files of `frames`, in the same order."
     )
     similarity: list[list[float]] = Field(
-        description="1 - distance / distance of unrelated frames, 0 to 1. The first row and column "
-        "belong to the query, and the others to `frames`, in the same order."
+        description="1 - distance / distance between unrelated frames, 0 to 1. The first row and "
+        "column belong to the query, and the others to `frames`, in the same order."
     )
 
 
@@ -307,9 +308,11 @@ class Similarity(ApiRecord):
     """The similarity of two frames."""
 
     distance: int = Field(
-        description="Distance of the signatures: squared L2, or L1 if psi itself is stored."
+        description="Distance between the signatures (squared L2, or L1 if psi itself is stored)."
     )
-    similarity: float = Field(description="1 - distance / distance of unrelated frames, 0 to 1.")
+    similarity: float = Field(
+        description="1 - distance / distance between unrelated frames, 0 to 1."
+    )
     model: str
     a: FrameName | None = Field(description="Stored frame a; null for an upload.")
     b: FrameName | None = Field(description="Stored frame b; null for an upload.")
@@ -317,8 +320,8 @@ class Similarity(ApiRecord):
         description="Result of the validation; null if validation was not requested."
     )
     transform: Transform | None = Field(
-        description="x_a = matrix @ x_b. An accepted transform is right if both frames show the "
-        "same place; a single pair cannot prove that they do."
+        description="Transform with x_a = matrix @ x_b. An accepted transform is right if both "
+        "frames show the same place; a single pair cannot prove that they do."
     )
     uncertainty: Uncertainty | None = Field(
         default=None, description="Uncertainty of an accepted `transform`."

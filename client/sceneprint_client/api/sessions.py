@@ -98,7 +98,9 @@ class Edge(ApiRecord):
     to_session: str | None
     from_robot: str | None
     to_robot: str | None
-    transform: Transform = Field(description="x_to = matrix @ x_from, between the sensors' frames.")
+    transform: Transform = Field(
+        description="Transform between the frames of the two sensors, with x_to = matrix @ x_from."
+    )
     information: list[float] | None = Field(
         description="Inverse covariance of the error, as 36 numbers, row by row in the order x y z "
         "rx ry rz, metres and radians. The error is along the axes of `from_frame`, with T_true = "
@@ -141,7 +143,7 @@ class Edge(ApiRecord):
 
 
 class Join(ApiRecord):
-    """Transform between the parent frames of two sessions, by consensus of the edges."""
+    """Transform between the parent frames of two sessions, on which the edges agree."""
 
     from_session: str
     to_session: str
@@ -150,8 +152,8 @@ class Join(ApiRecord):
     from_parent: str = Field(description="Parent frame of the poses of `from_session`.")
     to_parent: str
     transform: Transform | None = Field(
-        description="x_to = matrix @ x_from, between the parent frames; null if the edges do not "
-        "agree."
+        description="Transform between the parent frames, with x_to = matrix @ x_from; null if the "
+        "edges do not agree."
     )
     strength: Literal["strong", "weak"] | None = Field(
         description="`strong` if many edges of several frames agree and extend over more than a "
@@ -170,8 +172,8 @@ class Join(ApiRecord):
     reason: str
     root: str | None = Field(
         default=None,
-        description="Parent frame of all poses after the join, which is that of the session that "
-        "was uploaded first; null if no pose was moved or the join was undone.",
+        description="Parent frame of all poses after the join (the parent frame of the session "
+        "that was uploaded first); null if no pose was moved or the join was undone.",
     )
     undone: bool = Field(
         default=False,
@@ -189,7 +191,7 @@ class AssociationResult(ApiRecord):
     )
     validated: int = Field(description="Number of pairs of frames that were validated.")
     edges: int = Field(
-        description="Number of accepted pairs of frames, which look alike. Treat only `consistent` "
+        description="Number of accepted pairs of frames that look alike. Treat only `consistent` "
         "edges as showing the same place."
     )
     consistent: int = Field(

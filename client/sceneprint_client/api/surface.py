@@ -106,7 +106,7 @@ class SurfaceTile(ApiRecord):
     """A cube of cells, 64 along each side."""
 
     column: int = Field(
-        description="Index along the x axis of the parent frame: the tile extends from `column` * "
+        description="Index along the x axis of the parent frame. The tile extends from `column` * "
         "`tile_m` to (`column` + 1) * `tile_m`."
     )
     row: int = Field(description="Index along the y axis; see `column`.")
@@ -142,7 +142,7 @@ MOST_VIEWS = 32
 
 
 class NewReconstruction(Given):
-    """Options of a reconstruction: views to fuse, and kind of output."""
+    """The views to fuse in a reconstruction, and the kind of output."""
 
     frames: tuple[Named, ...] | None = Field(
         default=None,
@@ -167,7 +167,7 @@ class NewReconstruction(Given):
         "0.01, and more if memory is insufficient.",
     )
     output: Literal["mesh", "cloud"] = Field(
-        default="mesh", description="Content of mesh.ply: triangles, or points only."
+        default="mesh", description="Content of mesh.ply. `mesh`: triangles. `cloud`: only points."
     )
 
 
@@ -180,7 +180,7 @@ class FusedView(ApiRecord):
     strength: Literal["strong", "weak"] | None = Field(description="Strength of the match.")
     source: Literal["upload", "geometry"] = Field(
         description="`upload`: the uploaded depth. `geometry`: the reduced depth that validation "
-        "compares, which is used for the query and for frames whose upload is lost."
+        "compares; it is used for the query and for frames whose upload is lost."
     )
     samples: int = Field(description="Number of depth samples within the fused range.")
     added_m2: float = Field(
@@ -207,8 +207,8 @@ class Coverage(ApiRecord):
     left_out: list[LeftOut]
     area_m2: float = Field(description="Area of the fused surface, the sum of all `added_m2`.")
     observed_volume_m3: float = Field(
-        description="Volume between the cameras and the surfaces that they saw, which is known to "
-        "be empty or part of a surface."
+        description="Volume that is known to be empty or part of a surface. It lies between the "
+        "cameras and the surfaces that they saw."
     )
     query_explained: float = Field(
         description="Share of the query's points that other views also see, 0 to 1."
@@ -227,8 +227,8 @@ class Reconstruction(Product):
     maps: list[str] = Field(description="Maps of the fused frames.")
     request: NewReconstruction
     parent_frame: str = Field(
-        description="Coordinate frame of mesh.ply, which is the frame of the query's sensor (for a "
-        "camera x right, y down, z forward)."
+        description="Coordinate frame of mesh.ply. It is the frame of the query's sensor; for a "
+        "camera, x points right, y down and z forward."
     )
     result: Coverage | None = Field(
         description="Result of a job that has succeeded. GET "
