@@ -310,7 +310,7 @@ def _key_required_text(request: Request, here: Here) -> str:
     if not here.keys:
         reason = (
             f"The request came through a proxy (it has the header {request.state.forwarded}), so "
-            "anybody may have sent it, and it needs a key."
+            "anyone may have sent it, and a key is required."
         )
     return (
         f"{reason} Send the header Authorization: Bearer KEY; create one with `sceneprint keys "

@@ -353,7 +353,8 @@ class FormUpload:
 
 
 _NO_BODY = (
-    "The body is empty. Send the file itself, with curl by --data-binary @FILE or -F frame=@FILE."
+    "The body is empty. Send the file itself, for example with curl and --data-binary @FILE or "
+    "-F frame=@FILE."
 )
 
 
@@ -403,7 +404,7 @@ async def read_upload(request: Request, *fields: str) -> AsyncIterator[FormUploa
         if not isinstance(frame, UploadFile) or len(form.getlist("frame")) != 1:
             raise InvalidRequest(
                 "The form has no file part `frame`, or more than one part of that name. Send the "
-                "depth image or point cloud in it, with a file name.",
+                "depth image or point cloud in one such part, with a file name.",
                 (("frame", "not one file"),),
             )
         texts = texts_of(form)
@@ -466,7 +467,7 @@ def priority_of(fields: Mapping[str, str]) -> int:
     if number is None or abs(number) > MOST_PRIORITY:
         raise InvalidRequest(
             f"The priority is {text!r:.40}. Send a whole number from {-MOST_PRIORITY} to "
-            f"{MOST_PRIORITY}, or leave it out for 0.",
+            f"{MOST_PRIORITY}, or omit it for the default of 0.",
             (("priority", "not a whole number in the allowed range"),),
         )
     return number
@@ -488,7 +489,8 @@ async def read_json(request: Request) -> Any:
         body += chunk
         if len(body) > FIELD_BYTES:
             raise TooLarge(
-                f"The JSON exceeds the limit of {FIELD_BYTES} bytes. Send only the fields in /docs."
+                f"The JSON exceeds the limit of {FIELD_BYTES} bytes. Send only the fields that "
+                "/docs lists."
             )
     if not body:
         raise MalformedBody("The body is empty. Send a JSON object.")
@@ -633,7 +635,8 @@ async def read_frames(
         files = [one.file for one in form.getlist("frame") if isinstance(one, UploadFile)]
         if not files or len(files) != len(form.getlist("frame")):
             raise InvalidRequest(
-                "The form has no file part `frame`, or one that is not a file. Send 1 to "
+                "The form has no file part `frame`, or a part of that name that is not a file. "
+                "Send 1 to "
                 f"{most} depth images or point clouds in parts of that name, each with "
                 "a file name.",
                 (("frame", "not all files"),),
@@ -660,20 +663,22 @@ def _metas(text: str | None, count: int) -> list[FrameMeta | InvalidRequest]:
     if text is None:
         raise InvalidRequest(
             "The form has no field `metas`. Send JSON in it: one object for all frames, or a "
-            "list with one for each.",
+            "list with one object for each frame.",
             (("metas", "missing"),),
         )
     try:
         metas = from_json(text)
     except ValueError as error:
-        raise MalformedBody("The field `metas` is not JSON. Send an object or a list.") from error
+        raise MalformedBody(
+            "The field `metas` is not JSON. Send one object, or a list of objects."
+        ) from error
     if isinstance(metas, dict):
         return [_batch_meta(metas)] * count
     if not isinstance(metas, list) or len(metas) != count:
         kind = f"a list of {len(metas)}" if isinstance(metas, list) else "neither object nor list"
         raise InvalidRequest(
             f"`metas` is {kind}, but there are {count} frames. Send one object for all, or a "
-            "list with one for each.",
+            "list with one object for each frame.",
             (("metas", "not one for each frame"),),
         )
     return [_batch_meta(one) for one in metas]

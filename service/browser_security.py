@@ -170,8 +170,8 @@ def origins_of(settings: Settings) -> Origins:
     if "*" in settings.cors_origins and not settings.asks_for_keys:
         raise InvalidRequest(
             f"SCENEPRINT_CORS_ORIGINS is * and the service listens on {settings.host}, where it "
-            "requires no key, so every web page that a browser on this machine opens would have "
-            "full access. List the origins, or set SCENEPRINT_REQUIRE_KEYS.",
+            "requires no key, so every web page that is opened in a browser on this machine would "
+            "have full access. List the origins, or set SCENEPRINT_REQUIRE_KEYS.",
             (("cors_origins", "all origins, but no key required"),),
         )
     return Origins(settings.cors_origins)

@@ -101,7 +101,9 @@ class LocalService(httpx.BaseTransport):
             exchange.close()
             raise
         if start is None:
-            raise httpx.RemoteProtocolError("this client was closed meanwhile", request=request)
+            raise httpx.RemoteProtocolError(
+                "this client was closed in the meantime", request=request
+            )
         return httpx.Response(start["status"], headers=start["headers"], stream=exchange)
 
     def work(self, pause_s: float) -> None:

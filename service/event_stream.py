@@ -186,7 +186,7 @@ class Feed:
         return found[0] if found else None
 
     def _is_behind(self) -> bool:
-        """Return whether the last known event is missing in the database or differs there."""
+        """Return whether the last known event is missing from the database or differs there."""
         if self._last is None:
             return False
         with self._database.read() as connection:

@@ -127,13 +127,15 @@ METRICS = {
         "gauge", "Age of the oldest waiting job of each kind.", ("kind",)
     ),
     "oldest_unsigned_seconds": MetricFamily(
-        "gauge", "Age of the oldest frame without a signature; 0 without such a frame."
+        "gauge", "Age of the oldest frame without a signature; 0 if there is no such frame."
     ),
     "index_version": MetricFamily(
         "gauge", "Newest index of each of the 20 maps with the longest tails.", ("map",)
     ),
     "index_tail_frames": MetricFamily(
-        "gauge", "Number of indexed frames that the newest index lacks, of the same maps.", ("map",)
+        "gauge",
+        "Number of indexed frames of the same maps that are not yet in the newest index.",
+        ("map",),
     ),
     "workers": MetricFamily(
         "gauge", "Number of `busy` and `idle` workers of this machine; with PostgreSQL, of all.",

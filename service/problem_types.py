@@ -71,7 +71,7 @@ PROBLEM_TYPES = {
         412, "Read the object again, and repeat the edit with the new ETag."
     ),
     "TooLarge": ProblemType(
-        413, "Send less (JSON: at most 256 KiB), or ask the operator to raise "
+        413, "Send a smaller body (JSON: at most 256 KiB), or ask the operator to raise "
         "`SCENEPRINT_MAX_UPLOAD_BYTES` or `SCENEPRINT_MAX_IMPORT_BYTES`."
     ),
     "UnsupportedType": ProblemType(
@@ -81,7 +81,7 @@ PROBLEM_TYPES = {
         416, "Request a range within the file.", "The file is shorter than `Range`."
     ),
     "Misdirected": ProblemType(
-        421, "Address the service as `localhost`, and let a proxy set `Host` to that."
+        421, "Address the service as `localhost`, and configure any proxy to set `Host` to that."
     ),
     "InvalidRequest": ProblemType(422, "Correct the fields that `errors` lists."),
     "IdempotencyConflict": ProblemType(422, "Use a new key for each different request."),
@@ -103,7 +103,7 @@ PROBLEM_TYPES = {
         "Retry later.",
     ),
     "StoreLocked": ProblemType(
-        503, "Retry later. The operator ends the process that holds the database.",
+        503, "Retry later. The operator must stop the process that has locked the database.",
         retry_after_s=1,
         detail="Another process has locked the service's store for too long, so nothing was "
         f"stored. Queries still work. {_LOG} Retry later.",

@@ -209,8 +209,8 @@ def send_product_file(
             return send_file(
                 request, lambda: blobs.open(file.blob), file.media_type, file.blob, name
             )
-    find()  # raises if the job has been deleted meanwhile
-    raise DamagedBlob(f"{file.name} of the job is damaged. Delete the job, and start it again.")
+    find()  # raises if the job has been deleted in the meantime
+    raise DamagedBlob(f"{file.name} of the job is damaged. Delete the job, and start another.")
 
 
 def _requested_range(request: Request, tag: str, size: int) -> tuple[int, int]:

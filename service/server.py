@@ -182,7 +182,7 @@ class Connection(H11Protocol):
         handle = self.transport.get_extra_info("socket")
         try:
             (kernel,) = struct.unpack("i", fcntl.ioctl(handle, termios.TIOCOUTQ, bytes(4)))
-        except (OSError, TypeError):  # closed meanwhile
+        except (OSError, TypeError):  # closed in the meantime
             kernel = 0
         return self.transport.get_write_buffer_size() + carried + int(kernel)
 
@@ -321,7 +321,7 @@ def raise_file_limit() -> None:
 log = logging.getLogger(__name__)
 
 #: Interval after which a computing thread releases the interpreter, seconds. The event loop waits
-#: for each of a dozen threads in turn and answers nothing meanwhile; a query releases the
+#: for each of a dozen threads in turn and answers nothing in the meantime; a query releases the
 #: interpreter a hundred times and waits each time to get it back.
 SWITCH_S = 0.0001
 #: Time for requests in progress after the signal to stop, seconds.
@@ -342,7 +342,7 @@ def listen(settings: Settings) -> socket.socket:
         listening.close()
         raise UnusableStore(
             f"{settings.host}:{settings.port} is not available ({error.strerror}). Choose "
-            "another --port, 0 for a free one, or stop the process that uses it."
+            "another --port (0 selects a free port), or stop the process that uses this port."
         ) from error
     return listening
 

@@ -98,7 +98,7 @@ def read_object(
         try:
             fields = json.loads(text)
         except (ValueError, RecursionError) as cause:
-            raise error(f"This is not JSON ({cause}). Write it such as {example}.") from cause
+            raise error(f"This is not JSON ({cause}). Write it like {example}.") from cause
         if not isinstance(fields, dict):
             raise error(f"This is not a JSON object. Write an object such as {example}.")
     return fields
@@ -192,7 +192,7 @@ def _dtype(
 ) -> np.dtype[Any]:
     if described == "|O":
         raise error(
-            "The NPY file holds pickled Python objects, which could run code. "
+            "The NPY file holds pickled Python objects, which can run code when they are loaded. "
             "Write a plain float32 array in metres."
         )
     # The type is compared, not parsed, since np.dtype accepts almost any text.
@@ -261,7 +261,7 @@ def read_point_cloud(data: bytes) -> SerializedCloud:
     """
     if not _is_encapsulated(data):
         raise UnreadableCloud(
-            "This is not a serialised PointCloud2: its first bytes are not those of CDR. Send the "
+            "This is not a serialised PointCloud2: it does not start with a CDR header. Send the "
             "output of rclpy.serialization.serialize_message."
         )
     reader = _Reader(data)
@@ -301,7 +301,7 @@ def _read_fields(reader: _Reader) -> tuple[SerializedField, ...]:
     count = reader.word()
     if count > _MOST_FIELDS:
         raise UnreadableCloud(
-            f"The PointCloud2 announces {count} fields, and the limit is {_MOST_FIELDS}. "
+            f"The PointCloud2 declares {count} fields; the limit is {_MOST_FIELDS}. "
             "Serialise it again with fewer fields."
         )
     return tuple(
@@ -327,7 +327,7 @@ class _Reader:
         """Return the next bytes."""
         if count > self.left:
             raise UnreadableCloud(
-                f"The PointCloud2 is truncated: {count} bytes are due at byte {self._at}, but "
+                f"The PointCloud2 is truncated: {count} bytes are expected at byte {self._at}, but "
                 f"only {self.left} follow. Serialise it again."
             )
         self._at += count
@@ -348,7 +348,7 @@ class _Reader:
         length = self.word()
         if length > _LONGEST_NAME + 1:
             raise UnreadableCloud(
-                f"A name in the PointCloud2 has {length} bytes, and the limit is {_LONGEST_NAME}. "
+                f"A name in the PointCloud2 has {length} bytes; the limit is {_LONGEST_NAME}. "
                 "Serialise it again."
             )
         return bytes(self.bytes(length)).rstrip(b"\0").decode("utf-8", "replace")

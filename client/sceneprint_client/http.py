@@ -198,7 +198,7 @@ def check_options(how: QueryOptions) -> None:
     if unknown:
         raise TypeError(
             f"a query has no option {', '.join(sorted(unknown))}; its options are "
-            f"{', '.join(sorted(QueryOptions.__annotations__))}, and the camera is `meta`"
+            f"{', '.join(sorted(QueryOptions.__annotations__))}, and the camera is passed as `meta`"
         )
 
 
@@ -338,8 +338,9 @@ class ServiceConnection:
             ) from error
         except ImportError as error:  # socksio is missing
             raise errors.MissingDependency(
-                "ALL_PROXY, HTTP_PROXY or HTTPS_PROXY names a SOCKS proxy, which needs a package: "
-                "pip install 'httpx[socks]'. Or exclude this service from it with NO_PROXY."
+                "ALL_PROXY, HTTP_PROXY or HTTPS_PROXY names a SOCKS proxy, which requires another "
+                "package. Run: pip install 'httpx[socks]'. Or exclude this service from the proxy "
+                "with NO_PROXY."
             ) from error
         self._log_filter = RequestLogFilter(self._url)
         logging.getLogger("httpx").addFilter(self._log_filter)
@@ -522,8 +523,8 @@ def unreachable(url: str, error: Exception | None) -> errors.Unreachable:
         )
     if "CERTIFICATE_VERIFY_FAILED" in str(error):
         return errors.Unreachable(
-            f"{url} shows a certificate that is not trusted here ({error}). Check the address; if "
-            "it is right, set SSL_CERT_FILE to the PEM file of the authority that issued it."
+            f"{url} presents a certificate that is not trusted here ({error}). Check the address; "
+            "if it is right, set SSL_CERT_FILE to the PEM file of the authority that issued it."
         )
     return errors.Unreachable(
         f"{url} cannot be reached ({error}). Check the address and that the service runs; "
@@ -554,7 +555,7 @@ def read_record(kind: type[Record], response: httpx.Response) -> Record:
         return kind.model_validate_json(response.content)
     except ValidationError as error:
         raise errors.Refused(
-            f"The answer of {response.request.url} is not one of this version of sceneprint. "
+            f"The answer of {response.request.url} is not valid for this version of sceneprint. "
             "Check the address, and the service's version with `sceneprint doctor`.",
             response.status_code,
             {},
@@ -575,7 +576,7 @@ def _error_of(response: httpx.Response) -> errors.SceneprintError:
         if response.status_code in _OF_PROXY:
             return errors.Unreachable(
                 f"{response.request.url} answered {response.status_code} {response.reason_phrase}: "
-                "a proxy in front of the service reaches no ready process. Try again later."
+                "a proxy in front of the service cannot reach a ready process. Try again later."
             )
         return errors.Refused(
             f"{response.request.url} answered {response.status_code} {response.reason_phrase} "

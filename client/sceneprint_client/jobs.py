@@ -376,7 +376,7 @@ class JobMethods(ServiceConnection):
         known = get_args(GraphFormat)
         if kind not in known:
             raise InvalidRequest(
-                f"A graph has no format {kind!r:.80}. Pass one of {', '.join(known)}.",
+                f"A graph cannot have the format {kind!r:.80}. Pass one of {', '.join(known)}.",
                 (("format", f"pass one of {', '.join(known)}"),),
             )
         _check_overlap(min_overlap)

@@ -175,8 +175,7 @@ class Accelerations:
             return
         if len(self._stamps_ns) >= _MOST_SAMPLES:
             raise DatasetError(
-                f"The recording has more than {_MOST_SAMPLES} measurements of one IMU. Cut it "
-                "into parts."
+                f"The recording has more than {_MOST_SAMPLES} measurements of one IMU. Split it."
             )
         self._stamps_ns.append(stamp_ns)
         self._rows.extend(row)
@@ -242,11 +241,13 @@ def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         raise InvalidPose(f"The pose has shape {pose.shape}. Pass 4 x 4 numbers.")
     if not np.isfinite(pose).all():
         raise InvalidPose(
-            "The pose is not finite, as after a loss of tracking. Omit the frame or its pose."
+            "The pose has values that are not finite, as after a loss of tracking. Omit the frame "
+            "or its pose."
         )
     if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
         raise InvalidPose(
-            "The last row of the pose is not 0 0 0 1. Pass sensor to parent, row by row."
+            "The last row of the pose is not 0 0 0 1. Pass the transform from sensor to parent, "
+            "row by row."
         )
     rotation = pose[:3, :3]
     # Large entries are excluded first, since their product would overflow.

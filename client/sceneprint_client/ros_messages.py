@@ -77,8 +77,8 @@ def depth_samples(message: Any) -> NDArray[Any]:
     kind = ENCODINGS.get(message.encoding)
     if kind is None:
         raise UnreadableFrame(
-            f"The image has the encoding {message.encoding!r:.40}, and depth is 16UC1, mono16 or "
-            "32FC1. Specify the topic of the depth images."
+            f"The image has the encoding {message.encoding!r:.40}, but depth must be 16UC1, mono16 "
+            "or 32FC1. Specify the topic of the depth images."
         )
     samples = _samples(message, np.dtype((">" if message.is_bigendian else "<") + kind))
     return samples.astype("<" + kind)
@@ -90,13 +90,13 @@ def _samples(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
     row = width * kind.itemsize
     if not 0 < width * height <= MAXIMUM_SAMPLES or step < row:
         raise UnreadableFrame(
-            f"The image announces {width} x {height} samples in rows of {step} bytes; the limit is "
+            f"The image declares {width} x {height} samples in rows of {step} bytes; the limit is "
             f"{MAXIMUM_SAMPLES} samples. Record it again."
         )
     data = np.frombuffer(memoryview(message.data), np.uint8)
     if len(data) < step * height:
         raise UnreadableFrame(
-            f"The image has {len(data)} bytes, but announces {height} rows of {step} bytes. "
+            f"The image has {len(data)} bytes, but declares {height} rows of {step} bytes. "
             "Record it again."
         )
     rows = data[: step * height].reshape(height, step)[:, :row]
@@ -149,8 +149,8 @@ def compressed_depth(message: Any) -> CompressedDepth:
     is_rvl = "rvl" in str(message.format).partition("compressedDepth")[2].lower()
     if encoding is None or (at < 0 and not is_rvl):
         raise UnreadableFrame(
-            f"The image has the format {message.format!r:.60}; the supported compressed depth is "
-            "PNG and RVL of 16UC1 and 32FC1. Record the raw topic, or set the transport's format "
+            f"The image has the format {message.format!r:.60}; compressed depth must be PNG or "
+            "RVL of 16UC1 or 32FC1. Record the raw topic, or set the transport's format "
             "to png."
         )
     samples = rvl_samples(data[TRANSPORT_BYTES:]) if is_rvl else None
@@ -290,12 +290,12 @@ def _distortion(info: Any) -> tuple[float, ...]:
         if not any(d[5:]):
             return tuple(d[:5])
         raise InvalidIntrinsics(
-            "The camera info has the lens model rational_polynomial with k4, k5 or k6; supported "
-            "are only k1, k2, p1, p2 and k3. Record the rectified images."
+            "The camera info has the lens model rational_polynomial with k4, k5 or k6; only k1, "
+            "k2, p1, p2 and k3 are supported. Record the rectified images."
         )
     raise InvalidIntrinsics(
-        f"The camera info has the lens model {model!r:.40} with {len(d)} coefficients; supported "
-        "is plumb_bob. Record the rectified images."
+        f"The camera info has the lens model {model!r:.40} with {len(d)} coefficients; only "
+        "plumb_bob is supported. Record the rectified images."
     )
 
 
@@ -345,14 +345,14 @@ def cloud_table(message: Any) -> NDArray[np.void]:
     data = memoryview(message.data).cast("B")
     if width * height > MOST_POINTS:
         raise UnreadableCloud(
-            f"The cloud announces {width} x {height} points; the limit is {MOST_POINTS}. "
+            f"The cloud declares {width} x {height} points; the limit is {MOST_POINTS}. "
             "Downsample it."
         )
     if height == 1 or row == 0:  # some drivers do not set row_step
         row = width * step
     if step < 1 or row < width * step or len(data) < row * height:
         raise UnreadableCloud(
-            f"The cloud has {len(data)} bytes, but announces {height} rows of {width} points of "
+            f"The cloud has {len(data)} bytes, but declares {height} rows of {width} points of "
             f"{step} bytes. Record it again."
         )
     if not width * height:

@@ -65,8 +65,8 @@ class Camera:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
             raise InvalidIntrinsics(
-                f"The depth scale {self.depth_scale} is not a positive number. "
-                "Specify the stored units per metre, 1000 for millimetres."
+                f"The depth scale {self.depth_scale} is not a positive number. Specify the stored "
+                "units per metre, such as 1000 for millimetres."
             )
         if self.up is not None and not is_unit(self.up):
             raise InvalidIntrinsics(_NO_UP.format(self.up))
@@ -232,7 +232,7 @@ def row_of(text: str) -> tuple[str, ...]:
     if any(names.count(axis) != 1 for axis in "xyz") or len(names) > _LONGEST_ROW:
         raise DatasetError(
             f"The row {text!r:.80} must name x, y and z once each, and at most {_LONGEST_ROW} "
-            "values. Write it such as x,y,z,i,ring."
+            "values. Write it like x,y,z,i,ring."
         )
     return names
 
@@ -274,7 +274,8 @@ def _read_source(path: Path) -> CloudSource:
         row = fields.get("row")
         if row is not None and file_format not in (None, "kitti"):
             raise DatasetError(
-                f"row is valid only for .bin files, but format is {file_format}. Remove either."
+                f"row is valid only for .bin files, but format is {file_format}. Remove one of the "
+                "two."
             )
         return CloudSource(
             file_format, _viewpoint(fields), units, _cloud_up(fields.get("up")),
@@ -300,7 +301,7 @@ def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
         return None
     if not isinstance(value, dict) or set(value) != {"x", "y", "z"}:
         raise DatasetError(
-            f"viewpoint is {value!r:.60}. Write it such as {_CLOUDS_EXAMPLE}, or null for points "
+            f"viewpoint is {value!r:.60}. Write it like {_CLOUDS_EXAMPLE}, or null for points "
             "without a common viewpoint."
         )
     return (

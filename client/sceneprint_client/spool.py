@@ -117,7 +117,7 @@ CREATE TRIGGER reason_retried AFTER UPDATE OF reason ON frames WHEN NEW.reason I
 END;
 """
 #: Reason of a rejected frame whose reason could not be stored.
-_NO_REASON = "The service refused it; the disk had no room for its reason"
+_NO_REASON = "The service refused the frame; the disk had no room to store the reason"
 
 
 @dataclass(frozen=True)
@@ -302,7 +302,7 @@ class Spool:
             if size > most:
                 raise errors.InvalidRequest(
                     f"The frame takes {size} bytes, which exceeds the limit of {most} bytes of the "
-                    f"spool {self._path}. Increase `most_bytes`, or make frames smaller.",
+                    f"spool {self._path}. Increase `most_bytes`, or send smaller frames.",
                     (("frame", "larger than the spool"),),
                 )
             if database.execute("SELECT 1 FROM frames WHERE digest = ?", (digest,)).fetchone():

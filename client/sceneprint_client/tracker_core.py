@@ -325,8 +325,9 @@ class TrackerCore:
             known = self._marks[max(at, 0)]
             if known.stamp != stamp or not np.allclose(known.T_odom_sensor, T, atol=1e-6):
                 raise InvalidRequest(
-                    f"The stamp {stamp} is not after {self._marks[-1].stamp}, that of the last "
-                    "odometry. Pass increasing stamps; after a jump of the clock reset it.",
+                    f"The stamp {stamp} is not after {self._marks[-1].stamp}, the stamp of the "
+                    "last odometry. Pass increasing stamps; after a jump of the clock, reset the "
+                    "tracker.",
                     (("stamp", "not after the last"),),
                 )
             return known

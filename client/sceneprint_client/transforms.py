@@ -129,7 +129,7 @@ class TransformTree:
         self._count += 1
         if self._count > MOST_SAMPLES:
             raise DatasetError(
-                f"There are more than {MOST_SAMPLES} transforms. Cut the recording into parts."
+                f"There are more than {MOST_SAMPLES} transforms. Split the recording."
             )
         row[3:] /= length
         edges = self._edges.setdefault(child, {})

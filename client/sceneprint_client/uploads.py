@@ -158,7 +158,7 @@ class UploadMethods(ServiceConnection):
         """Send a frame; the service does not wait if the map already has it."""
         sent = frame_form(*frame_bytes(frame, meta, with_pose=True, up=up))
         sent["data"] |= fields
-        # A service in this process has no other worker that could sign the frame meanwhile.
+        # A service in this process has no other worker that could sign the frame in the meantime.
         wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)
         response = self._send(
             method, path, headers={"Prefer": f"wait={wait}"} if wait else {},

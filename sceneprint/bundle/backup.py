@@ -103,7 +103,7 @@ class Bundle:
 def take_backup(
     settings: Settings, place: str, progress: Progress | None = None, *, keep: int | None = None
 ) -> Bundle:
-    """Write a bundle of a store; service and workers may run meanwhile.
+    """Write a bundle of a store; service and workers may run in the meantime.
 
     The bundle holds everything that was acknowledged before the call, and possibly later changes. A
     missing or damaged blob does not prevent the backup of the other blobs, and is reported.
@@ -140,7 +140,7 @@ def _open(url: str) -> Iterator[Database]:
     database = reach_database(url)
     with closing(database):
         if database.is_sqlite and database.file is None:
-            raise BundleError("A database in memory cannot be backed up. Use one in a file.")
+            raise BundleError("An in-memory database cannot be backed up. Use a database file.")
         if not database_exists(url):
             shown = database.file or database.shown
             raise UnusableStore(f"{shown}: the database does not exist. Pass --data FOLDER.")

@@ -131,16 +131,18 @@ class BundlePlace:
         UnusableStore : If the URL is not that of an object store.
         """
         if "://" in place:
-            return cls(open_objects(place, "the place of the bundles"), None)
+            return cls(open_objects(place, "the location of the bundles"), None)
         folder = Path(os.path.realpath(place))
         if not create and not folder.is_dir():
-            raise BundleError(f"{place}: the folder does not exist. Pass the place of the bundles.")
+            raise BundleError(
+                f"{place}: the folder does not exist. Pass the location of the bundles."
+            )
         if folder.exists() and not folder.is_dir():
-            raise BundleError(f"{place} is not a folder. Pass another place for the bundles.")
+            raise BundleError(f"{place} is not a folder. Pass another location for the bundles.")
         if create:
             make_folder(folder)
         url = f"file://{quote(str(folder))}"
-        return cls(open_objects(url, "the place of the bundles"), folder)
+        return cls(open_objects(url, "the location of the bundles"), folder)
 
     def claim(self, owner: str) -> None:
         """Mark the place as that of a store.
@@ -158,12 +160,12 @@ class BundlePlace:
                 self._objects.delete(_MARK)
                 raise BundleError(
                     f"{self.shown} holds {other}, which is not part of a bundle. Pass an empty "
-                    "place."
+                    "location."
                 )
         elif self._objects.get(_MARK) != data:
             raise BundleError(
-                f"{self.shown} holds the bundles of another store. Use a separate place for each "
-                f"store. If the other store no longer exists, remove {_MARK} there."
+                f"{self.shown} holds the bundles of another store. Use a separate location for "
+                f"each store. If the other store no longer exists, remove {_MARK} there."
             )
         if self._folder is not None:
             for name in (_BUNDLES, _PARTS):  # private, since frames show rooms
@@ -261,7 +263,7 @@ class BundlePlace:
         """Return the error for a damaged or missing part."""
         return DamagedBundle(
             f"{self.shown}: the part {_key(digest)} {what}. Restore another bundle, or remove this "
-            "part and take a snapshot: it is written again if the store still has its content."
+            "part and take a snapshot, which writes it again if the store still has its content."
         )
 
     def prune(self, needed: Collection[str], keep: int) -> int:
@@ -309,15 +311,15 @@ def _decode(data: bytes, place: str) -> BundleManifest:
     try:
         record = unseal(data)
         if record.get("format") != "sceneprint-bundle":
-            raise ValueError("it has another format")
+            raise ValueError("it has a different format")
         if record.get("version") != 1:
             raise BundleError(
-                f"{place}: version {record.get('version')!r:.20} of a bundle, but this sceneprint "
-                "reads version 1. Restore it with the sceneprint that wrote it."
+                f"{place}: the bundle has version {record.get('version')!r:.20}, but this version "
+                "of sceneprint reads version 1. Restore the bundle with the version that wrote it."
             )
         return BundleManifest.model_validate_json(json.dumps(record))
     except (ValueError, RecursionError) as error:
         raise DamagedBundle(
             f"{place}: the manifest of the bundle is damaged ({str(error).partition(chr(10))[0]}). "
-            "Restore another bundle, or use another copy of this place."
+            "Restore another bundle, or use another copy of this location."
         ) from error

@@ -207,8 +207,9 @@ def check_empty(connection: Connection) -> None:
             continue
         if connection.exec_driver_sql(f"SELECT 1 FROM {name} LIMIT 1").first() is not None:
             raise BundleError(
-                f"The database has rows in its table {name}, and nothing is overwritten. "
-                "Create an empty one (CREATE DATABASE), and set SCENEPRINT_DATABASE_URL to it."
+                f"The database has rows in its table {name}, and a restore does not "
+                "overwrite them. Create an empty database (CREATE DATABASE), and set "
+                "SCENEPRINT_DATABASE_URL to it."
             )
 
 
@@ -274,7 +275,9 @@ def restore_to_folder(
     make_folder(work)
     with folder_turn(work) as mine:
         if not mine:
-            raise BundleError(f"{folder}: another process is restoring to it. Wait for it to end.")
+            raise BundleError(
+                f"{folder}: another process is restoring to this folder. Wait until it ends."
+            )
         if (folder / _BLOBS).exists():  # a restore was killed inside `_publish`
             (folder / _BLOBS).rename(work / _BLOBS)
         for half in work.glob(f"{_BLOBS}/*/.*"):  # unfinished files of a killed restore
@@ -302,8 +305,8 @@ def _check_folder(folder: Path) -> None:
     if names:
         more = "" if len(names) <= 3 else f" and {len(names) - 3} more"
         raise BundleError(
-            f"{folder} holds {', '.join(names[:3])}{more}, and nothing is overwritten. Pass "
-            "another folder with --data, or move its files away."
+            f"{folder} holds {', '.join(names[:3])}{more}, and a restore does not overwrite "
+            "files. Pass another folder with --data, or move the files away."
         )
 
 
@@ -335,8 +338,8 @@ def _publish(work: Path, folder: Path) -> None:
         shutil.rmtree(work)
     except OSError as error:
         raise BundleError(
-            f"{folder}: the restored files cannot be moved there ({error.strerror}). Nothing was "
-            "overwritten. Check the files in the folder and its permissions."
+            f"{folder}: the restored files cannot be moved into this folder ({error.strerror}). "
+            "Nothing was overwritten. Check the files in the folder and its permissions."
         ) from error
 
 
@@ -413,8 +416,8 @@ def _check_unused(database: Database) -> None:
     while others := _connections_of(database):
         if time.monotonic() >= end:
             raise BundleError(
-                f"{database.shown} is in use: {others} connections of sceneprint. Stop its "
-                "services and workers, and run the command again."
+                f"{database.shown} is in use by {others} connections of sceneprint. Stop "
+                "the services and workers, and run the command again."
             )
         time.sleep(0.1)
 

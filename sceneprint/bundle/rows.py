@@ -221,11 +221,11 @@ def read_rows(data: bytes, columns: Sequence[str]) -> Iterator[Row]:
             raise ValueError("it is too long or truncated")
         head, *lines = text.split(b"\n")
         if json.loads(head) != list(columns):
-            raise ValueError("it has other columns")
+            raise ValueError("its columns differ")
         for line in lines:
             row = json.loads(line)
             if not isinstance(row, list) or len(row) != len(columns):
-                raise ValueError("a row has another number of columns")
+                raise ValueError("a row has a different number of columns")
             yield row
     except (zlib.error, ValueError, RecursionError) as error:
         raise DamagedBundle(
@@ -246,7 +246,7 @@ def decoded_rows(columns: Sequence[Column[Any]], rows: Iterable[Row]) -> Iterato
             yield [None if x is None else f(x) for f, x in zip(decoders, row, strict=True)]
         except (TypeError, ValueError, binascii.Error) as error:
             raise DamagedBundle(
-                f"A row of table {columns[0].table.name} in the bundle does not fit its schema "
+                f"A row of table {columns[0].table.name} in the bundle does not fit the schema "
                 f"({error}). Nothing was restored."
             ) from error
 

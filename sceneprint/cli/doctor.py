@@ -86,11 +86,13 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
 
     path = _path_of(url)
     if path is None:
-        return _wrong("is an in-memory database, which processes cannot share. Name a file.")
+        return _wrong("is an in-memory database, which processes cannot share. Specify a file.")
     if not path.exists():
         # Only the data folder is created automatically.
         if settings.database_url is not None and not path.parent.is_dir():
-            return _wrong(f"the folder of {path} does not exist. Create it, or name another file.")
+            return _wrong(
+                f"the folder of {path} does not exist. Create it, or specify another file."
+            )
         return Check("ok", "database", f"none yet; the first use creates {path}")
     wal, shm = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
     if wal.exists() and not shm.exists():  # reading it would create the shm file
@@ -242,12 +244,14 @@ def _durability(values: Mapping[str, object]) -> Check:
             "Turn it on."
         )
         return Check("WRONG", "durability", text)
-    text = "commits survive the loss of power"
+    text = "commits survive a power failure"
     if values["standbys"] and values["synchronous_commit"] == "local":
         text += "; synchronous_commit is local, so commits do not wait for a standby. Turn it on."
         return Check("note", "durability", text)
     if values["standbys"]:
-        text += f", and loss of the host: commits wait for a standby ({values['standbys']})"
+        text += (
+            f", and the loss of the host, because commits wait for a standby ({values['standbys']})"
+        )
     else:
         text += "; commits do not wait for a standby, so the last ones are lost if the disk fails"
     if values["checksums"] == "off":

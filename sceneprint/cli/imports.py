@@ -206,7 +206,7 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
         if item.status == 200:  # the frame may have been signed long ago
             try:
                 state = client.frame(map_name, item.frame_id).state
-            except UnknownFrame:  # it was deleted meanwhile
+            except UnknownFrame:  # it was deleted in the meantime
                 continue
         added = Added(frame_id=item.frame_id, job_id=item.job_id, state=state, reason=None)
         tally.count(item.name, added, item.status == 202)

@@ -150,7 +150,8 @@ def prior_of(text: str) -> dict[str, Any]:
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else "it is not text"
             raise argparse.ArgumentTypeError(
-                f"{text}: cannot be read ({why}). Pass JSON or a file, such as {_A_PRIOR}"
+                f"{text}: cannot be read ({why}). Pass the path of a JSON file, or JSON such as "
+                f"{_A_PRIOR}"
             ) from error
     try:
         prior = json.loads(document)

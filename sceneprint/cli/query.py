@@ -112,7 +112,7 @@ def run_query(options: argparse.Namespace) -> int:
     if options.overlay is not None:  # checked before the first query
         if len(references) != 1:
             raise DatasetError(
-                f"{options.path}: has {len(references)} frames, but --overlay writes a single "
+                f"{options.path} has {len(references)} frames, but --overlay writes a single "
                 "file. Select a frame with --frame."
             )
         check_writable(options.overlay)
@@ -220,7 +220,7 @@ def _wanted_frames(
         if int(wanted) < len(references):
             return [references[int(wanted)]]
         raise DatasetError(
-            f"{path}: has {len(references)} frames. Set --frame to an index from 0 to "
+            f"{path} has {len(references)} frames. Set --frame to an index from 0 to "
             f"{len(references) - 1}."
         )
     named = [

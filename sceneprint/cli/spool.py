@@ -58,7 +58,9 @@ def run_spool(options: argparse.Namespace) -> int:
     run the command again.
     """
     if options.paths and options.to is not None:
-        raise InvalidRequest("Either add frames to a spool or upload it: omit --to or PATH.")
+        raise InvalidRequest(
+            "Frames cannot be added to a spool and uploaded in one command. Omit --to or PATH."
+        )
     if options.retry_refused and options.to is None:
         raise InvalidRequest("--retry-refused requires --to. Specify the map to upload to.")
     if options.paths:

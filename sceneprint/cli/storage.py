@@ -350,9 +350,9 @@ def run_restore(options: argparse.Namespace) -> int:
         else:
             if settings.blob_url is not None:
                 raise InvalidRequest(
-                    "SCENEPRINT_BLOB_URL is set, but this restores blobs to the data folder, where "
-                    "a service would not find them. Unset the variable, or restore into a fleet "
-                    "with --database."
+                    "SCENEPRINT_BLOB_URL is set, but this command restores blobs to the data "
+                    "folder, where a service would not find them. Unset the variable, or restore "
+                    "into a fleet with --database."
                 )
             bundle = restoration.restore_to_folder(
                 place, settings.data_dir, name, progress, keep_keys=keep
@@ -363,8 +363,9 @@ def run_restore(options: argparse.Namespace) -> int:
           f"in {seconds:.1f} s")  # fmt: skip
     if keys:
         print(
-            f"Keys that work again: {_key_list(keys)}. A key that was revoked after the bundle "
-            "was taken is among them: revoke it again with `sceneprint keys --revoke NAME`."
+            f"Keys that work again: {_key_list(keys)}. They include any key that was revoked "
+            "after the bundle was taken. Revoke such a key again with `sceneprint keys --revoke "
+            "NAME`."
             if keep
             else f"Revoked keys: {_key_list(keys)}. Create others with `sceneprint keys --create`."
         )
@@ -379,7 +380,9 @@ def _keep_keys(choice: str | None, keys: list[str]) -> bool:
     """Return whether restored keys stay valid: as chosen, or as answered in a terminal."""
     if choice is not None or not keys or not sys.stdin.isatty():
         return choice != "revoke"
-    print(f"The bundle has keys: {_key_list(keys)}. Keys that were revoked since work again too.")
+    print(
+        f"The bundle has keys: {_key_list(keys)}. Keys that were revoked since then work again too."
+    )
     return input("Keep these keys? [y/N] ").strip().lower() in ("y", "yes")
 
 
@@ -407,8 +410,9 @@ def _server(settings: Settings) -> str:
     database.close()
     if database.is_sqlite:
         raise InvalidRequest(
-            "SCENEPRINT_DATABASE_URL is set to SQLite, but this restores to the data folder, where "
-            "a service would not find the bundle. Unset the variable, also for the service."
+            "SCENEPRINT_DATABASE_URL is set to SQLite, but this command restores to the data "
+            "folder, where a service would not find the bundle. Unset the variable for this "
+            "command and for the service."
         )
     return one_line(database.shown)
 

@@ -420,8 +420,8 @@ def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSe
             known = places.setdefault(sequence.parent_frame, place)
             if known != place and options.parent_frame is None:
                 raise DatasetError(
-                    f"{path}: the parent frame {sequence.parent_frame} is also that of {known}, "
-                    "and poses of the two would be mixed. Upload a folder above both, rename one, "
+                    f"{path}: {known} also has the parent frame {sequence.parent_frame}, so the "
+                    "poses of both would be mixed. Upload a folder above both, rename one, "
                     "or, if their poses share one parent frame, specify it with --parent-frame."
                 )
             sequences.append(sequence)

@@ -62,7 +62,7 @@ def read_surface_confined(
 
     Parameters
     ----------
-    file : descriptor or path of a regular file, which must not change meanwhile
+    file : descriptor or path of a regular file, which must not change in the meantime
     name : name of the file for errors; its suffix identifies formats without a signature
     options : units and up direction that the user states
     limits : limits for the process; default: 2 GiB and 10 minutes
@@ -87,7 +87,9 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
     status = os.fstat(file)
     with naming(name):
         if not stat.S_ISREG(status.st_mode):
-            raise UnreadableCloud("This is not a regular file. Specify a file with the map.")
+            raise UnreadableCloud(
+                "This is not a regular file. Specify the file that contains the map."
+            )
         form = surface_format(os.pread(file, HEAD, 0), name, status.st_size)
     request = {
         "task": "surface", "name": name, "up": options.up,

@@ -58,8 +58,8 @@ class Signers:
         """Wait for compiled kernels; raise Busy after `wait_s` seconds (default: KERNELS_S)."""
         if not self._compiled.wait(KERNELS_S if wait_s is None else wait_s):
             raise Busy(
-                "The service is waiting for its kernels, which the first start after an "
-                "installation compiles for about half a minute. Retry in a few seconds."
+                "The kernels of the service are being compiled. The first start after an "
+                "installation takes about half a minute. Retry in a few seconds."
             )
 
     def __call__(self, model_id: str) -> Signer:

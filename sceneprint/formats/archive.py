@@ -69,7 +69,7 @@ class ArchiveEntry:
     Parameters
     ----------
     name : name in the archive; never used as a path
-    size : announced size of the content, bytes
+    size : declared size of the content, bytes
     start : offset of the content in the archive, bytes
     packed : size of the content in the archive, bytes
     open : function that opens the content of a member of a zip; None for a tar
@@ -107,7 +107,7 @@ def parts_of(name: str) -> tuple[str, ...]:
         raise UnusableName("its name is absolute")
     parts = tuple(part for part in text.split("/") if part not in ("", "."))
     if ".." in parts:
-        raise UnusableName("its name leads outside the archive")
+        raise UnusableName("its name points outside the archive")
     if not parts or not all(map(_is_plain, parts)):
         raise UnusableName("its name is empty or has a character that is not printable")
     if len(parts) > DEEPEST:
@@ -148,7 +148,9 @@ class _HeaderFile:
         data = self._read(size if 0 <= size <= self.allowance else self.allowance + 1)
         self.allowance -= len(data)
         if self.allowance < 0:
-            raise UnreadableArchive("The headers of the archive are too long. Pack it again.")
+            raise UnreadableArchive(
+                "The headers of the archive are too long. Pack the archive again."
+            )
         if data.count(_DIRECTORY_ENTRY) > MOST_MEMBERS:
             raise _too_many()
         return data
@@ -285,7 +287,7 @@ def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
 
     Raises
     ------
-    UnreadableArchive : If the content is damaged, or its size differs from the announced size.
+    UnreadableArchive : If the content is damaged, or its size differs from the declared size.
     """
     if entry.open is None:
         file.seek(entry.start)
@@ -297,7 +299,7 @@ def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
         raise UnreadableArchive(f"it is damaged ({cause})") from cause
     if len(data) != entry.size:
         raise UnreadableArchive(
-            f"it is damaged (it has {len(data)} bytes, but announces {entry.size})"
+            f"it is damaged (it has {len(data)} bytes, but declares {entry.size})"
         )
     return data
 
@@ -406,7 +408,7 @@ class Inflater:
             if self.bytes_out > self._most or self.bytes_out > FREE + MOST_RATIO * self.bytes_in:
                 raise UnreadableArchive(
                     f"The content of the archive exceeds {self._most} bytes or {MOST_RATIO} times "
-                    "the size of the archive. Depth images do not compress so well. Send the "
+                    "the size of the archive. Depth images do not compress this well. Send the "
                     "archive in parts, or with less compression."
                 )
             if self._packing is not None and len(self._start) < BLOCK:
@@ -498,7 +500,7 @@ class Archive:
         return printable_name(self._members[reference.path].name)
 
     def size_of(self, reference: FrameReference) -> int:
-        """Return the announced size of a frame's member, bytes."""
+        """Return the declared size of a frame's member, bytes."""
         return self._members[reference.path].size
 
     def data_of(self, reference: FrameReference) -> bytes:
@@ -550,7 +552,7 @@ class Archive:
         if unpacked > FREE + MOST_RATIO * weight:
             raise UnreadableArchive(
                 f"The content of the archive has {unpacked} bytes, more than {MOST_RATIO} times "
-                "the size of the archive. Depth images do not compress so well. Pack them with "
+                "the size of the archive. Depth images do not compress this well. Pack them with "
                 "less compression."
             )
         left = _MAXIMUM_TEXTS

@@ -144,7 +144,7 @@ def _checked_header(content: memoryview) -> bytes:
         )
     if width < 1 or height < 1 or width * height > MAXIMUM_SAMPLES:
         raise UnreadableFrame(
-            f"The PNG announces {width} x {height} samples; it must have 1 to {MAXIMUM_SAMPLES}. "
+            f"The PNG declares {width} x {height} samples; it must have 1 to {MAXIMUM_SAMPLES}. "
             "Send the image at a lower resolution."
         )
     if compression or filtering or interlace > 1:
@@ -176,7 +176,7 @@ def _inflate(pixels: bytes, header: bytes) -> bytes:
         ) from cause
     if len(rows_bytes) != expected or not stream.eof:
         raise UnreadableFrame(
-            f"The PNG announces {width} x {height} samples, but contains "
+            f"The PNG declares {width} x {height} samples, but contains "
             f"{'fewer' if len(rows_bytes) <= expected else 'more'}. Copy or write it again."
         )
     return rows_bytes
@@ -295,7 +295,7 @@ def decode_npy(data: bytes) -> Samples:
     expected = height * width * header.dtype.itemsize
     if len(data) - header.start != expected:
         raise UnreadableFrame(
-            f"The NPY header announces {height} x {width} samples of {header.dtype.itemsize} "
+            f"The NPY header declares {height} x {width} samples of {header.dtype.itemsize} "
             f"bytes, but {len(data) - header.start} of {expected} bytes follow. Copy or write the "
             "file again."
         )
@@ -318,8 +318,8 @@ def _header(data: bytes) -> NpyHeader:
     height, width = header.shape
     if not 1 <= height * width <= MAXIMUM_SAMPLES:
         raise UnreadableFrame(
-            f"The NPY file must have 1 to {MAXIMUM_SAMPLES} samples, but announces none or more. "
-            "Send the image at a lower resolution."
+            f"The NPY file must have 1 to {MAXIMUM_SAMPLES} samples, but declares none, or too "
+            "many. Send the image at a lower resolution."
         )
     return header
 

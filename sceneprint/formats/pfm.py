@@ -30,7 +30,7 @@ def decode_pfm(data: bytes) -> Floats32:
     (width, height), scale, start = _header(data)
     if len(data) - start != 4 * width * height:
         raise UnreadableFrame(
-            f"The PFM header announces {width} x {height} samples of 4 bytes, but "
+            f"The PFM header declares {width} x {height} samples of 4 bytes, but "
             f"{len(data) - start} bytes follow. Copy or write the file again."
         )
     rows = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=start).reshape(height, width)

@@ -121,7 +121,7 @@ class Scrub:
             with self._store.database.read() as connection:
                 row = find_map(connection, finding.map)
                 frame = find_frame(connection, row, finding.frame_id)
-        except NotFound:  # the frame was deleted meanwhile
+        except NotFound:  # the frame was deleted in the meantime
             return
         if finding.kind.endswith("-upload"):
             with self._store.database.write() as connection:

@@ -93,7 +93,7 @@ class GeometryCache:
         geometry = read_geometry(self._blobs.get(digest))
         entry = _Entry(geometry, int(_OVERHEAD * _array_bytes(geometry)), time.monotonic())
         with self._lock:
-            self._remove(digest)  # another thread may have read the blob meanwhile
+            self._remove(digest)  # another thread may have read the blob in the meantime
             self._entries[digest] = entry
             self._bytes += entry.size
             while self._bytes > self._most_bytes:

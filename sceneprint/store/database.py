@@ -335,7 +335,7 @@ class Database:
         self._guarded = True
 
     def require_schema(self) -> None:
-        """Raise NewerSchema if a later version has migrated the store meanwhile."""
+        """Raise NewerSchema if a later version has migrated the store in the meantime."""
         if self._guarded:
             with self.read() as connection:
                 require_schema(connection)
@@ -550,7 +550,7 @@ class Database:
         pool = self._engine.pool
         self._engine.dispose()  # connections in use are left to the garbage collector
         event.listen(pool, "checkin", _close_connection)
-        pool.dispose()  # closes connections that were returned meanwhile
+        pool.dispose()  # closes connections that were returned in the meantime
         if self._line is not None:
             self._line.close()
 

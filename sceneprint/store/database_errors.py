@@ -168,7 +168,10 @@ _FAULTS: dict[str, tuple[type[UnusableStore], str]] = {
     "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
     "3D000": (UnusableStore, "Create the database, or set SCENEPRINT_DATABASE_URL to another one."),
     "URL": (UnusableStore, "Correct SCENEPRINT_DATABASE_URL."),
-    "plan": (StoreLocked, "The tables were changed meanwhile. Nothing was stored. Try again."),
+    "plan": (
+        StoreLocked,
+        "The tables were changed in the meantime. Nothing was stored. Try again.",
+    ),
     # the tables existed when this process started
     "42P01": (UnusableStore, "Tables are missing. Restore the database from a copy."),
     "42501": (UnusableStore, "The user does not own the tables. Make it their owner."),

@@ -287,7 +287,7 @@ class IdempotentRequest:
 
         Raises
         ------
-        Overtaken : If a transaction on another map has stored a result for the key meanwhile.
+        Overtaken : If a transaction on another map has stored a result for the key in the meantime.
         """
         values, own = self.columns(data), ("actor", "key")
         replaceable = or_(
@@ -309,7 +309,7 @@ class Overtaken(Exception):
     """Error for a transaction that must be repeated: another one stored the same row first."""
 
 
-#: Number of results that one transaction removes; other writers wait meanwhile.
+#: Number of results that one transaction removes; other writers wait in the meantime.
 _REMOVED_AT_ONCE = 5_000
 
 

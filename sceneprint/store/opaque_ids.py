@@ -131,7 +131,7 @@ class OpaqueIds:
             value = connection.execute(statement).scalar()
         if value is None:
             raise UnusableStore(
-                "The secret that encrypts the ids of events is missing in the database. Restore "
+                "The secret that encrypts the ids of events is missing from the database. Restore "
                 "the data folder from a copy."
             )
         return bytes(value)

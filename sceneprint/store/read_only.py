@@ -29,7 +29,7 @@ def inspect_database(url: str) -> Iterator[Database]:
     Raises
     ------
     UnusableStore : If there is no database, its schema is older, or a process wrote to an unlocked
-        file meanwhile, so that the data may be wrong.
+        file in the meantime, so that the data may be wrong.
     NewerSchema : If a later version of sceneprint wrote the database.
     """
     parsed = database_url(url)

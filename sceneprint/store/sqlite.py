@@ -60,8 +60,8 @@ class ReadOnlyFile:
         has_log, has_index = self._log(), self._beside("-shm").exists()
         if (has_log and not has_index) or self._beside("-journal").exists():
             raise UnusableStore(
-                f"{self._path} was not closed, and cannot be recovered on a read-only disk. Open "
-                "the data folder once from a writable disk, or use a copy."
+                f"{self._path} was not closed properly, and cannot be recovered on a read-only "
+                "disk. Open the data folder once from a writable disk, or use a copy."
             )
         how = "mode=ro" if has_log else "mode=ro&immutable=1"
         return sqlite3.connect(f"{self._path.as_uri()}?{how}", uri=True, check_same_thread=False)
@@ -77,7 +77,7 @@ class ReadOnlyFile:
         return status.st_mtime_ns, status.st_size, status.st_ino
 
     def check(self, before: object) -> None:
-        """Check at the end of a transaction that no process has written meanwhile.
+        """Check at the end of a transaction that no process has written in the meantime.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class ReadOnlyFile:
 BUSY_S, HELD_S = 10.0, 0.1
 #: Seconds between two attempts to take the lock, and maximum seconds in the line for it.
 LOOK_S, LINE_S = 0.0005, 1.0
-#: Seconds that emptying the log waits for readers; writers wait meanwhile.
+#: Seconds that emptying the log waits for readers; writers wait in the meantime.
 SHRINKING_S = 0.5
 
 

@@ -124,7 +124,7 @@ def test_manifests_that_lie(copy, place, refused):
 
     rewrite(copy, lambda one: None)
     assert verify_bundle(str(copy)) == verify_bundle(place)
-    lies(lambda one: one.update(version=3), "version 3 of a bundle", BundleError)
+    lies(lambda one: one.update(version=3), "the bundle has version 3", BundleError)
     lies(lambda one: one.update(schema_revision="9999"), "9999", NewerSchema)
     for other in ({"format": "other"}, {"more": 1}, {"maps": "1"}):
         lies(lambda one, other=other: one.update(other), "the manifest of the bundle is damaged")
@@ -152,9 +152,9 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
     replace_part(copy, "rows/frames", lambda lines: None)
     assert verify_bundle(str(copy)).manifest.blobs == 9
     blob = lines_of(copy, "rows/frames")[0].index("blob")
-    lies("rows/frames", lambda lines: lines[1].pop(), "another number of columns")
-    lies("rows/frames", lambda lines: lines[0].reverse(), "it has other columns")
-    lies("rows/frames", lambda lines: lines.insert(1, {}), "another number of columns")
+    lies("rows/frames", lambda lines: lines[1].pop(), "a different number of columns")
+    lies("rows/frames", lambda lines: lines[0].reverse(), "its columns differ")
+    lies("rows/frames", lambda lines: lines.insert(1, {}), "a different number of columns")
     for value in (5, ["x"], True):
         lies(
             "rows/frames", lambda lines, value=value: lines[1].__setitem__(blob, value),

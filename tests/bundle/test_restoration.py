@@ -184,7 +184,7 @@ def test_somebody_else_is_faster(place, tmp_path, name):
         restore_to_folder(place, folder, progress=come)
         assert names_in(folder) == ["blobs", "other", "sceneprint.db"]
     else:
-        with pytest.raises(BundleError, match="cannot be moved there"):
+        with pytest.raises(BundleError, match="cannot be moved into this folder"):
             restore_to_folder(place, folder, progress=come)
     assert (folder / name).read_bytes() == b"somebody else's"
 
@@ -227,7 +227,7 @@ def test_two_at_once(place, tmp_path):
             inner.append(error)
 
     restore_to_folder(place, tmp_path / "new", progress=come)
-    assert "another process is restoring to it" in str(inner[0])
+    assert "another process is restoring to this folder" in str(inner[0])
     assert names_in(tmp_path / "new") == ["blobs", "sceneprint.db"]
 
 
@@ -322,7 +322,7 @@ def test_a_server_that_is_used_stays(place, postgres, postgres_url, tmp_path):
     empty = postgres.create("in_use")
     with (
         Engine(fleet_of(tmp_path / "service", empty)),
-        pytest.raises(BundleError, match="is in use: "),
+        pytest.raises(BundleError, match="is in use by "),
     ):
         restore_to_server(place, fleet_of(tmp_path / "new", empty))
     (tmp_path / "embedded").mkdir()
@@ -382,7 +382,7 @@ def test_commands_with_a_server(place, postgres, tmp_path, sceneprint, monkeypat
     again = ("restore", place, "--data", data, "--database", url)
     shown = url.replace("+psycopg", "")
     assert f"is restored to {shown}: 1 maps" in sceneprint(*again).stdout
-    assert "nothing is overwritten" in sceneprint(*again, expect=2).stderr
+    assert "does not overwrite" in sceneprint(*again, expect=2).stderr
     monkeypatch.setenv("SCENEPRINT_DATABASE_URL", secret)
     out = tmp_path / "out"
     assert "1 maps, 5 frames" in sceneprint("snapshot", "--data", data, "--to", out).stdout

@@ -216,7 +216,7 @@ def test_a_prior_is_a_file_or_json(
     (tmp_path / "torn.json").write_text('{"pose": ')
     pose = {"translation": {"x": 0, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
     for wrong, text in (
-        (tmp_path / "none.json", "cannot be read (No such file or directory). Pass JSON or"),
+        (tmp_path / "none.json", "cannot be read (No such file or directory). Pass the path"),
         (tmp_path / "torn.json", "the prior is not JSON ("),
         (json.dumps({"pose": pose}), "parent_frame"),
         (json.dumps({**prior, "covariance": [1]}), "covariance: List should have at least 36"),

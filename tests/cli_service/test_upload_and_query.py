@@ -138,7 +138,7 @@ def test_what_is_lost_though_nobody_asked_ends_with_code_2(
     (folder / "groundtruth.txt").write_text("1.01 0 0 0 0 0 0 1\n")
     summary = sceneprint("upload", "day2", folder.parent).stdout.splitlines()[2]
     assert summary.startswith("poses of 1 of 3 frames; 2 without: ")
-    assert "; left out: both/ir (" in summary
+    assert "; skipped: both/ir (" in summary
     cloud = tmp_path / "points.ply"
     cloud.write_bytes(b"ply\n")
     done = sceneprint("upload", "day", cloud, "--depth-scale", "250", expect=2)
@@ -197,7 +197,7 @@ def test_upload_refuses_what_would_mix(
     other = tmp_path / "room-0"
     shutil.copytree(rooms / "room-0", other)
     done = sceneprint("upload", house, rooms / "room-0", other, expect=2)
-    assert "the parent frame room-0 is also that of" in done.stderr
+    assert "also has the parent frame room-0" in done.stderr
     assert "specify it with --parent-frame" in done.stderr
     assert done.stdout == ""
 

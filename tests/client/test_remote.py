@@ -150,7 +150,7 @@ def test_another_kind_of_server(scripted: Make) -> None:
     for reply, message in (
         ((404, {}, {"message": "nothing here"}), "answered 404 Not Found without a reason"),
         ((301, {"Location": "https://x/"}, None), "answered 301 Moved Permanently without"),
-        ((200, {}, {"hello": "world"}), "is not one of this version"),
+        ((200, {}, {"hello": "world"}), "is not valid for this version"),
     ):
         server = scripted([reply])
         with Client(server.url) as client, pytest.raises(errors.Refused, match=message):

@@ -346,7 +346,7 @@ def test_a_reason_without_room_is_told_to_be_missing(tmp_path: Path) -> None:
         spool._record_results([], {1: "a reason"})
         assert (spool.status().waiting, spool.status().refused) == (0, 1)
         assert [one.reason for one in spool.refusals()] == [
-            "The service refused it; the disk had no room for its reason"
+            "The service refused the frame; the disk had no room to store the reason"
         ]
 
 

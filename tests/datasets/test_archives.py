@@ -365,7 +365,7 @@ def test_bombs_are_refused_while_they_burst(
     twice = gzip.compress(gzip.compress(tar_of(("a.png", b"x"))))
     with pytest.raises(UnreadableArchive, match="is not a tar"):
         inflated(twice + bytes(512))
-    # a zip whose 900 entries are one member, of which each announces 1 MB
+    # a zip whose 900 entries are one member, of which each declares 1 MB
     body = zlib.compressobj(9, zlib.DEFLATED, -15)
     packed = body.compress(bytes(1 << 20)) + body.flush()
     local = struct.pack(

@@ -67,7 +67,7 @@ BAD_NPY = {
     "only the signature": (b"\x93NUMPY", "header of the NPY"),
     "unknown version": (b"\x93NUMPY\x09" + GOOD_NPY[7:], "header of the NPY"),
     "truncated": (GOOD_NPY[:-1], "47 of 48 bytes"),
-    "more than announced": (GOOD_NPY + b"\0", "49 of 48 bytes"),
+    "more than declared": (GOOD_NPY + b"\0", "49 of 48 bytes"),
     "header beyond the file": (GOOD_NPY[:8] + b"\x10\x27" + GOOD_NPY[10:], "a length of 10000"),
     "endless header": (
         b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 99_999, "a length of 4294967295",
@@ -81,7 +81,7 @@ BAD_NPY = {
     "pickled": (npy(np.array([[{}]], object), allow_pickle=True), "pickled"),
     "flat": (npy(np.ones(12, np.float32)), "two dimensions"),
     "colour": (npy(np.ones((3, 4, 3), np.float32)), "two dimensions"),
-    "announces none": (npy(np.ones((0, 4), np.float32)), "announces none"),
+    "declares none": (npy(np.ones((0, 4), np.float32)), "declares none"),
     "bomb": (
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999), }"),
         "1 to 8388608 samples",

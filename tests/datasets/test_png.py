@@ -121,8 +121,8 @@ BAD_PNG = {
     "bomb by its header": (raw_png(65_535, 65_535, b"\0" * 99), "65535 x 65535"),
     "just over the limit": (raw_png(4096, 4097, b"\0" * 99), "4096 x 4097"),
     "no size": (raw_png(0, 3, b""), "0 x 3"),
-    "fewer rows than announced": (raw_png(4, 4, rows_of(SAMPLES)), "contains fewer"),
-    "more rows than announced": (raw_png(4, 2, rows_of(SAMPLES)), "contains more"),
+    "fewer rows than declared": (raw_png(4, 4, rows_of(SAMPLES)), "contains fewer"),
+    "more rows than declared": (raw_png(4, 2, rows_of(SAMPLES)), "contains more"),
     "bomb in the data": (raw_png(4, 3, b"\0" * 30_000_000), "contains more"),
     "no data": (PNG_SIGNATURE + GOOD_PNG[8:33] + chunk(b"IEND"), "contains fewer"),
     "no zlib": (
@@ -158,7 +158,7 @@ def test_bad_png(case: str) -> None:
 def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
     monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100_000)
-    for case in ("fewer rows than announced", "truncated in the data", "bomb by its header"):
+    for case in ("fewer rows than declared", "truncated in the data", "bomb by its header"):
         with pytest.raises(UnreadableFrame):
             decode_png(BAD_PNG[case][0])
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1)  # a program's own, lower limit

@@ -54,10 +54,10 @@ def test_a_range_is_doubted_where_the_unit_is_wrong(near: float, median: float, 
 def test_a_summary_is_one_line() -> None:
     ranges = [of(0.6, 1.5, 4.0), of(0.7, 1.6, 4.2), of(0.8, 1.9, 9.0), of(1.0, 5.0, 30.0, None)]
     why = "no sample within 20 ms (nearest 1.2 s)"
-    summary = upload_summary(50, {why: 9}, ranges, ["left out: run/ir (infrared)"])
+    summary = upload_summary(50, {why: 9}, ranges, ["skipped: run/ir (infrared)"])
     assert summary.text == (
         "poses of 41 of 50 frames; 9 without: no sample within 20 ms (nearest 1.2 s); "
-        "left out: run/ir (infrared); depth 0.7 to 4.2 m (5th to 95th percentile), 88 % of pixels "
+        "skipped: run/ir (infrared); depth 0.7 to 4.2 m (5th to 95th percentile), 88 % of pixels "
         "valid; range 1 to 30 m (5th to 95th percentile), 100 points"
     )
     assert summary.model_dump()["text"] == summary.text

@@ -211,7 +211,7 @@ def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(
     assert chosen.run(task) == JobState.FAILED
     error = str(chosen.get_job(task.job.id).error)
     assert "0 of" in error
-    assert "the same file again to add the other views" in error
+    assert "the same file again to add the remaining views" in error
     chosen.imports.tidy()
     assert (used_bytes(chosen), list(chosen.store.blobs.digests())) == (0, [])
 

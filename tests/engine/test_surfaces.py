@@ -415,7 +415,9 @@ def test_a_spot_is_seen_by_the_frames_that_have_a_point_there(engine: Engine) ->
     )
     nowhere = engine.surfaces.sightings("hall", [1e6, 0.0, 0.0], None, parent.parent_frame)
     assert (nowhere.items, nowhere.next_cursor) == ([], None)
-    with pytest.raises(InvalidRequest, match=r"The radius is 4 m. Use one above 0 and up to 3.2"):
+    with pytest.raises(
+        InvalidRequest, match=r"The radius is 4 m. Use a radius above 0 and up to 3.2"
+    ):
         engine.surfaces.sightings("hall", spot, 4.0)
 
 

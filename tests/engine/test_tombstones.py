@@ -123,7 +123,7 @@ def test_a_restored_frame_is_as_it_was_and_found_at_once(
     assert told(full)[-2:] == ["frame.deleted", "frame.restored"]
     assert full.tombstones.list_all("hall", None, 9).items == []
     for name in (first, "none"):
-        with pytest.raises(UnknownFrame, match="was not deleted, or cannot be restored"):
+        with pytest.raises(UnknownFrame, match="was not deleted, or can no longer be restored"):
             full.tombstones.restore_one("hall", name)
 
 

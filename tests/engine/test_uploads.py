@@ -228,7 +228,7 @@ def test_a_deleted_frame_is_found_no_more_and_may_come_again(
     assert full.get_frame("hall", gone).state == FrameState.DELETED
     assert full.get_frame("hall", gone).content_id is None
     assert gone not in ids(full)
-    with pytest.raises(UnknownFrame, match="is already deleted"):
+    with pytest.raises(UnknownFrame, match="already deleted"):
         full.delete_frame("hall", gone)
     again, new = full.add_frame("hall", data, meta)
     assert new

@@ -223,7 +223,7 @@ def test_optimised_poses_replace_those_of_odometry(room: Any, tmp_path: Path) ->
     [sequence] = find_sequences(write(tmp_path / "a.db", "0.21.4", nodes, **optimised(right)))
     assert [one.name for one in sequence.frames] == ["a/000001", "a/000002"]
     assert all(error_of(room, one) < 1e-3 for one in sequence.frames)
-    assert "optimised poses; left out: 1 nodes without an optimised pose" in sequence.note
+    assert "optimised poses; skipped: 1 nodes without an optimised pose" in sequence.note
 
 
 def test_sessions_that_nothing_joins_have_frames_of_their_own(room: Any, tmp_path: Path) -> None:
@@ -306,7 +306,7 @@ def test_flat_scans_and_stereo_images_are_refused_with_the_remedy(
         {"pose": pose, "depth": b"\xff\xd8\xff" + bytes(40), "calibration": stereo},
     ]
     path = write(tmp_path / "a.db", "0.16.1", nodes)
-    message = "1 laser scans of two dimensions, 1 stereo images without depth.*rtabmap-export"
+    message = "1 two-dimensional laser scans, 1 stereo images without depth.*rtabmap-export"
     with pytest.raises(DatasetError, match=message):
         find_sequences(path)
 
@@ -417,5 +417,5 @@ def test_matrices_that_announce_too_much_are_refused(room: Any, tmp_path: Path) 
     [sequence] = find_sequences(
         write(tmp_path / "a.db", "0.10.6", [{"pose": transform(np.eye(4)), "scan": bomb}])
     )
-    with pytest.raises(UnreadableCloud, match="a matrix announces 12884901888 bytes"):
+    with pytest.raises(UnreadableCloud, match="a matrix declares 12884901888 bytes"):
         sequence.frames[0].read()

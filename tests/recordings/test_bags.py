@@ -212,7 +212,7 @@ def test_interpolation_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samp
     np.testing.assert_allclose(poses[2.015][:3, 3], (4.3, 0, 0.5), atol=1e-9)
     assert sequence.note == (
         "4 of 7 frames of /camera/depth/image_raw taken, poses of 4 of 7 frames in odom; 3 "
-        "without: no sample of odom -> base_link within 20 ms (nearest 0.03 s); left out: 3 "
+        "without: no sample of odom -> base_link within 20 ms (nearest 0.03 s); skipped: 3 "
         "without a pose"
     )
     assert sequence.lost == 3

@@ -148,7 +148,7 @@ def test_keyframes_are_uploaded_and_the_rest_is_counted(
     done = sceneprint("upload", "sparse", recording, "--keyframe-m", 100, "--keyframe-deg", 360)
     assert "1 frames: 1 received" in done.stdout
     assert f"1 of {FRAMES} frames" in done.stderr
-    assert f"left out: {FRAMES - 1} between keyframes" in done.stderr
+    assert f"skipped: {FRAMES - 1} between keyframes" in done.stderr
 
 
 def test_localize_and_sequences_of_a_bag(
@@ -255,8 +255,8 @@ def test_files_that_are_no_bags(sceneprint: Run, tmp_path: Path) -> None:
     done = sceneprint("bag", tmp_path / "a.mcap", expect=2)
     assert re.fullmatch(
         r"sceneprint bag: .*a\.mcap: The recording cannot be read \(File magic is invalid\.\)\. If "
-        r"the recorder was killed before it closed the file, run `mcap recover`; else copy it "
-        r"again\.\n",
+        r"the recorder was killed before it closed the file, run `mcap recover`; otherwise, copy "
+        r"it again\.\n",
         done.stderr,
     )
     done = sceneprint("bag", tmp_path / "gone.mcap", expect=2)

@@ -64,7 +64,7 @@ def test_a_clock_that_is_set_back_splits_a_recording(
     assert [one.name for one in found[1].frames] == ["run.part2/000004", "run.part2/000005"]
     assert found[0].note == (
         "10 of 13 frames of /camera/depth/image_raw taken, poses of 10 of 13 frames in odom; 3 "
-        "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); left out: 3 without "
+        "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); skipped: 3 without "
         "a pose; split into 3 parts, because stamps go back"
     )
 
@@ -142,7 +142,7 @@ def test_frames_within_a_jump_are_left_out(tmp_path: Path, ros: SimpleNamespace)
     middle = [[round((a + b) / 2, 6), 0, 0] for a, b in pairwise(x)]
     assert positions(found) == [*middle[:3], *middle[4:]]
     assert "1 without: samples of odom -> base_link contradict each other" in found.note
-    assert "left out: 1 without a pose" in found.note
+    assert "skipped: 1 without a pose" in found.note
 
 
 @pytest.mark.parametrize("length", [0.0, 0.5, 1.02, float("nan")])

@@ -221,8 +221,8 @@ def test_a_file_that_ends_early_is_refused(file: bytes, share: float) -> None:
     [
         (b'recordCount="3000"', b'recordCount="9000"', "they end before point 9000"),
         (b'recordCount="3000"', b'recordCount="3e+3"', "missing or damaged"),
-        (b'recordCount="3000"', b"recordCount='-300'", "at most 200000000"),
-        (b'fileOffset="48"', b'fileOffset="49"', "wrong offset of points"),
+        (b'recordCount="3000"', b"recordCount='-300'", "limit is 200000000"),
+        (b'fileOffset="48"', b'fileOffset="49"', "wrong offset for its points"),
         (b"<cartesianX", b"<cartesianW", "damaged"),  # and its end tag stays
         (b"<formatName ", b"<!DOCTYPE a ", "declares entities"),
         (b"<data3D ", b"<data4D ", "damaged"),

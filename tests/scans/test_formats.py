@@ -31,7 +31,7 @@ def test_forms(request: pytest.FixtureRequest, points: np.ndarray, name: str, fo
 def test_kitti_has_to_be_said(kitti: Write, points: np.ndarray, ply: Write) -> None:
     assert format_of(kitti()) is None
     np.testing.assert_array_equal(decode_cloud(kitti(), file_format="kitti").points, points)
-    with pytest.raises(UnreadableCloud, match=r"its first bytes.*state the format kitti"):
+    with pytest.raises(UnreadableCloud, match=r"its first bytes.*specify the format kitti"):
         decode_cloud(kitti())
     with pytest.raises(UnreadableCloud, match="has 191 bytes, but each point"):
         decode_cloud(kitti()[:-1], file_format="kitti")
@@ -104,5 +104,5 @@ def test_nothing_known(ply: Write) -> None:
             decode_cloud(data)
     with pytest.raises(UnreadableCloud, match="not a PCD file"):
         decode_cloud(ply(), file_format="pcd")
-    with pytest.raises(UnreadableCloud, match="not a format of points"):
+    with pytest.raises(UnreadableCloud, match="not a point cloud format"):
         decode_cloud(ply(), file_format="stl")  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ def changed(data: bytes, at: int, form: str, value: float) -> bytes:
     ("at", "form", "value", "message"),
     [
         (107, "I", 13, "13 points of 30 bytes, but 360 of 390"),
-        (107, "I", 50_000_000, "announces 50000000 points"),
+        (107, "I", 50_000_000, "declares 50000000 points"),
         (105, "H", 27, "records of 27 bytes"),
         (105, "H", 31, "360 of 372"),
         (104, "B", 11, "point format 11"),

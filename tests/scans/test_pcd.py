@@ -119,7 +119,7 @@ def compressed(count: int, inflated: int, packed: bytes) -> bytes:
 def test_bombs() -> None:
     zeros = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * 1000  # 1 + 264,000 bytes of 3,002
     assert inflate(np.frombuffer(zeros, np.uint8), 264_001).sum() == 0
-    with pytest.raises(UnreadableCloud, match=r"announces 240000000 bytes compressed to 3002"):
+    with pytest.raises(UnreadableCloud, match=r"declares 240000000 bytes compressed to 3002"):
         decode_cloud(compressed(20_000_000, 240_000_000, zeros))
     with pytest.raises(
         UnreadableCloud, match=r"240000000 bytes of points, but the body states 264001"

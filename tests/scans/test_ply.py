@@ -74,7 +74,7 @@ def test_numbers_written_out() -> None:
     header = header.replace(str(len(words)), str(len(words) + len(missing)))
     scan = decode_scan((header + rows).encode())
     assert len(scan.cloud.points) == len(words)
-    assert scan.cloud.note == "8 missing points left out"
+    assert scan.cloud.note == "8 missing points skipped"
 
 
 def test_old_line_ends(points: np.ndarray) -> None:
@@ -99,7 +99,7 @@ LIES = {
                   "property list uchar float z\n"),
         "exactly one property",
     ),
-    "fifty million": (described(f"element vertex 50000000\n{XYZ}"), "announces 50000000 points"),
+    "fifty million": (described(f"element vertex 50000000\n{XYZ}"), "declares 50000000 points"),
     "more than there are": (described(f"element vertex 11\n{XYZ}"), "at least 132 bytes, but 120"),
     "fewer than there are": (described(f"element vertex 9\n{XYZ}"), "12 bytes follow"),
     "doubles for floats": (

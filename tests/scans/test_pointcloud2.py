@@ -81,7 +81,7 @@ def test_what_a_sensor_missed_is_left_out(serialize: Any, points: np.ndarray) ->
     rows = rows_of(np.vstack([points + 10, np.zeros((2, 3)), np.full((3, 3), np.nan)]), LAYOUTS[0])
     scan = decode_scan(serialize(rows))
     np.testing.assert_array_equal(scan.cloud.points, (points + 10).astype(np.float32))
-    assert scan.cloud.note == "5 missing points left out"
+    assert scan.cloud.note == "5 missing points skipped"
     with pytest.raises(UselessFrame, match="0 of 0 points are missing"):
         decode_scan(serialize(rows[:0]))
 
@@ -93,7 +93,7 @@ def test_a_message_may_end_with_its_last_byte_and_no_earlier(
     data = serialize(rows)
     end = data.rindex(rows.tobytes()) + rows.nbytes + 1  # is_dense; what follows is padding
     assert bytes(read_point_cloud(data[:end]).data) == rows.tobytes()
-    with pytest.raises(UnreadableCloud, match="truncated: 1 bytes are due"):
+    with pytest.raises(UnreadableCloud, match="truncated: 1 bytes are expected"):
         read_point_cloud(data[: end - 1])
 
 
@@ -129,8 +129,8 @@ def test_wrong_numbers_are_named(serialize: Any, points: np.ndarray) -> None:
     for place, word, why in (
         (4 + 4, 10**9, "stamp"), (12, huge, "A name"), (count, huge, "20000000"),
         (count, 2, "2 rows"), (count + 4, huge, "20000000"), (count + 8, huge, "fields"),
-        (count + 8, 4, "truncated|fields|is announced|name"), (step, 0, "0 bytes"),
-        (step, huge, "but announces"), (step, 11, "do not fit|but announces"),
+        (count + 8, 4, "truncated|fields|is declared|name"), (step, 0, "0 bytes"),
+        (step, huge, "but declares"), (step, 11, "do not fit|but declares"),
         (step + 8, huge, "truncated"), (step + 8, 0, "follow the end"),
     ):  # fmt: skip
         changed = patched(data, place, word)

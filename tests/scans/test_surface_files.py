@@ -131,7 +131,7 @@ def test_rows_of_numpy_and_what_is_missing() -> None:
     read = read_surface(file.getvalue(), "map.npy", STATED)
     assert (read.units, read.up_from) == ("stated", "stated")
     np.testing.assert_allclose(read.surface.points, np.delete(points, 5, axis=0), atol=MILLIMETRE)
-    assert read.notes == ("1 missing points were left out.",)
+    assert read.notes == ("1 missing points were skipped.",)
 
 
 def test_stated_units_and_up(pcd: Callable[..., bytes], points: Points) -> None:
@@ -239,7 +239,7 @@ def test_parts_of_a_scene_are_placed_and_a_mirrored_one_keeps_its_front() -> Non
     placed = scene.to_mesh()
     assert len(placed.faces) == 24
     np.testing.assert_allclose(corners(read.surface), sorted_rows(placed.triangles), atol=1e-6)
-    assert read.notes == ("1 parts without triangles were left out.",)
+    assert read.notes == ("1 parts without triangles were skipped.",)
 
 
 def ply(faces: list[list[int]], order: str, vertices: Points) -> bytes:
@@ -298,7 +298,7 @@ def test_what_is_no_triangle_is_left_out() -> None:
     kept = vertices[np.array([faces[0], faces[4]])]
     np.testing.assert_allclose(corners(read.surface), sorted_rows(kept), atol=1e-4)
     assert len(read.surface.points) == 4  # of those, none without a triangle
-    assert read.notes == ("3 triangles without area or with missing vertices were left out.",)
+    assert read.notes == ("3 triangles without area or with missing vertices were skipped.",)
     with pytest.raises(UselessFrame, match="None of the 1 triangles"):
         read_surface(ply([[4, 4, 5]], "ascii", vertices), "map.ply", STATED)
 
@@ -427,7 +427,7 @@ def test_a_part_that_is_placed_too_often_is_refused_unbuilt() -> None:
         ("a.txt", b"hello world", "none of PCD"),
         ("a.obj", b"no geometry\n", "neither triangles nor points"),
         ("a.pcd", b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 4000000000\n"
-                  b"HEIGHT 1\nPOINTS 4000000000\nDATA binary\n", "the limit is 60000000. Thin"),
+                  b"HEIGHT 1\nPOINTS 4000000000\nDATA binary\n", "the limit is 60000000. Down"),
         ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
                   b"property float y\nproperty float z\nelement face 3000000000\n"
                   b"property list uchar int vertex_indices\nend_header\n", "Simplify the mesh"),

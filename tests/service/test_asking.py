@@ -119,7 +119,7 @@ def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map)
     same = "/v1/similarity"
     refuse(same, {"frame_a": named}, *bad, "'frame_b' is missing")
     refuse(same, {"frame_a": named, "frame_b": away}, 404, "unknown-map", "'no'")
-    refuse(same, {"frame_a": named, "frame_b": named, "model": "paper"}, *bad, "Leave `model` out")
+    refuse(same, {"frame_a": named, "frame_b": named, "model": "paper"}, *bad, "Omit `model`")
     file = ("a.png", shots[0].png)
     for files, data, text in (
         ({"a": file}, {}, "frame_b"),

@@ -170,7 +170,8 @@ def test_a_port_that_is_taken_is_refused_in_one_line(begin, tmp_path):
         assert not (tmp_path / "new").exists()
         assert line == (
             f"sceneprint serve: 127.0.0.1:{port} is not available (Address already in use). "
-            "Choose another --port, 0 for a free one, or stop the process that uses it."
+            "Choose another --port (0 selects a free port), or stop the process that uses this "
+            "port."
         )
         with socket.create_connection(("127.0.0.1", port)) as asking:
             asked, address = taken.accept()  # who had it, has it

@@ -133,7 +133,7 @@ BODIES = {
         422, "invalid-request", "stages.0: Input should be 'retrieve', 'diversify' or 'validate'."),
     b'{"frame_id": "a", "stages": "validate"}': (422, "invalid-request", "stages: "),
     b'{"frame_id": "a", "stages": 7}': (422, "invalid-request", "stages: must be a list of stages"),
-    b'{"frame_id": "a", "stages": null}': (422, "invalid-request", "or a text with commas"),
+    b'{"frame_id": "a", "stages": null}': (422, "invalid-request", "or a text with stages"),
     b'{"frame_id": "a", "fly": 1}': (422, "invalid-request", "fly: "),
     b'{"frame_id": "../a\\u0000"}': (404, "unknown-frame", ""),
 }  # fmt: skip

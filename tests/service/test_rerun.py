@@ -157,4 +157,4 @@ def test_what_cannot_be_asked_again(served, asked, shots, refused):
     served.client.post("/v1/maps", json={"name": "again-paper", "model": "paper"})
     body = {"maps": ["again-paper"], "query_id": asked["query_id"]}
     reply = served.client.post("/v1/queries", json=body)
-    refused(reply, 409, "not-indexed", "a different model")
+    refused(reply, 409, "not-indexed", "not signed with the model")

@@ -134,7 +134,7 @@ def test_while_kernels_are_compiled_readyz_says_so_and_who_needs_them_waits(
         until(lambda: not is_ready())  # what it says is up to a second old
         waits = house.ask("robot", "GET", "/readyz")
         assert (waits.status_code, waits.headers["retry-after"]) == (503, "1")
-        assert waits.json()["detail"].startswith("The service is waiting for its kernels, which")
+        assert waits.json()["detail"].startswith("The kernels of the service are being compiled")
         assert house.ask("robot", "GET", "/healthz").status_code == 200
         assert house.ask("robot", "GET", "/v1/maps").status_code == 200
         house.engine.signers.release()

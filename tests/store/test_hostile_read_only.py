@@ -122,7 +122,7 @@ def test_a_log_that_was_left_is_read_or_refused(folder: Path, reader: Reader) ->
     (folder / "a.db-shm").unlink()
     told = reader.ask()  # the row in the log must not be overlooked
     assert told.startswith("UnusableStore: ")
-    assert "was not closed, and cannot be recovered on a read-only disk" in told
+    assert "was not closed properly, and cannot be recovered on a read-only disk" in told
     (folder / "a.db-wal").write_bytes(b"")
     assert reader.ask() == "1 ['a.db', 'a.db-wal']"  # all that the file itself holds
 

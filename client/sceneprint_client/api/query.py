@@ -599,7 +599,7 @@ class Query(Given):
         if isinstance(stages, list | tuple):
             return stages
         # pydantic's own message would be about tuples.
-        raise ValueError("must be a list of stages, or a text with commas between them")
+        raise ValueError("must be a list of stages, or a text with stages separated by commas")
 
     @field_validator("filter", mode="before", json_schema_input_type=str | Filter | None)
     @classmethod

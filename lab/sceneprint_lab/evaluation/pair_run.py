@@ -557,8 +557,8 @@ def evaluate_pairs(
     if not drawn:
         raise DatasetError(
             f"The {len(members)} frames contain no pairs at least {settings.drawing.apart} frames "
-            "apart that overlap by a tenth or more, or not at all. Specify more recordings or a "
-            "smaller --apart."
+            "apart that overlap either by a tenth or more, or not at all. Specify more recordings "
+            "or a smaller --apart."
         )
     tasks = [(one, members[one.query], members[one.match]) for one in drawn]
     opening = partial(

@@ -720,7 +720,8 @@ def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
         for j in range(i):
             if place.is_relative_to(places[j]) or places[j].is_relative_to(place):
                 raise DatasetError(
-                    f"{paths[i]}: the path has the frames of {paths[j]}. Specify each path once."
+                    f"{paths[i]}: the path contains the same frames as {paths[j]}. Specify each "
+                    "path once."
                 )
     gathered = _Gathered()
     for path in paths:
@@ -771,7 +772,7 @@ class _Gathered:
             scene, file, place = run.parent_frame, reference.path.resolve(), run.place
             if self._places.setdefault(scene, place.resolve()) != place.resolve():
                 raise DatasetError(
-                    f"{path}: another scene, {self._places[scene]}, has the name {scene} too. "
+                    f"{path}: another scene, {self._places[scene]}, also has the name {scene}. "
                     "Rename one of the folders."
                 )
             known = self.frames.get(file)

@@ -438,8 +438,8 @@ def _until(expires_at: datetime) -> float:
         datetime.fromtimestamp(seconds, UTC)
     except (ValueError, OverflowError) as error:  # its zone or rounding puts it out of range
         raise InvalidRequest(
-            f"{expires_at.isoformat()} is not within the years 1 to 9999 of UTC. Leave expires_at "
-            "out for a key that does not expire.",
+            f"{expires_at.isoformat()} is not within the years 1 to 9999 of UTC. Omit expires_at "
+            "to create a key that does not expire.",
             (("expires_at", "not within the years 1 to 9999 of UTC"),),
         ) from error
     return seconds

@@ -197,7 +197,7 @@ def _file_sizes(folder: Path) -> Iterator[int]:
             if one.is_file(follow_symlinks=False):
                 yield _size(one)
     except OSError:
-        return  # removed meanwhile, or missing
+        return  # removed in the meantime, or missing
 
 
 def _size(path: Path | os.DirEntry[str]) -> int:

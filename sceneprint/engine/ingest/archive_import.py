@@ -220,8 +220,8 @@ class _MapBytes:
             self._head += chunk[: HEAD - len(self._head)]
             if len(self._head) >= BLOCK and is_archive(self._head):
                 raise errors.InvalidRequest(
-                    "The file is an archive, and a map is one cloud or mesh. Unpack it, or leave "
-                    "`as` out to import the frames in it.",
+                    "The file is an archive, but a map must be a single cloud or mesh. Unpack it, "
+                    "or omit `as` to import the frames in it.",
                     (("as", "the file is an archive"),),
                 )
         self._size += len(chunk)
@@ -299,7 +299,7 @@ def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewPa
         if not isinstance(view_parameters(model).camera, Intrinsics):
             raise errors.InvalidRequest(
                 "The model of the map is for 360-degree scans, so `camera` would have no effect. "
-                "Leave it out, or import into a map with the model `depth`.",
+                "Omit it, or import into a map with the model `depth`.",
                 (("camera", "does not apply to a map of scans"),),
             )
         n = math.ceil(max(k.width, k.height) / _MOST_PIXELS)
@@ -386,7 +386,7 @@ class Imports:
             )
         except Swept as error:
             raise errors.Conflict(
-                "Another import of the same file ended and removed its bytes while this one was "
+                "Another import of the same file ended and removed the file while it was being "
                 "received. Send the file again."
             ) from error
         except errors.SceneprintError:

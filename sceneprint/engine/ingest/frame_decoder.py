@@ -252,8 +252,8 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Deco
         raise errors.UnsupportedType(str(error)) from error
     if scan.file_format != _packing(data):  # it could not be decoded again
         raise errors.UnreadableCloud(
-            f"The file was sent as {scan.file_format.upper()}, but does not start like one. Write "
-            "the file again, or correct the format."
+            f"The file was sent as {scan.file_format.upper()}, but does not start like a file of "
+            "that format. Write the file again, or correct the format."
         )
     # -0.0 is the same viewpoint as 0.0
     seen_from = None if scan.viewpoint is None else [value + 0.0 for value in scan.viewpoint]
@@ -273,7 +273,7 @@ def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
     if extra:
         raise errors.InvalidRequest(
             f"The frame is a {kind}, and {' and '.join(f'`{name}`' for name in extra)} would have "
-            "no effect. Leave it out, or check that you sent the right file.",
+            "no effect. Omit what does not apply, or check that you sent the right file.",
             tuple((name, f"does not apply to a {kind}") for name in extra),
         )
 

@@ -229,8 +229,8 @@ class MapImporter:
                 )
             except DecoderFailure as error:
                 raise UnreadableCloud(
-                    f"{options.name} cannot be read: {error}. Thin the points or simplify the "
-                    "mesh, or write it in another format."
+                    f"{options.name} cannot be read: {error}. Downsample the points or simplify "
+                    "the mesh, or write the file in another format."
                 ) from error
         surface = read.surface
         if options.offset is not None:
@@ -289,7 +289,7 @@ class MapImporter:
                 if isinstance(outcome.error, QuotaExceeded):
                     raise QuotaExceeded(
                         f"{outcome.error} {first} of {progress['views']} views were added. Send "
-                        "the same file again to add the other views."
+                        "the same file again to add the remaining views."
                     )
                 item = import_item(str(upload.meta.name), outcome)
                 progress["refused"] += outcome.added is None
@@ -369,9 +369,10 @@ class MapImporter:
                 return  # the first file, or a repeated one
         x, y, z = offset.tolist()
         raise InvalidRequest(
-            f"The parent frame {parent!r} already has frames, but {options.name} lies far from its "
-            f"origin, so its own offset would be {x:.0f},{y:.0f},{z:.0f}. Send `offset` (--offset) "
-            "with the numbers of the first file in this frame, or another `parent_frame`.",
+            f"The parent frame {parent!r} already has frames, but {options.name} lies far from the "
+            f"origin of that frame and would get the offset {x:.0f},{y:.0f},{z:.0f}. Send the "
+            "`offset` (--offset) of the first file in this parent frame, or another "
+            "`parent_frame`.",
             (("offset", "needed, since the parent frame has frames"),),
         )
 
@@ -442,8 +443,8 @@ def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> R
     if not np.abs(points).max() <= _FARTHEST_M:
         middle = ", ".join(f"{x:.0f}" for x in surface.offset + surface.points.mean(axis=0))
         raise InvalidRequest(
-            f"{name} lies about {middle}, more than {_FARTHEST_M / 1000:.0f} km from the offset. "
-            "Check its numbers, which are metres, and the units of the file.",
+            f"{name} lies around {middle}, more than {_FARTHEST_M / 1000:.0f} km from the offset. "
+            "Check the offset, which is in metres, and the units of the file.",
             (("offset", "too far from the surface"),),
         )
     return replace(surface, points=points.astype(np.float32), offset=to)

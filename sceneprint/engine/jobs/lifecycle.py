@@ -50,7 +50,7 @@ class Work:
 
     @property
     def again(self) -> bool:
-        """Whether the job signs an indexed frame again, which stays indexed meanwhile."""
+        """Whether the job signs an indexed frame again, which stays indexed in the meantime."""
         return self.job.kind == REENCODE
 
     @property
@@ -257,8 +257,8 @@ def _retry(store: Store, job_id: str) -> tuple[Job, bool]:
             return _job_record(connection, latest), False
         if latest.number != job.number:
             raise CannotRetry(
-                f"Job {job.id} was replaced by {latest.id}, which is {latest.state}. Retry the "
-                "latter."
+                f"Job {job.id} was replaced by {latest.id}, which is {latest.state}. Retry that "
+                "job."
             )
         can_retry = frame.state in _GIVEN_UP
         if job.kind == REENCODE:

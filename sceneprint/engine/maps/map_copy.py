@@ -183,7 +183,7 @@ def pull_map(
 ) -> PulledMap:  # fmt: skip
     """Update the copy of a map to a state that the map had in the service during this call.
 
-    Queries of the copy see its former state meanwhile.
+    Queries of the copy see its former state in the meantime.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def pull_map(
                     artifacts, size = artifacts + (more > 0), size + more
             except UnknownMap:
                 raise
-            except NotFound:  # the frame was deleted or signed again meanwhile
+            except NotFound:  # the frame was deleted or signed again in the meantime
                 continue
             pull.fetched[digest] = rows
             if progress is not None:
@@ -362,6 +362,6 @@ def _require_copied(store: Store, rows: Iterable[FrameRow], map_name: str) -> No
     if own:
         raise Conflict(
             f"Map {map_name!r} has {len(own)} frames that were uploaded into the copy, such as "
-            f"{own[0]}. Nothing was changed. Upload them to the service, delete them here, and "
-            "pull the map again."
+            f"{own[0]}. Nothing was changed. Upload these frames to the service, delete them "
+            "from the copy, and pull the map again."
         )

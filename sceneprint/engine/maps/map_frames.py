@@ -124,7 +124,7 @@ def check_unchanged(store: Store, indexed: IndexedFrame) -> None:
     now = find_indexed(store, indexed.row.name, indexed.frame.id)
     if (now.frame.number, now.artifact) != (indexed.frame.number, indexed.artifact):
         raise errors.Busy(
-            f"Frame {indexed.frame.id} was signed with another model meanwhile. Try again."
+            f"Frame {indexed.frame.id} was signed with another model in the meantime. Try again."
         )
 
 
@@ -300,7 +300,7 @@ def _only(what: str, wanted: str | None, names: Iterable[str | None], session: s
         shown = ", ".join("none" if name is None else repr(name)[:60] for name in names[:5])
         raise errors.InvalidRequest(
             f"Session {session!r:.140} has frames with {len(names)} values of `{what}` ({shown}), "
-            f"but a trajectory covers one. Choose it with `{what}`.",
+            f"but a trajectory covers only one. Select one with `{what}`.",
             ((what, "required, since there are several"),),
         )
     return names[0] if names else None
@@ -564,7 +564,7 @@ def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]
         lacking = "pose" if within == "parent" else "T_base_sensor"
         raise errors.InvalidRequest(
             f"Frame {frame.id} has no {lacking}, so its points are available only in {optical}. "
-            "Use frame=optical, or add one with PATCH.",
+            "Use frame=optical, or add it with PATCH.",
             (("frame", f"it has no {lacking}"),),
         )
     return name, matrix

@@ -91,7 +91,7 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
         if differs or (existing.title, existing.model_id) != (new.title, model.id):
             raise errors.MapExists(
                 f"Map {new.name!r} already exists with a different title, model, limits or up. Use "
-                "it as it is, delete it, or choose another name."
+                "the existing map, delete it, or choose another name."
             )
         return map_record(connection, existing), False
 
@@ -161,7 +161,7 @@ def edit_frame(
         row = find_map(connection, map_name)
         frame = find_frame(connection, row, frame_id)
         if frame.state == FrameState.DELETED:
-            raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted before.")
+            raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was already deleted.")
         _check_tag(f"Frame {frame.id}", frame_tag(frame), if_match)
         values = edited(frame, patch)
         if "pose_parent" in values:  # the new parent frame may be joined to another
@@ -199,8 +199,8 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
     meta = _merged(frame, patch)
     if meta.pose is not None and meta.pose.of != "sensor":
         raise errors.InvalidRequest(
-            "An edit cannot set the pose of the base. Send that of the sensor, without `of`.",
-            (("pose.of", "an edited pose is that of the sensor"),),
+            "An edit cannot set the pose of the base. Send the pose of the sensor, without `of`.",
+            (("pose.of", "must be the pose of the sensor"),),
         )
     pose = None if meta.pose is None else frame_decoder.pose_matrix(meta.pose)
     columns_after = columns(meta, pose, base_of(meta.T_base_sensor, viewpoint_of(frame)))
@@ -254,7 +254,7 @@ def _check_fields(patch: Mapping[str, Any]) -> None:
         if name in _CONTENT:
             raise errors.InvalidRequest(
                 f"`{name}` is part of the identity of the frame and cannot be edited. Delete the "
-                "frame, and upload it again with the right value.",
+                "frame, and upload it again with the correct value.",
                 ((name, "cannot be edited"),),
             )
         if name not in FrameEdit.model_fields:
@@ -359,7 +359,7 @@ class Reencodings:
                 if self._tidied.get(row.number) != models and _tidy(self._store, row, TIDY_S):
                     self._tidied[row.number] = models
             except errors.UnknownMap:
-                pass  # the map was deleted meanwhile
+                pass  # the map was deleted in the meantime
             except errors.SceneprintError as error:
                 log.error("map not reencoded", extra={"map": row.name, "error": str(error)})
 

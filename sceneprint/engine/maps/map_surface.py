@@ -217,7 +217,7 @@ class MapSurfaces:
         within = _NEAR * surface.cell_m if radius is None else radius
         if not 0 < within <= _NEAREST * surface.cell_m:
             raise InvalidRequest(
-                f"The radius is {within:g} m. Use one above 0 and up to "
+                f"The radius is {within:g} m. Use a radius above 0 and up to "
                 f"{_NEAREST * surface.cell_m:g} m.",
                 (("radius", "out of range"),),
             )
@@ -297,9 +297,9 @@ class MapSurfaces:
             ]
         if surface is None or record is None or not totals:
             raise NotFound(
-                f"Map {row.name!r} has no surface in that parent frame. Start it with "
-                f"POST /v1/maps/{row.name}/surface, and see GET /v1/maps/{row.name}/surface for "
-                "its parent frames."
+                f"Map {row.name!r} has no surface in that parent frame. Start a build with "
+                f"POST /v1/maps/{row.name}/surface; GET /v1/maps/{row.name}/surface lists the "
+                "parent frames."
             )
         axes = np.array(record["axes"])
         plan = plan_frame(axes, totals[0].low, totals[0].high, surface.cell_m, width)

@@ -265,6 +265,6 @@ def _require_frames(count: int, map_name: str, session: str, robot: str | None) 
     if not count:
         by = "" if robot is None else f" by robot {robot!r:.140}"
         raise UnknownSession(
-            f"Map {map_name!r} has no frame of session {session!r:.140}{by}. "
-            f"`sceneprint sessions {map_name}` lists them."
+            f"Map {map_name!r} has no frame of session {session!r:.140}{by}. `sceneprint sessions "
+            f"{map_name}` lists the sessions."
         )

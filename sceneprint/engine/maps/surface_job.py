@@ -314,7 +314,7 @@ class SurfaceHandler:
         return SliceResult(False, progress, write=write)
 
     def _conclude(self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Return the end of the job, or another slice if frames have changed meanwhile."""
+        """Return the end of the job, or another slice if frames have changed in the meantime."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
             now = stored.find_surface(connection, row.number)

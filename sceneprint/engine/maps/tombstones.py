@@ -103,13 +103,13 @@ class Tombstones:
             frame = find_tombstone(connection, row.number, self._seconds, frame_id)
             if frame is None:
                 raise UnknownFrame(
-                    f"Frame {frame_id!r:.80} of map {map_name!r} was not deleted, or cannot be "
-                    "restored any more. Upload it again."
+                    f"Frame {frame_id!r:.80} of map {map_name!r} was not deleted, or can no "
+                    "longer be restored. Upload it again."
                 )
             successor = successor_of(connection, frame)
             if successor is not None:
                 raise Conflict(
-                    f"Frame {frame.id} was not restored, since it was uploaded again as frame "
+                    f"Frame {frame.id} was not restored, because it was uploaded again as frame "
                     f"{successor}. Use that frame."
                 )
             restore_frame(connection, row, frame)
@@ -138,7 +138,7 @@ class Tombstones:
                 if deletion is None:
                     if not last:
                         raise _unknown_deletion(row, deletion_id)
-                    left = 0  # the deletion has expired meanwhile
+                    left = 0  # the deletion has expired in the meantime
                     break
                 if not last:
                     _require_room(row, deletion)
@@ -170,7 +170,7 @@ class Tombstones:
         for row in rows:
             while numbers := self._spent(row, everything=everything):
                 with self._store.database.write(map_number=row.number) as connection:
-                    # without frames that were restored or purged meanwhile
+                    # without frames that were restored or purged in the meantime
                     existing = {one[0] for one in oldest_tombstones(connection, row.number)}
                     numbers = [one for one in numbers if one in existing]
                     blobs = purge_frames(connection, row.number, numbers)
@@ -205,6 +205,6 @@ def _require_room(row: MapRow, deletion: Deletion) -> None:
     if row.quota_frames is not None and row.used_frames + deletion.frames > row.quota_frames:
         raise QuotaExceeded(
             f"The deletion has {deletion.frames} frames, but the quota of map {row.name!r} has no "
-            "room for all of them, so none was restored. Restore single frames, or ask the "
+            "room for all of them, so no frame was restored. Restore single frames, or ask the "
             "operator for a larger quota."
         )

@@ -240,7 +240,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
     def _geometry(self, row: MapRow, number: int, blobs: Mapping[int, str]) -> Geometry | None:
         """Return the geometry of a frame; None if it was deleted or is damaged."""
-        if number not in blobs:  # the frame was deleted meanwhile
+        if number not in blobs:  # the frame was deleted in the meantime
             return None
         try:
             return self._store.geometries.read(blobs[number])
@@ -287,8 +287,9 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         """Raise JoinStands if poses of the map depend on an association."""
         if job.map_number is not None and is_joined_by(connection, job.map_number, job.id):
             raise JoinStands(
-                f"Association {job.id} joined parent frames of its map, so it is needed to undo "
-                "this. Undo its join first: DELETE the path of the association with /join."
+                f"Association {job.id} joined parent frames of its map, and undoing this join "
+                "requires it. Undo the join first: send DELETE to the path of the association, "
+                "followed by /join."
             )
 
     def items(
@@ -375,7 +376,9 @@ def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> li
     """
     for one in joins:
         if not join_parent(connection, task.of_map.number, one, task.job.id):
-            raise Swept(f"Another association has joined {one.parent} or {one.root} meanwhile.")
+            raise Swept(
+                f"Another association has joined {one.parent} or {one.root} in the meantime."
+            )
     return []
 
 

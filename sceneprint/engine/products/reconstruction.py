@@ -342,7 +342,7 @@ def _matches_to_fuse(matches: Sequence[Match], request: NewReconstruction) -> li
         if missing:
             raise InvalidRequest(
                 f"Frame {missing[0]!r:.80} is not an accepted match of the answer. Choose from "
-                f"{', '.join(sorted(frame_ids))}, or leave `frames` out.",
+                f"{', '.join(sorted(frame_ids))}, or omit `frames`.",
                 (("frames", "not an accepted match"),),
             )
         accepted = [match for match in accepted if match.frame_id in request.frames]

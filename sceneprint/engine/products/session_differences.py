@@ -79,7 +79,7 @@ def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -
         counts[side] = parents_of_session(connection, row.number, name)
         if not counts[side]:
             raise InvalidRequest(
-                f"Map {row.name!r} has no indexed frame with a pose of session {name!r:.80}. "
+                f"Session {name!r:.80} of map {row.name!r} has no indexed frame with a pose. "
                 f"See GET /v1/maps/{row.name}/sessions.",
                 ((side, "no indexed frame with a pose"),),
             )

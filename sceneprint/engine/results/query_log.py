@@ -205,7 +205,7 @@ class QueryLog:
             loss_reason = "an unexpected error"
         self._written_at = time.monotonic()
         with self._changed:
-            for one in batch[: len(self._waiting)]:  # none if the log was closed meanwhile
+            for one in batch[: len(self._waiting)]:  # none if the log was closed in the meantime
                 self._waiting.popleft()
                 self._bytes_waiting -= one.size
             self._settled += len(batch)
@@ -342,7 +342,7 @@ class QueryLog:
             if row.kept_at is None:
                 self._require_room(connection, row)
                 if not keep_answer(connection, row.number, data, read_clock(connection)):
-                    raise unknown_query(query_id)  # the answer was removed meanwhile
+                    raise unknown_query(query_id)  # the answer was removed in the meantime
             set_title(connection, row.number, title)
             record_change(connection, "answer.kept", row.map, query_id)
         if row.kept_at is None:

@@ -63,7 +63,7 @@ TRIES = 5
 
 
 def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]) -> T:
-    """Run a query, and repeat it if one of its maps switched to another model meanwhile.
+    """Run a query, and repeat it if one of its maps switched to another model in the meantime.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
     if how.model is not None and read_model(how.model).id != rows[0].model_id:
         raise InvalidRequest(
             f"The stored frame was not signed with model {how.model!r}: map {models[0]}. "
-            "Leave `model` out.",
+            "Omit `model`.",
             (("model", f"map {models[0]}"),),
         )
     return signers(rows[0].model_id)
@@ -335,8 +335,8 @@ class Queries:
             for row in rows:
                 if row.model_id != stored.model_id:
                     raise NotIndexed(
-                        f"Map {row.name!r} has a different model than the query was signed with, "
-                        "and the upload of the query is not stored. Send the frame again."
+                        f"The query was not signed with the model of map {row.name!r}, and its "
+                        "upload is not stored. Send the frame again."
                     )
             return self.answer(rows, prepared, query, deadline, sent=sent)
 
@@ -422,7 +422,7 @@ class Queries:
             raise UnknownMap("There is no map to search. Create one, or check the key's grants.")
         if len(names) > MOST_MAPS:
             raise InvalidRequest(
-                f"There are {len(names)} maps, but a query can search at most {MOST_MAPS}. Name "
+                f"There are {len(names)} maps, but a query can search at most {MOST_MAPS}. Specify "
                 "the maps to search.",
                 (("maps", f"more than {MOST_MAPS}"),),
             )
@@ -447,8 +447,8 @@ def check_sequence(metas: Sequence[FrameMeta], query: Query) -> None:
     check_localizes(query)
     if not 2 <= len(metas) <= MOST_OF_SEQUENCE:
         raise InvalidRequest(
-            f"The sequence has {len(metas)} frames. Send 2 to {MOST_OF_SEQUENCE} frames, of which "
-            "the last is localised.",
+            f"The sequence has {len(metas)} frames. Send 2 to {MOST_OF_SEQUENCE} frames; the query "
+            "localises the last one.",
             (("frame", f"{len(metas)} frames"),),
         )
     without = [i for i, meta in enumerate(metas) if meta.pose is None]
@@ -473,7 +473,7 @@ def check_localizes(query: Query) -> None:
     """Raise InvalidRequest unless a query includes validation, which a pose needs."""
     if "validate" not in query.stages:
         raise InvalidRequest(
-            "A pose needs validated matches. Leave `stages` out, or include `validate`.",
+            "A pose needs validated matches. Omit `stages`, or include `validate`.",
             (("stages", "without validate"),),
         )
 

@@ -141,7 +141,7 @@ def parent_axes(connection: Connection, row: MapRow, numbers: Sequence[int]) -> 
     if (up := parent_up(connection, numbers)) is not None:
         return PlanAxes(plan_axes(up), "frames" if row.up is None else "map")
     stops = [stop for stop in path_frames(connection, numbers).values() if stop.pose is not None]
-    if not stops:  # all frames were deleted meanwhile
+    if not stops:  # all frames were deleted in the meantime
         return PlanAxes(np.eye(3)[:2], "cameras")
     poses = np.array([stop.pose for stop in stops])
     return PlanAxes(plan_axes(upright(poses, [stop.is_cloud for stop in stops])), "cameras")

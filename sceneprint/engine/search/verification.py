@@ -229,12 +229,12 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
         return None
     if "validate" not in query.stages:
         raise InvalidRequest(
-            "A prior needs validated matches. Leave `stages` out, or include `validate`.",
+            "A prior needs validated matches. Omit `stages`, or include `validate`.",
             (("prior", "without validate"),),
         )
     if len(places) > 1:
         raise InvalidRequest(
-            "A prior is a pose in one map. Query only that map, or leave `prior` out.",
+            "A prior is a pose in one map. Query only that map, or omit `prior`.",
             (("prior", "with several maps"),),
         )
     covariance = _prior_covariance(prior)
@@ -242,7 +242,7 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
     if np.abs(T[:3, 3]).max() > FARTHEST_PRIOR:
         raise InvalidRequest(
             f"The prior lies more than {FARTHEST_PRIOR:,.0f} m from the origin of its parent "
-            "frame. Send the pose in metres, or leave `prior` out.",
+            "frame. Send the pose in metres, or omit `prior`.",
             (("prior.pose", "too far from the origin"),),
         )
     row, name = places[0].row, str(prior.pose.parent_frame)
@@ -254,7 +254,8 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
         if not has_parent_frame(connection, row.number, name):
             raise InvalidRequest(
                 f"No frame of map {row.name!r} has a pose in the parent frame {name!r} of the "
-                "prior. Use a parent frame of the map; `sceneprint frames` lists them.",
+                "prior. Use a parent frame of the map; `sceneprint frames` lists the frames with "
+                "their poses.",
                 (("prior.pose.parent_frame", "not of this map"),),
             )
     return PosePrior(f"{row.number} {name}", T, covariance)
@@ -280,7 +281,7 @@ def _prior_covariance(prior: Prior) -> Floats:
                 f"The deviations of the prior are between {deviations.min():.3g} and "
                 f"{deviations.max():.3g}, but must be between {LEAST_DEVIATION} and "
                 f"{MOST_DEVIATION:.0f} (metres and radians). Check the diagonal of the "
-                "covariance, which has their squares, or leave `prior` out.",
+                "covariance, which contains their squares, or omit `prior`.",
                 (("prior.covariance", "deviations out of range"),),
             )
         # no entry may exceed the largest variance; this also prevents overflows below

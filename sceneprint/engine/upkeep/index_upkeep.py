@@ -176,7 +176,7 @@ class Upkeep:
         """
         if self._signers(row.model_id).model.metric != "l2":
             raise InvalidRequest(
-                f"Map {row.name!r} has no index to rebuild: its model stores full Fisher "
+                f"Map {row.name!r} has no index to rebuild, because its model stores full Fisher "
                 "vectors, and queries compare all of them. If the map is too large for that, "
                 "switch its model with `sceneprint reencode`."
             )
@@ -228,7 +228,7 @@ class Upkeep:
                 return False
             return self._publish(row, force=force) is not None
         except UnknownMap:
-            return False  # the map was deleted meanwhile
+            return False  # the map was deleted in the meantime
         except (OSError, SceneprintError, ValueError) as error:
             log.error("index publication failed", extra={"map": row.name, "error": str(error)})
             if self._place.is_shared:  # frequent attempts would be too expensive
@@ -309,8 +309,8 @@ class Upkeep:
             done = self._place.remove_all_but(row, head)
         if not done:
             raise BusyIndex(
-                f"Another process is building the index of map {row.name!r}, so it may still "
-                "contain bytes of deleted frames. Try again later."
+                f"Another process is building the index of map {row.name!r}, so the index may "
+                "still contain bytes of deleted frames. Try again later."
             )
         return stale
 
@@ -321,7 +321,7 @@ class Upkeep:
     def postpone_purge(self, row: MapRow, seconds: float) -> None:
         """Postpone the next purge of a map's index in all processes."""
         now = time.time()
-        with suppress(OSError):  # the index was removed meanwhile
+        with suppress(OSError):  # the index was removed in the meantime
             mark = self._place.folder(row) / _PURGED
             mark.touch(PRIVATE_FILE)
             os.utime(mark, (now, now + seconds))

@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 
 #: Maximum number of frames to delete in one commit, for which writers wait about 20 ms.
 AT_ONCE = 100
-#: Maximum duration of a call in seconds, since jobs wait meanwhile.
+#: Maximum duration of a call in seconds, since jobs wait in the meantime.
 TURN_S = 2.0
 #: Seconds between two checks after all old frames were deleted.
 LOOK_S = 60.0
@@ -160,7 +160,7 @@ class MemoryPurging:
 
 #: Seconds for which blobs of a deletion are left to the deleting process.
 _YOUNG_S = 60.0
-#: Maximum seconds to remove doomed blobs, since jobs wait meanwhile.
+#: Maximum seconds to remove doomed blobs, since jobs wait in the meantime.
 _SWEEP_S = 20.0
 #: Pause before the next purge of an index, as a multiple of the duration of the last one, so that
 #: frequent deletions from a large map do not occupy the workers.
@@ -234,7 +234,7 @@ class Purging:
             try:
                 return do()
             except (UnknownMap, UnknownJob):
-                return 0  # a map or a product was deleted meanwhile
+                return 0  # a map or a product was deleted in the meantime
             except (SceneprintError, OSError, ValueError) as error:
                 level = logging.INFO if isinstance(error, BusyIndex) else logging.ERROR
                 log.log(level, "purge incomplete", extra={"error": str(error)})

@@ -64,7 +64,7 @@ def without_loss(reason: str | None) -> str | None:
 def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: str) -> int:
     """Queue jobs that sign frames with damaged artifacts or signatures again.
 
-    Queries still find the frames meanwhile. Errors are only logged, since queries call this.
+    Queries still find the frames in the meantime. Errors are only logged, since queries call this.
     Frames whose repair is pending or recent are skipped.
 
     Returns
@@ -141,7 +141,7 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
         with store.database.read() as connection:
             row = find_map(connection, map_name)
             frame = find_frame(connection, row, frame_id)
-    except UnknownFrame:  # the map was created again meanwhile
+    except UnknownFrame:  # the map was created again in the meantime
         return []
     if store.database.read_only or frame.state == FrameState.DELETED:
         return []

@@ -218,7 +218,7 @@ class FrameSequence:
 EMPTY_FRAMES = frozenset(
     {
         "frames without a depth_file_path", "cameras without a depth image", "frames without depth",
-        "scans without points", "stereo images without depth", "laser scans of two dimensions",
+        "scans without points", "stereo images without depth", "two-dimensional laser scans",
     }
 )  # fmt: skip
 

@@ -368,7 +368,7 @@ def _note_of(left_out: list[Path], root: Path) -> str:
         return ""
     names = [one.relative_to(root.parent).as_posix() for one in left_out]
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return f"left out: {', '.join(names[:_MOST_NAMES])}{more} ({OMITTED_IMAGES})"
+    return f"skipped: {', '.join(names[:_MOST_NAMES])}{more} ({OMITTED_IMAGES})"
 
 
 def find_recordings(path: Path) -> list[Path]:

@@ -56,7 +56,7 @@ class E57Source:
         """
         with naming(f"{self.path}, scan {self.place + 1}"), _scans(self.path) as scans:
             if self.place >= len(scans):
-                raise UnreadableCloud("The scan no longer exists. Read the file again.")
+                raise UnreadableCloud("The scan no longer exists in the file. Read the file again.")
             scan = scans[self.place]
             points, n = np.empty((scan.count, 3), np.float32), 0
             with np.errstate(all="ignore"):  # points with NaN are missing
@@ -122,7 +122,7 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
             "whole with --as-map, or export structured scans with their poses."
         )
     note = f"{len(frames)} of {len(scans)} scans taken"
-    note += f"; left out: {reasons}" if reasons else ""
+    note += f"; skipped: {reasons}" if reasons else ""
     note += f"; {thick} scans with more than {MOST_POINTS} points are thinned" if thick else ""
     lost = count_lost(left_out)
     return FrameSequence(name, path, Layout.E57, name, None, tuple(frames), note, lost=lost)

@@ -122,7 +122,7 @@ def _original(file: Path, fields: dict[str, Any]) -> tuple[Floats, float]:
     try:
         scale = number(fields.get("applied_scale", 1.0), "applied_scale")
         if not scale > 0:
-            raise DatasetError(f"applied_scale is {scale:g}, not positive. Export it again.")
+            raise DatasetError(f"applied_scale is {scale:g}, not positive. Export the file again.")
         if "applied_transform" not in fields:
             return np.eye(4), scale
         T_saved_original = transform(fields["applied_transform"], "applied_transform")

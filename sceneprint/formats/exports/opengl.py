@@ -124,14 +124,14 @@ def number(value: object, what: str) -> float:
                 return float(value)
         except OverflowError:
             pass
-    raise DatasetError(f"{what} is {value!r:.40}, not a finite number. Export it again.")
+    raise DatasetError(f"{what} is {value!r:.40}, not a finite number. Export the file again.")
 
 
 def pixels(value: object, what: str) -> int:
     """Return a size in pixels of a JSON file. Raise DatasetError for other values."""
     size = number(value, what)
     if not 1 <= size <= 1e6 or size != int(size):
-        raise DatasetError(f"{what} is {size:g}, not a size in pixels. Export it again.")
+        raise DatasetError(f"{what} is {size:g}, not a size in pixels. Export the file again.")
     return int(size)
 
 
@@ -139,10 +139,10 @@ def transform(rows: object, what: str) -> Floats:
     """Return a transform (4, 4) from 3 or 4 rows. Raise DatasetError if it is not rigid."""
     T = np.eye(4)
     if not isinstance(rows, list) or len(rows) not in (3, 4):
-        raise DatasetError(f"{what} does not have 3 or 4 rows. Export it again.")
+        raise DatasetError(f"{what} does not have 3 or 4 rows. Export the file again.")
     for place, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != 4:
-            raise DatasetError(f"{what} has a row without 4 numbers. Export it again.")
+            raise DatasetError(f"{what} has a row without 4 numbers. Export the file again.")
         T[place] = [number(value, what) for value in row]
     try:
         return rigid_transform(T)
@@ -178,6 +178,6 @@ def sequence_of(
             f"{folder}: No frame of this {layout.value} export has depth{why}. {remedy}"
         )
     note = f"{len(frames)} frames of {layout.value} taken"
-    note += f"; left out: {'; '.join(reasons)}" if reasons else ""
+    note += f"; skipped: {'; '.join(reasons)}" if reasons else ""
     lost = count_lost(left_out)
     return FrameSequence(name, folder, layout, name, None, tuple(frames), note, lost=lost)

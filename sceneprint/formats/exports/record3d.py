@@ -7,7 +7,7 @@ dw x dh float32 metres, compressed with LZFSE. `metadata` has w and h of the col
 `perFrameIntrinsicCoeffs` (fx, fy, cx, cy of each frame) or K (column by column), and `poses`: qx,
 qy, qz, qw, x, y, z of the transform from camera to world in ARKit axes (x right, y up, z backward).
 
-The export "EXR + JPG sequence" has depth as OpenEXR, which is not supported.
+The export "EXR + JPG sequence" stores depth as OpenEXR, which is not supported.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _decompressed(packed: bytes, size: int) -> bytes:
         ) from cause
     if len(samples) != size:
         raise UnreadableFrame(
-            f"The depth has {len(samples)} bytes, but the metadata announce {size}. Export the "
+            f"The depth has {len(samples)} bytes, but the metadata declare {size}. Export the "
             "capture again."
         )
     return samples
@@ -186,7 +186,7 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
     """
     if capture.is_dir() and not (capture / METADATA).is_file():
         raise DatasetError(
-            f"{capture}: This export of Record3D has depth as OpenEXR, which is not supported. "
+            f"{capture}: This export of Record3D stores depth as OpenEXR, which is not supported. "
             f"{_REMEDY}"
         )
     try:
@@ -200,7 +200,7 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
             pixels(fields.get("dh", portrait[1]), "dh"),
         )
         if size[0] * size[1] > MAXIMUM_SAMPLES:
-            raise DatasetError(f"They announce {size[0]} x {size[1]} pixels of depth.")
+            raise DatasetError(f"They declare {size[0]} x {size[1]} pixels of depth.")
     except (ValueError, RecursionError, SceneprintError) as cause:
         reason = printable(f"{cause!s:.200}")
         raise DatasetError(

@@ -348,7 +348,7 @@ def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _No
         if is_solid(scan_tail, form):
             node.scan = form, T_base_scan
         elif not node.cameras:
-            left_out["laser scans of two dimensions"] += 1
+            left_out["two-dimensional laser scans"] += 1
     return node
 
 
@@ -457,7 +457,7 @@ def _note(sequences: list[FrameSequence], is_optimised: bool, left_out: Counter[
             "odometry poses, because the database has no optimised poses: "
             "open and close it in RTAB-Map to store them"
         )
-    return f"{frames} frames taken, {poses}{_listed(left_out, '; left out: ', '')}"
+    return f"{frames} frames taken, {poses}{_listed(left_out, '; skipped: ', '')}"
 
 
 def _listed(counts: Counter[str], before: str, after: str) -> str:

@@ -109,14 +109,14 @@ def matrix(blob: bytes) -> NDArray[Any]:
     dtype = np.dtype(_ELEMENTS[kind & 7])
     size = rows * columns * channels * dtype.itemsize
     if size > _MAXIMUM_MATRIX_BYTES:
-        raise BrokenBlob(f"a matrix announces {size} bytes, which exceeds the limit")
+        raise BrokenBlob(f"a matrix declares {size} bytes, which exceeds the limit")
     stream = zlib.decompressobj()
     try:
         content = stream.decompress(blob[:-12], size + 1)
     except zlib.error as cause:
         raise BrokenBlob("a matrix cannot be decompressed") from cause
     if len(content) != size:
-        raise BrokenBlob("the size of a matrix differs from the announced size")
+        raise BrokenBlob("the size of a matrix differs from the declared size")
     return np.frombuffer(content, dtype).reshape(rows, columns, channels)
 
 
@@ -152,7 +152,7 @@ def _camera_of(
     fx: float, fy: float, cx: float, cy: float, width: float = 0, height: float = 0, *, local: bytes
 ) -> RtabmapCamera:
     if not np.isfinite((fx, fy, cx, cy, width, height)).all():
-        raise BrokenBlob("a calibration is not finite")
+        raise BrokenBlob("a calibration has values that are not finite")
     T = transform(local) if local else np.array(_OPTICAL)
     if T is None:
         raise BrokenBlob("the local transform of a camera is null")
@@ -225,7 +225,7 @@ def depth_samples(blob: bytes) -> Samples:
     kind, width, height = header
     if not 1 <= width * height <= MAXIMUM_SAMPLES:
         raise UnreadableFrame(
-            f"The depth image announces {width} x {height} samples; it must have 1 to "
+            f"The depth image declares {width} x {height} samples; it must have 1 to "
             f"{MAXIMUM_SAMPLES}. {_AGAIN}"
         )
     if kind == "millimetres":

@@ -57,13 +57,13 @@ def read_kitti(data: bytes) -> FilePoints:
         row = ",".join(("x", "y", "z", "i", "ring", "time", "a", "b")[:floats])
         raise UnreadableCloud(
             f"According to the values, a row of the file has {floats} numbers, but a row of a "
-            f'KITTI scan has 4. State the row with `--row {row}` or with "row" in clouds.json, or '
+            f'KITTI scan has 4. Specify it with `--row {row}` or with "row" in clouds.json, or '
             "send x, y and z as NPY with the shape (N, 3)."
         )
     if rest or not count:
         raise UnreadableCloud(
             f"The file has {len(data)} bytes, but each point of a KITTI scan has {_KITTI_ROW}: "
-            "x, y, z and intensity as float32. Copy the file again, or state its actual format."
+            "x, y, z and intensity as float32. Copy the file again, or specify its actual format."
         )
     check_count(count, MAXIMUM_POINTS)
     rows = np.frombuffer(data, "<f4").reshape(count, 4)
@@ -128,7 +128,7 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     expected = count * width * header.dtype.itemsize
     if len(data) - header.start != expected:
         raise UnreadableCloud(
-            f"The NPY header announces {count} points of {width} values, but "
+            f"The NPY header declares {count} points of {width} values, but "
             f"{len(data) - header.start} of {expected} bytes follow. Copy or write the file again."
         )
     numbers = np.frombuffer(data, header.dtype, offset=header.start)
@@ -331,7 +331,7 @@ def decode_scan(
         if len(data) > MAXIMUM_CLOUD_BYTES:
             raise UnreadableCloud(
                 f"The file has {len(data)} bytes; the limit is {MAXIMUM_CLOUD_BYTES}. "
-                "Thin the cloud, or send it in parts."
+                "Downsample the cloud, or send it in parts."
             )
         recognised = _format(data, file_format)
         raw = (points_of or read_points)(data, recognised, viewpoint, units_per_metre)
@@ -341,7 +341,7 @@ def decode_scan(
                 f"{missing} of {raw.file_points} points are missing, and the {len(points)} valid "
                 f"points are fewer than {FEWEST_POINTS}. Check that the sensor saw surfaces."
             )
-        note = f"{missing} missing points left out" if missing else ""
+        note = f"{missing} missing points skipped" if missing else ""
         if len(points) > MOST_POINTS:
             before = len(points)
             points, edge = thinned(points, MOST_POINTS)
@@ -380,19 +380,19 @@ def _format(data: bytes, stated: CloudFormat | None) -> CloudFormat:
     recognised = format_of(data)
     if stated == "kitti" and recognised is not None:
         raise UnreadableCloud(
-            f"This is not a KITTI scan: it starts like a {recognised.upper()} file. State that "
-            "format, or none."
+            f"This is not a KITTI scan: it starts like a {recognised.upper()} file. Specify that "
+            "format, or omit it."
         )
     if stated is not None and stated not in _READERS:
         raise UnreadableCloud(
-            f"{stated!r:.40} is not a format of points. Use one of {', '.join(_READERS)}."
+            f"{stated!r:.40} is not a point cloud format. Use one of {', '.join(_READERS)}."
         )
     if not data:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
     if stated is None and recognised is None:
         raise UnreadableCloud(
             f"According to its first bytes, the format is none of {titles_of('cloud')}. Write one "
-            "of these; for a KITTI scan, state the format kitti."
+            "of these; for a KITTI scan, specify the format kitti."
         )
     chosen = stated or recognised
     assert chosen is not None

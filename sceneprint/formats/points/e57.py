@@ -115,7 +115,7 @@ class E57Scan:
                 packet = next(packets, None)
                 if packet is None:
                     raise UnreadableCloud(
-                        f"The scan announces {self.count} points, but they end before point "
+                        f"The scan declares {self.count} points, but they end before point "
                         f"{first + n}. {_AGAIN}"
                     )
                 for stream, place in zip(streams, columns, strict=True):
@@ -160,10 +160,10 @@ def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
             f"The file has version {major} of E57; only version 1 is supported. {_AS_PLY}"
         )
     if not _PAGE_BYTES[0] <= page <= _PAGE_BYTES[1] or page % 4:
-        raise UnreadableCloud(f"The header of the file announces pages of {page} bytes. {_AGAIN}")
+        raise UnreadableCloud(f"The header of the file declares pages of {page} bytes. {_AGAIN}")
     if length > len(data) or length % page:
         raise UnreadableCloud(
-            f"The header of the file announces {length} bytes, but it has {len(data)}. {_AGAIN}"
+            f"The header of the file declares {length} bytes, but it has {len(data)}. {_AGAIN}"
         )
     if xml_bytes > _MAXIMUM_XML_BYTES:
         raise UnreadableCloud(
@@ -303,8 +303,8 @@ def _scan(pages: _Pages, node: Element, number: int) -> E57Scan:
     count = _whole(points.get("recordCount"), place)
     if not 0 <= count <= MAXIMUM_SCAN_POINTS:
         raise UnreadableCloud(
-            f"{place} announces {count} points; the limit is {MAXIMUM_SCAN_POINTS}. Thin the scan, "
-            "or export it in parts."
+            f"{place} declares {count} points; the limit is {MAXIMUM_SCAN_POINTS}. Downsample the "
+            "scan, or export it in parts."
         )
     fields = tuple(_fields(prototype, place))
     bits = {one.name: one.bits for one in fields}
@@ -408,7 +408,7 @@ def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
     """
     kind, length, data_start, _ = _SECTION.unpack(pages.read(start, _SECTION.size))
     if kind != 1:
-        raise UnreadableCloud(f"The header of the file has a wrong offset of points. {_AGAIN}")
+        raise UnreadableCloud(f"The header of the file has a wrong offset for its points. {_AGAIN}")
     place, end = pages.logical(data_start), start + length
     while place + 4 <= end:
         packet, _, last = struct.unpack("<BBH", pages.read(place, 4))

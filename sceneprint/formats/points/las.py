@@ -76,7 +76,7 @@ def inflated_records(
         )
     if count * length > min(_MOST, _FREE + _MOST_RATIO * len(data)):
         raise UnreadableCloud(
-            f"The LAZ file announces {count} points of {length} bytes, which exceeds "
+            f"The LAZ file declares {count} points of {length} bytes, which exceeds "
             f"{_MOST_RATIO} times the size of the file, {len(data)} bytes. {_AGAIN}"
         )
     _check_chunks(data, start, length, kinds, count, chunk)
@@ -140,7 +140,7 @@ def _laszip_vlr(data: FileBytes) -> bytes:
     for user, number, content in las_records(data):
         if (user, number) == (b"laszip encoded", 22204):
             return content
-    raise UnreadableCloud(f"The LAZ file does not tell how its points are packed. {_AGAIN}")
+    raise UnreadableCloud(f"The LAZ file does not say how its points are packed. {_AGAIN}")
 
 
 def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
@@ -152,7 +152,7 @@ def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
         if chunk and len(vlr) >= 34 + 6 * items:
             kinds = [struct.unpack_from("<HH", vlr, 34 + 6 * i) for i in range(items)]
             return compressor, coder, chunk, kinds
-    raise UnreadableCloud(f"The LAZ file does not tell how its points are packed. {_AGAIN}")
+    raise UnreadableCloud(f"The LAZ file does not say how its points are packed. {_AGAIN}")
 
 
 def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
@@ -250,7 +250,7 @@ def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     else:
         if count * length > len(data) - start:
             raise UnreadableCloud(
-                f"The LAS header announces {count} points of {length} bytes, but "
+                f"The LAS header declares {count} points of {length} bytes, but "
                 f"{len(data) - start} of {count * length} bytes follow. {_AGAIN}"
             )
         table = np.frombuffer(data, row, count, start)

@@ -56,7 +56,7 @@ def inflate(packed: Bytes, size: int) -> Bytes:
     """
     if size > MOST_RATIO * len(packed):  # this check must precede the allocation
         raise UnreadableCloud(
-            f"The file announces {size} bytes compressed to {len(packed)}, but the maximum ratio "
+            f"The file declares {size} bytes compressed to {len(packed)}, but the maximum ratio "
             f"of LZF is {MOST_RATIO}. Copy or write the file again."
         )
     out = np.empty(size, np.uint8)
@@ -158,7 +158,7 @@ def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
             len(data) - start < count * width
         ):  # more bytes are accepted, since some files are padded
             raise UnreadableCloud(
-                f"The PCD header announces {count} points of {width} bytes, but "
+                f"The PCD header declares {count} points of {width} bytes, but "
                 f"{len(data) - start} of {count * width} bytes follow. {_AGAIN}"
             )
         kinds = [(field.name, field.kind, field.count) for field in fields]
@@ -194,7 +194,7 @@ def _compressed_blocks(
     packed, inflated = struct.unpack_from("<II", data, start)
     if inflated != size or packed > len(data) - start - 8:
         raise UnreadableCloud(
-            f"The PCD header announces {size} bytes of points, but the body states {inflated} "
+            f"The PCD header declares {size} bytes of points, but the body states {inflated} "
             f"bytes compressed to {packed}, of which {len(data) - start - 8} exist. {_AGAIN}"
         )
     most_bytes = MAXIMUM_INFLATED // MAXIMUM_POINTS * most

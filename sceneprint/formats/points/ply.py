@@ -83,7 +83,7 @@ def value_offsets(
         start, rows = _walk(view, start, places, sizes, lengths, signed, values, order == "<")
         if rows < n:
             raise UnreadableCloud(
-                f"The file ends in row {first + rows + 1} of {count}, whose lists announce more "
+                f"The file ends in row {first + rows + 1} of {count}, whose lists declare more "
                 "bytes than remain. Copy or write the file again."
             )
         yield places, start
@@ -209,7 +209,7 @@ def element_end(data: FileBytes, start: int, element: Element, order: str) -> in
     left = len(data) - start
     if element.count * element.least > left:
         raise UnreadableCloud(
-            f"The PLY header announces {element.count} rows of {element.name}, at least "
+            f"The PLY header declares {element.count} rows of {element.name}, at least "
             f"{element.count * element.least} bytes, but {left} bytes remain. {_AGAIN}"
         )
     if not element.has_lists:
@@ -278,7 +278,7 @@ def _parse_header(lines: list[str]) -> tuple[str, list[Element]]:
     for element in elements:
         if element.count and not element.properties:
             raise UnreadableCloud(
-                f"The PLY header announces {element.count} rows of {element.name!r:.40} without "
+                f"The PLY header declares {element.count} rows of {element.name!r:.40} without "
                 f"properties. {_AGAIN}"
             )
     return order, [_with_axis_names(element) for element in elements]
@@ -298,8 +298,8 @@ def _property(words: list[str]) -> Property:
         if length[0] != "f":
             return Property(words[3], _TYPES[words[2]], length)
     raise UnreadableCloud(
-        f"The PLY header has the property {' '.join(words)!r:.60}; supported are the types "
-        f"{', '.join(list(_TYPES)[:8])}, and lists of them. {_AGAIN}"
+        f"The PLY header has the property {' '.join(words)!r:.60}; only the types "
+        f"{', '.join(list(_TYPES)[:8])} and lists of them are supported. {_AGAIN}"
     )
 
 

@@ -53,11 +53,11 @@ class FilePoints:
 
 
 def check_count(count: int, most: int) -> None:
-    """Raise UnreadableCloud if a header announces more than `most` points."""
+    """Raise UnreadableCloud if a header declares more than `most` points."""
     if count > most:
         raise UnreadableCloud(
-            f"The file announces {count} points; the limit is {most}. "
-            "Thin the cloud to a voxel grid of a few centimetres, or send it in parts."
+            f"The file declares {count} points; the limit is {most}. Downsample the cloud to a "
+            "voxel grid of a few centimetres, or send it in parts."
         )
 
 
@@ -98,8 +98,8 @@ GOOD, ENDS, FEW, MANY, NO_NUMBER, CORNERS = 0, 1, 2, 3, 4, 5
 
 ROW_ERRORS = {
     ENDS: "the file ends before it",
-    FEW: "it has fewer values than the header announces",
-    MANY: "it has more values than the header announces",
+    FEW: "it has fewer values than the header declares",
+    MANY: "it has more values than the header declares",
     NO_NUMBER: "one of its values is not a number",
     CORNERS: "its polygon has fewer than 3 corners, or more than 1024",
 }
@@ -145,10 +145,10 @@ def skip_lines(text: Bytes, start: int, count: int) -> int:
 
 
 def check_room(text: Bytes, start: int, count: int, columns: int) -> None:
-    """Raise UnreadableCloud if a header announces more rows than fit into the rest of the file."""
+    """Raise UnreadableCloud if a header declares more rows than fit into the rest of the file."""
     if count * columns * 2 - 1 > len(text) - start:  # each value has at least a digit and a space
         raise UnreadableCloud(
-            f"The header announces {count} rows of {columns} values, but only "
+            f"The header declares {count} rows of {columns} values, but only "
             f"{len(text) - start} bytes follow. Copy or write the file again."
         )
 

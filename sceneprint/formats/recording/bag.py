@@ -278,7 +278,8 @@ def _advice(path: Path) -> str:
     suffix = path.suffix.lower()
     tool = {".mcap": "mcap recover", ".bag": "rosbag reindex"}.get(suffix, "ros2 bag reindex")
     return (
-        f"If the recorder was killed before it closed the file, run `{tool}`; else copy it again."
+        f"If the recorder was killed before it closed the file, run `{tool}`; otherwise, copy it "
+        "again."
     )
 
 
@@ -309,7 +310,7 @@ def _types(*, ros1: bool) -> Typestore:
 
 
 def _limit_decompression() -> None:
-    """Limit decompressed chunks to their announced size and to MAXIMUM_CHUNK_BYTES.
+    """Limit decompressed chunks to their declared size and to MAXIMUM_CHUNK_BYTES.
 
     rosbags decompresses a chunk completely before it checks the size, so a damaged or hostile chunk
     could fill the memory. Its tables of decompressors are replaced by limited functions.
@@ -392,7 +393,7 @@ def _lz4() -> Any:
 def _inflate(stream: Any, data: bytes, most: int) -> bytes:
     """Decompress a chunk of at most `most` bytes."""
     if most > MAXIMUM_CHUNK_BYTES:
-        raise ValueError(f"a chunk announces {most} bytes, more than {MAXIMUM_CHUNK_BYTES}")
+        raise ValueError(f"a chunk declares {most} bytes, more than {MAXIMUM_CHUNK_BYTES}")
     content: bytes = stream.decompress(data, most + 1)
     if len(content) > most or not stream.eof:
         raise ValueError(f"a chunk does not end within {most} bytes")

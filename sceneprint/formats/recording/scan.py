@@ -279,7 +279,8 @@ class _Scanner:
         if kind == CAMERA:
             if len(scan.infos) == MOST_INFOS:
                 raise DatasetError(
-                    f"{message.topic} has more than {MOST_INFOS} different contents. Split the bag."
+                    f"{message.topic} has more than {MOST_INFOS} different camera infos. Split the "
+                    "bag."
                 )
             number = len(scan.infos) if is_calibrated(fields) else -1
             scan.infos.extend([] if number < 0 else [fields])

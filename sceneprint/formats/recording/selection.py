@@ -494,7 +494,7 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
         if count
     ]
     if left:
-        text += f"; left out: {', '.join(left)}"
+        text += f"; skipped: {', '.join(left)}"
     if len(motions) > 1:
         text += f"; split into {len(motions)} parts, because stamps go back"
     remarks = dict.fromkeys(one for motion in motions for one in motion.remarks)

@@ -128,7 +128,7 @@ def _joined(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
         [np.asarray(one.vertices, np.float64) @ T[:3, :3].T + T[:3, 3] for one, T in chosen]
     )
     omitted = len(parts) - len(chosen)
-    notes = (f"{omitted} parts without triangles were left out.",) if omitted else ()
+    notes = (f"{omitted} parts without triangles were skipped.",) if omitted else ()
     if not meshes:
         return FileMesh(vertices, None, notes)
     triangles, first = list[Ints32](), 0
@@ -155,7 +155,7 @@ def _gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
             )
         if total > len(data):
             raise UnreadableCloud(
-                f"The glTF header announces {total} bytes, but the file has {len(data)}. {_AGAIN}"
+                f"The glTF header declares {total} bytes, but the file has {len(data)}. {_AGAIN}"
             )
     try:
         fields = json.loads(data[_GLB_HEADER : _GLB_HEADER + length] if length else data[:])
@@ -186,7 +186,7 @@ def _check_gltf(fields: dict[str, Any]) -> None:
         if "sparse" in accessor or "bufferView" not in accessor:
             raise UnreadableCloud(
                 "The glTF file has sparse arrays, or arrays without bytes, which are not "
-                "supported. Export it again without them."
+                "supported. Export the file again without them."
             )
 
 

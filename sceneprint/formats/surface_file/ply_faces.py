@@ -45,7 +45,7 @@ def read_faces(data: FileBytes) -> Ints32 | None:
 
     Raises
     ------
-    UnreadableCloud : If the faces have no list of vertices, or fewer or more bytes than announced,
+    UnreadableCloud : If the faces have no list of vertices, or fewer or more bytes than declared,
         a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.
     """
     order, elements, start = ply_header(data)

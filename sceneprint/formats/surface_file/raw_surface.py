@@ -72,7 +72,7 @@ def gather(
     Parameters
     ----------
     blocks : coordinates in blocks (n, 3) of float64
-    count : announced number of points
+    count : declared number of points
     units_of : function that estimates the units per metre of a cloud from its first points; None
         for the vertices of a mesh, which are returned completely, including missing vertices
     most : maximum number of points of the thinned cloud
@@ -85,7 +85,7 @@ def gather(
 
     Raises
     ------
-    UnreadableCloud : If there are more points than announced, or a point is too far from the
+    UnreadableCloud : If there are more points than declared, or a point is too far from the
         others.
     """
     cloud = _Cloud(count, units_of, most)
@@ -136,8 +136,8 @@ class _Cloud:
     def _thin(self) -> None:
         if self._units_of is None:
             raise UnreadableCloud(
-                f"The file announces {len(self._points)} vertices, but more follow. "
-                "Copy or write the file again."
+                f"The file declares {len(self._points)} vertices, but more follow. Copy or write "
+                "the file again."
             )
         points = self._points[: self._n]
         reach = float(np.abs(points).max(initial=0.0))

@@ -297,7 +297,7 @@ def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None
     if raw.triangles is None:
         missing = raw.file_points - len(raw.points)
         if missing and raw.voxel is None:
-            notes.append(f"{missing} missing points were left out.")
+            notes.append(f"{missing} missing points were skipped.")
         if len(raw.points) < FEWEST_POINTS:
             raise UselessFrame(
                 f"The file has {len(raw.points)} valid points, fewer than {FEWEST_POINTS}. Check "
@@ -319,7 +319,7 @@ def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None
             "file, and write it again."
         )
     if omitted:
-        notes.append(f"{omitted} triangles without area or with missing vertices were left out.")
+        notes.append(f"{omitted} triangles without area or with missing vertices were skipped.")
     return points, triangles
 
 

@@ -219,7 +219,7 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
         if condition == "sound" and not recovered:
             continue
         with folder.store.database.read() as connection:
-            if _current_reference(connection, one) is None:  # the row was deleted meanwhile
+            if _current_reference(connection, one) is None:  # the row was deleted in the meantime
                 continue
         finding = partial(
             Finding, what=one.what, map=one.map, frame_id=one.frame_id,
@@ -235,7 +235,7 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
             )  # fmt: skip
         elif condition == "missing" and (one.on_its_way or is_known_loss(one.reason)):
             yield finding(
-                kind=f"missing-{kind}", severity="note", means=f"{means}; the loss is on record"
+                kind=f"missing-{kind}", severity="note", means=f"{means}; the loss is recorded"
             )
         else:
             move = "move the file to the quarantine, and " if condition == "damaged" else ""

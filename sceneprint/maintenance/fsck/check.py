@@ -3,7 +3,7 @@
     Settings  --fsck-->  Findings, as they are discovered
 
 Without `repair` the check writes nothing. With it, a transaction verifies each finding again and
-repairs it at once, since services and workers may run meanwhile.
+repairs it at once, since services and workers may run in the meantime.
 """
 
 from __future__ import annotations

@@ -304,7 +304,7 @@ def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
     frame, row, damaged = one.frame, one.map, _damaged(one)
     _remove_signatures(connection, frame.number, damaged)
     if row.model_id in one.signed and row.model_id not in damaged:
-        for model_id in damaged:  # queries use the sound signature meanwhile
+        for model_id in damaged:  # queries use the sound signature in the meantime
             enqueue(connection, REENCODE, frame.number, PRIORITY, model_id)
         return "a worker computes it again from the upload"
     condition = folder.store.blobs.condition(frame.blob)

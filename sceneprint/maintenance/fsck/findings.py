@@ -31,7 +31,7 @@ GRACE_S = 3600.0
 #: Number of rows that are read in one transaction.
 BLOCK = 64
 #: Result of a repair that is no longer necessary.
-GONE = "nothing: the data was repaired or deleted meanwhile"
+GONE = "nothing: the data was repaired or deleted in the meantime"
 #: Reason why a blob cannot be moved.
 BUSY_BLOBS = (
     "a backup or another process that removes blobs is running; run the check again after it ends"

@@ -564,7 +564,7 @@ class FolderBlobs(Blobs):
                         yield name
 
     def entries(self) -> Iterator[BlobEntry]:
-        """See `Blobs.entries`. Files that are removed meanwhile are skipped."""
+        """See `Blobs.entries`. Files that are removed in the meantime are skipped."""
         folders = [self._folder]
         while folders:
             with os.scandir(folders.pop()) as entries:

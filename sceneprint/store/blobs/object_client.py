@@ -223,8 +223,8 @@ class Objects:
             data = obstore.get_range(self._large, key, start=start, length=length)
         if len(data) != length:
             raise UnusableStore(
-                f"{self.url}: {key} cannot be read, because another program changed it meanwhile. "
-                "Try again."
+                f"{self.url}: {key} cannot be read, because another program changed it in the "
+                "meantime. Try again."
             )
         return bytes(data)
 
@@ -259,7 +259,7 @@ class Objects:
         """Return the properties of an object; None if it does not exist."""
         import obstore
 
-        with self._explained(f"{key} cannot be looked at"):
+        with self._explained(f"{key} cannot be inspected"):
             try:
                 one = obstore.head(self._small, key)
             except FileNotFoundError as error:

@@ -288,7 +288,7 @@ class ObjectBlobs(Blobs):
         try:
             for chunk in self.objects.chunks(_key(digest), size):
                 hashed.update(chunk)
-        except FileNotFoundError:  # the blob was removed meanwhile
+        except FileNotFoundError:  # the blob was removed in the meantime
             return "missing"
         return "sound" if hashed.hexdigest() == digest else "damaged"
 

@@ -132,7 +132,7 @@ class SessionLocks(Locks):
         # a blob that is removed after the turn is doomed until the end of the removal
         if digest is not None and self._reader.query(_DOOMED, digest) == math.inf:
             return
-        # other threads use the shared connection in `removals` meanwhile
+        # other threads use the shared connection in `removals` in the meantime
         connection = self._database.driver_connection()
         try:
             with self._database.explained():
