@@ -66,5 +66,5 @@ def test_a_service_needs_neither_lab_nor_viewers(tmp_path: Path) -> None:
         assert error.endswith("Run: pip install sceneprint-viewers\n")
     code, error = found["upload"]
     assert code == 2
-    assert "nowhere.png: There is no such file" in error
+    assert "nowhere.png: The file or folder does not exist" in error
     assert not file.exists()

@@ -500,7 +500,7 @@ def test_a_request_without_an_answer_may_be_carried_out_later(
     with closing(open_store(postgres_url, bucket)) as remover:
         with pytest.raises(UnusableStore, match="cannot be removed"):
             collect_blobs(remover, [digest])
-        with pytest.raises(StoreLocked, match="may still remove them"):
+        with pytest.raises(StoreLocked, match="may still remove the blob"):
             alone(engine, small)
         held.release()
         until(lambda: digest not in engine.store.blobs.digests())

@@ -70,7 +70,7 @@ def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
     forsaken.execute(f"SELECT pg_cancel_backend(pid) {WAITING}")
     thread.join(PATIENCE_S)
     assert [type(error) for error in raised] == [StoreAway]  # it may be stored
-    assert "an operator ended the wait for a standby" in str(raised[0])
+    assert "An operator ended the wait for a standby" in str(raised[0])
 
 
 def test_other_warnings_are_no_doubt(server_store: Store) -> None:
