@@ -57,7 +57,7 @@ def told(engine: Engine) -> Iterator[list[EventRow]]:
 
 def _follow(database: Database, found: list[EventRow], ended: threading.Event) -> None:
     async def follow() -> None:
-        feed = Feed(database, most=1, kept=1000)
+        feed = Feed(database, most=1, retained=1000)
         feed.join()
         reading = asyncio.ensure_future(_gather(feed, found))
         while not ended.is_set():
