@@ -346,7 +346,7 @@ async def administers(caller: Sender) -> None:
 def _forbidden(caller: Caller, scope: Scope, what: str) -> Forbidden:
     return Forbidden(
         f"The key {caller.name!r:.80} does not have the scope {scope!r} for {what}. Ask the "
-        "operator for a key that has it."
+        "operator for a key with this scope."
     )
 
 

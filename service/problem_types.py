@@ -51,7 +51,7 @@ PROBLEM_TYPES = {
         405, "`Allow` lists the methods of the path.", "The path does not have this method."
     ),
     "NotAcceptable": ProblemType(
-        406, "Leave `Accept` out.", "`Accept` names no type that the operation returns."
+        406, "Omit `Accept`.", "`Accept` names no type that the operation returns."
     ),
     "SlowBody": ProblemType(
         408, "Send the body faster: within 30 s plus 4 s for each MiB, without 10 s of silence."
@@ -109,7 +109,9 @@ PROBLEM_TYPES = {
         f"stored. Queries still work. {_LOG} Retry later.",
     ),
     "StoreAway": ProblemType(
-        503, "Repeat the request. It may have been stored already; that is safe.", retry_after_s=1,
+        503,
+        "Repeat the request. It may have been stored already; repeating it is safe.",
+        retry_after_s=1,
         detail="The service's database or object store does not respond. The request may or may "
         f"not have been stored; it is safe to send it again. {_LOG} Retry later.",
     ),

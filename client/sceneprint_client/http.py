@@ -458,7 +458,7 @@ def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
         return ssl.create_default_context(cafile=file or None, capath=folder or None)
     except OSError as error:
         raise ValueError(
-            f"SSL_CERT_FILE or SSL_CERT_DIR names no certificates: {error.strerror or error}"
+            f"SSL_CERT_FILE or SSL_CERT_DIR contains no certificates: {error.strerror or error}"
         ) from error
 
 

@@ -477,6 +477,6 @@ def _map_import_options(options: ImportOptions | None, name: str | None) -> Impo
 def _check_overlap(least: float) -> None:
     if not 0.0 <= least <= 1.0:
         raise InvalidRequest(
-            f"The smallest overlap is {least}. Pass one from 0 to 1.",
+            f"The smallest overlap is {least}. Pass a value from 0 to 1.",
             (("min_overlap", "out of range"),),
         )

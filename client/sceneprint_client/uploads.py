@@ -181,7 +181,7 @@ def upload_fields(priority: int, if_novel: float | bool | None) -> dict[str, str
     """Return the non-default fields of an upload other than the frame."""
     if abs(priority) > MOST_PRIORITY:
         raise InvalidRequest(
-            f"The priority is {priority}. Pass one from {-MOST_PRIORITY} to {MOST_PRIORITY}.",
+            f"The priority is {priority}. Pass a value from {-MOST_PRIORITY} to {MOST_PRIORITY}.",
             (("priority", "out of range"),),
         )
     novelty = novelty_of(if_novel)

@@ -352,7 +352,7 @@ def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
         lines.append(
             f"Of {r.tested} test views of this file, {r.coverage:.0%} are found in the map: "
             f"{r.found} found, {r.ambiguous} ambiguous, {r.not_found} not found, {r.wrong} wrong. "
-            "Real frames are found less often; try some."
+            "Real frames are found less often; test with real frames too."
         )
     for area in r.weak[:_MOST_WEAK]:
         at = _numbers(area.centre.x, area.centre.y, area.centre.z)

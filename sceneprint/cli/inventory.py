@@ -104,7 +104,9 @@ def run_frames(options: argparse.Namespace) -> int:
     if options.trajectory is not None and not one_session:
         raise InvalidRequest("--trajectory requires a session. Add --session NAME.")
     if options.trajectory is not None and options.mcap is not None:
-        raise InvalidRequest("--trajectory does not write a scene. Run the command twice.")
+        raise InvalidRequest(
+            "--trajectory does not write a scene. Use a separate command for the scene."
+        )
     check_scene(options)
     with open_client(options) as client, open_scene(options, client) as scene:
         if options.frame_id is not None:

@@ -664,8 +664,8 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
         archive.lay_out(own)
         if not archive.sequences and archive.is_record3d:
             raise UnreadableArchive(
-                "This is a capture of Record3D, whose depth the service cannot decompress. Upload "
-                "it with `sceneprint upload MAP FILE.r3d`."
+                "This is a capture of Record3D, and the service cannot decompress its depth. "
+                "Upload it with `sceneprint upload MAP FILE.r3d`."
             )
         if not archive.sequences and not archive.refused:
             raise UnreadableArchive(

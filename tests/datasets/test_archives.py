@@ -251,8 +251,8 @@ def test_names_that_lead_elsewhere_are_refused_and_the_rest_is_taken(
         assert len(archive.refused) == len(odd) + 4
     assert "absolute" in reasons["/etc/a.png"]
     assert "absolute" in reasons["C:\\d.png"]
-    assert "leads out" in reasons["../../b.png"]
-    assert "leads out" in reasons["s/../../c.png"]
+    assert "points out" in reasons["../../b.png"]
+    assert "points out" in reasons["s/../../c.png"]
     assert "not printable" in reasons["s/e\\n.png"]
     assert "not printable" in reasons["s/\\udcff.png"]
     assert "15 folders" in reasons[deep]

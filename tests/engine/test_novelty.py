@@ -80,8 +80,8 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(
     second = send(empty, 1, between)
     assert second.state == FrameState.REDUNDANT
     assert second.reason == (
-        f"the map already has this place: frame {first.frame_id} is at {near:.3f} of the distance "
-        f"of unrelated frames (required: more than {between:g})"
+        f"the map already covers this place: the distance to frame {first.frame_id} is {near:.3f} "
+        f"of the distance of unrelated frames (required: more than {between:g})"
     )
     job = empty.get_job(second.job_id)
     assert (job.state, job.error) == (JobState.SUCCEEDED, None)

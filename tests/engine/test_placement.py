@@ -262,7 +262,7 @@ def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> Non
     skew["pose"]["matrix"][0][0] += 0.5
     with pytest.raises(InvalidPose, match="The prior"):
         localized(full, uploads[8], prior=skew)
-    with pytest.raises(InvalidRequest, match="A prior needs validated matches"):
+    with pytest.raises(InvalidRequest, match="A prior requires validated matches"):
         full.queries.upload(
             ["hall"], uploads[8].data, uploads[8].meta,
             Query.model_validate({"stages": "retrieve", "prior": prior_at(uploads[8])}),

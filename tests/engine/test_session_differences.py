@@ -110,7 +110,7 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
 def test_sessions_that_cannot_be_compared_are_refused(compared: Any) -> None:
     engine, _ = compared
     for asked, why in (
-        ({"before": "a", "after": "z"}, "'z' of map 'rooms' has no indexed frame with a pose"),
+        ({"before": "a", "after": "z"}, "'z' of map 'hall' has no indexed frame with a pose"),
         ({"before": "a", "after": "c"}, "share no parent frame"),
         ({"before": "a", "after": "b", "parent_frame": "x"}, "parent frame 'x'. Choose from"),
     ):

@@ -269,7 +269,7 @@ def test_after_its_time_a_deletion_is_for_good(full: Engine) -> None:
     end_undo(full)
     with pytest.raises(UnknownDeletion, match="has expired"):
         restore(full, deletion)
-    with pytest.raises(UnknownFrame, match="cannot be restored any more"):
+    with pytest.raises(UnknownFrame, match="can no longer be restored"):
         full.tombstones.restore_one("hall", names[0])
     assert full.tombstones.list_all("hall", None, 9).items == []
     assert full.tombstones.purge() == 2

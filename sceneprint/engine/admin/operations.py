@@ -406,7 +406,8 @@ def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey
     """
     if not 0 <= overlap_s <= MOST_OVERLAP_S:
         raise InvalidRequest(
-            f"An overlap of {overlap_s:g} s is not between 0 s and 30 days. Choose a shorter one.",
+            f"An overlap of {overlap_s:g} s is not between 0 s and 30 days. Choose a shorter "
+            "overlap.",
             (("overlap_s", "not between 0 and 2592000"),),
         )
     with store.database.write() as connection:

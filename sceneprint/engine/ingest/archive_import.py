@@ -136,7 +136,7 @@ def _added(
 
 
 def _too_large() -> UploadOutcome:
-    reason = "The frame needs more memory than a worker may use. Send a smaller one."
+    reason = "The frame needs more memory than a worker may use. Send a smaller frame."
     return UploadOutcome(None, error=errors.UnreadableFrame(reason))
 
 

@@ -73,7 +73,8 @@ def find_duplicate(
         if differing:
             raise errors.FrameConflict(
                 f"Frame {frame.id} of map {row.name} already exists with a different "
-                f"{', '.join(differing)}. Delete it first, send it unchanged, or use another id."
+                f"{', '.join(differing)}. Delete the stored frame first, send the frame unchanged, "
+                "or use another id."
             )
         return frame
     alike = frames_of_content(connection, row.number, content)

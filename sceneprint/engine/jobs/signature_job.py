@@ -329,8 +329,8 @@ def why_redundant(
         return None
     other = frame_of(connection, nearest[0]).id
     return (
-        f"the map already has this place: frame {other} is at {share:.3f} of the distance of "
-        f"unrelated frames (required: more than {novelty:g})"
+        f"the map already covers this place: the distance to frame {other} is {share:.3f} of the "
+        f"distance of unrelated frames (required: more than {novelty:g})"
     )
 
 

@@ -159,7 +159,7 @@ class Tombstones:
         )
 
     def purge(self, *, everything: bool = False) -> int:
-        """Purge tombstones that cannot be restored any more; with `everything`, all tombstones.
+        """Purge tombstones that can no longer be restored; with `everything`, all tombstones.
 
         Returns
         -------

@@ -355,8 +355,8 @@ class QueryLog:
             return
         raise QuotaExceeded(
             f"Map {row.map!r} keeps {count} of at most {MOST_KEPT} answers, and all kept answers "
-            f"take {size} of at most {self._room // 2} bytes, so this one was not kept. Release "
-            "some with DELETE /v1/queries/{query_id}/keep, or ask the operator to raise "
+            f"take {size} of at most {self._room // 2} bytes, so this answer was not kept. Release "
+            "kept answers with DELETE /v1/queries/{query_id}/keep, or ask the operator to raise "
             "SCENEPRINT_QUERY_LOG_BYTES."
         )
 

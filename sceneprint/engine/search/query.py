@@ -473,7 +473,7 @@ def check_localizes(query: Query) -> None:
     """Raise InvalidRequest unless a query includes validation, which a pose needs."""
     if "validate" not in query.stages:
         raise InvalidRequest(
-            "A pose needs validated matches. Omit `stages`, or include `validate`.",
+            "A pose requires validated matches. Omit `stages`, or include `validate`.",
             (("stages", "without validate"),),
         )
 

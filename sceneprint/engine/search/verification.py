@@ -229,7 +229,7 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
         return None
     if "validate" not in query.stages:
         raise InvalidRequest(
-            "A prior needs validated matches. Omit `stages`, or include `validate`.",
+            "A prior requires validated matches. Omit `stages`, or include `validate`.",
             (("prior", "without validate"),),
         )
     if len(places) > 1:
