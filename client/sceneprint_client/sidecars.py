@@ -28,7 +28,7 @@ _NO_UP = (
     "up is {}, not a direction. Write a list of three numbers of length 1 in the sensor's axes, "
     "such as [0, -1, 0] for a camera that is held level."
 )
-_PARENTS = 4  #: number of searched folders above that of the frames
+_PARENTS = 4  #: number of folders to search above the folder of the frames
 _MAXIMUM_BYTES = 65_536
 
 

@@ -33,7 +33,7 @@ _LEAST_M, _LEAST_RAD = 0.01, math.radians(0.3)
 _ANSWER_M, _ANSWER_RAD = 0.03, math.radians(1.0)
 #: Factor of the deviation of repeated answers that the prior decided.
 _PRIOR_FACTOR = 2.0
-#: Number of stored odometry poses, which limits the delay of answers.
+#: Number of odometry poses stored; limits how late an answer can arrive.
 _MOST_MARKS = 4096
 #: Smallest motion between two views of one query, of which either is sufficient.
 _SPACING_M, _SPACING_RAD = 0.1, math.radians(6.0)

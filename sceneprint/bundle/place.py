@@ -267,7 +267,8 @@ class BundlePlace:
         )
 
     def prune(self, needed: Collection[str], keep: int) -> int:
-        """Remove old bundles and their parts, and return the number of removed parts.
+        """Remove old bundles, then the parts that are not needed and older than GRACE_S; return the
+        number of removed parts.
 
         Parameters
         ----------

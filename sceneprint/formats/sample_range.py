@@ -10,7 +10,7 @@ import numpy as np
 from sceneprint.types import AnyFrame, Cloud, Floats32
 from sceneprint_client.api.frames import SampleRange
 
-#: Minimum number of samples for the percentiles of a larger frame, which take a millisecond.
+#: Minimum number of samples for the percentiles of a larger frame; they take a millisecond.
 _SAMPLES = 20_000
 
 

@@ -95,7 +95,10 @@ def time_scale(first: float, last: float) -> TimeScale:
 
 
 def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlace, CellSums]:
-    """Return the cells of one view by tile, as CELL_SUM sorted by key, in at most MOST_TILES tiles.
+    """Return the cells of one view by tile, as CELL_SUM sorted by key.
+
+    Each holds the mean position of its points within the cell, as the sum of one view. At most
+    MOST_TILES tiles remain, those with the most cells. NaN and very distant points are omitted.
 
     Parameters
     ----------

@@ -329,11 +329,12 @@ def write_segment(
 ) -> SegmentFiles:
     """Write the frames of sources as one segment in the order of their keys.
 
-    The parts of an unchanged segment are reused without reading them.
+    The parts of a single segment are reused without reading them, unless more than GONE_SHARE of
+    its frames are removed.
 
     Parameters
     ----------
-    clean : whether to write a segment again if it has any removed frames
+    clean : whether to write a single segment again if any of its frames is removed
     flat_bytes : size of signatures in bytes above which there are sketches
     """
     only = sources[0]

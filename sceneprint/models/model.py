@@ -326,7 +326,7 @@ def _number(kind: Any, value: Any, where: str) -> Any:
     return kind(value)
 
 
-#: Power of a metre in the units of the parameters, by class and field.
+#: Exponent of the metre in the units of the parameters, by class and field.
 POWERS: dict[type, dict[str, int]] = {
     DepthParameters: {"minimum_depth": 1, "maximum_depth": 1},
     CloudParameters: {

@@ -96,7 +96,7 @@ def list_jobs(
     before : number of the last job of the previous page
     limit : maximum number of jobs
     state, kind : conditions; None matches all jobs
-    map_names : names of the selected maps, which exclude jobs without a map; None selects all
+    map_names : names of the selected maps, without jobs that have no map; None selects all
     """
     last = _later_job().scalar_subquery()
     statement = (

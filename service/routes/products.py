@@ -211,7 +211,7 @@ def list_edges(
         ),
     ] = None,
 ) -> Page[Edge]:
-    """List the edges in the order of their discovery, even while the job runs."""
+    """List the edges in order of discovery, even while the job runs."""
     return here.associations.edges(
         map_name, job_id, cursor, limit, min_overlap, consistent=consistent
     )

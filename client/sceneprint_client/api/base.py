@@ -166,7 +166,7 @@ class Transform(ApiRecord):
 
 # Directions in requests.
 
-#: Tolerance of the length of a unit vector.
+#: Tolerance for the length of a unit vector.
 _UNIT = 1e-2
 
 

@@ -74,12 +74,13 @@ class MapFlaws:
 def with_flaws(
     frames: Sequence[AnyFrame], flaws: MapFlaws, rng: np.random.Generator
 ) -> list[AnyFrame]:
-    """Return a part of a map's frames in their order, with poses that drift.
+    """Return a random part of a map's frames in their order, with correlated pose errors.
 
     Parameters
     ----------
     frames : frames of the map with poses
-    flaws : maximum flaws; the flaws of a site are random shares of them
+    flaws : maximum share of missing frames and standard deviation of the steps of the error; those
+        of a site are random shares of them
     rng : random generator for missing frames and drift
     """
     share = rng.uniform(0.0, 1.0, 3) * (flaws.missing, flaws.drift_m, flaws.drift_rad)

@@ -408,7 +408,7 @@ def own_scanner(rng: np.random.Generator) -> Spinning:
     """Return a random realistic scanner with 16 to 128 rings."""
     rings = int(rng.choice((16, 32, 64, 64, 96, 128)))
     low, high = np.radians(rng.uniform((-45.0, 8.0), (-14.0, 45.0)))
-    if rings < 64:  # few rings have a small vertical view
+    if rings < 64:  # a sensor with few rings has a narrow vertical field of view
         low, high = max(low, -rings * 0.018), min(high, rings * 0.018)
     # Many rings have coarser azimuths, since such scanners also return tens of thousands of points.
     step = math.radians(rng.uniform(0.18, 0.4)) * (1.0 if rings <= 64 else 1.6)

@@ -238,7 +238,7 @@ def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
 
 
 def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, list[list[int]]]:
-    """Return viewpoints (k, 6) and, for each, the others at the end of a clear straight segment."""
+    """Return viewpoints (k, 6) and, for each, those at the end of a clear line."""
     anchors: list[Floats] = []
     ways: list[list[int]] = []
     for attempt in range(400):
@@ -301,12 +301,14 @@ def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floa
 
 
 def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STEP) -> list[Floats]:
-    """Return poses every `step` metres on a walk that often returns; each faces ahead.
+    """Return poses of a scanner every `step` metres on a walk that often returns.
+
+    Its height and its yaw to the direction of travel are random, but constant during the walk.
 
     Parameters
     ----------
     n : number of poses
-    rng : generator of places, heights and wobble
+    rng : generator of places, height, mounting and wobble
     step : distance between poses, metres
     """
     spots, graph = _ways(premises)

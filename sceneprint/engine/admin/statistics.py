@@ -95,7 +95,7 @@ def _read(path: Path) -> IndexManifest | None:
         return None  # readers skip it too
 
 
-# Sizes of a store's parts on the disk.
+# Sizes of a store's parts on disk.
 
 #: Maximum number of files to measure; the size of the others is extrapolated.
 MEASURED = 5_000

@@ -59,11 +59,12 @@ def find_duplicate(
     Parameters
     ----------
     metadata : the upload's columns
-    frame_id : requested id; None if any frame with the content is a duplicate
+    frame_id : requested id: only its frame is compared; None compares all frames with the content
 
     Raises
     ------
-    FrameConflict : If a frame has the id or content, but other content or metadata.
+    FrameConflict : If the frame with the id has other content or metadata; without an id, if every
+        frame with the content has other metadata.
     """
     if frame_id is not None:
         frame = living_frame(connection, row.number, frame_id)

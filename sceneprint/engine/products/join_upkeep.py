@@ -35,7 +35,7 @@ LOOK_S = 5.0
 LEAST_FRAMES = 5
 #: Growth factor of the number of frames after which two sessions are associated again.
 GROWTH = 1.25
-#: Maximum number of newest associations of a map to consider.
+#: Maximum number of a map's newest associations to consider.
 _JOBS = 200
 
 

@@ -110,7 +110,7 @@ class IndexView:
 
 
 #: Size of signatures in bytes up to which they are in memory. Larger tails are in a mapped file,
-#: whose pages the kernel can evict, since a map without an index may exceed the memory.
+#: whose pages the kernel can evict, since a map without an index may not fit in memory.
 IN_MEMORY = 256 << 20
 
 
@@ -355,7 +355,7 @@ class Reader:
             log.error("damaged signature skipped", extra={"frame_id": change.frame_id})
             self._damaged.add(change.number)
         elif self._tail.revision_of(change.number) < change.revision:
-            # otherwise, an interrupted call appended it already
+            # otherwise, an interrupted call has already appended it
             if self._tail.revision_of(change.number):  # a damaged frame was signed again
                 self._tail = self._tail.copy(0, without={change.number})
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))

@@ -304,7 +304,7 @@ class Upkeep:
         done = True
         if stale and not empty:
             done = self._publish(row, force=True, clean=True) is not None
-        if done and older:  # also files that a killed builder left
+        if done and older:  # including files that a killed builder left behind
             head = None if empty else self._place.head(row)
             done = self._place.remove_all_but(row, head)
         if not done:

@@ -55,7 +55,7 @@ AT_ONCE = 100
 TURN_S = 2.0
 #: Seconds between two checks after all old frames were deleted.
 LOOK_S = 60.0
-#: Reason of the deletion in events.
+#: Reason for the deletion, in events.
 REASON = "retention"
 
 

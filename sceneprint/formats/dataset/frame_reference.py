@@ -252,16 +252,16 @@ def parent_frame_of(sequence: FrameSequence, robot: str | None) -> str:
 def numbered_sequences(
     sequences: Iterable[FrameSequence], session: str | None
 ) -> list[FrameSequence]:
-    """Return sequences whose frames have unique numbers within their session.
+    """Return sequences whose frames have numbers within their session.
 
     If several sequences form one session, each continues the numbers of the previous one. Frames
-    of one folder that the user lists one by one keep the numbers of the folder, or else get numbers
-    in the order of the list.
+    of one folder that the user lists one by one keep the order of their numbers in the folder; a
+    frame without a number gets the next unused one. The only sequence of a session is unchanged.
 
     Parameters
     ----------
     sequences : sequences in chronological order
-    session : session of all sequences; None assigns a session to each sequence
+    session : session of all sequences; None: that of `session_of`, which several may share
     """
     unnumbered, numbered = list(sequences), []
     names = [session or session_of(one) for one in unnumbered]

@@ -472,7 +472,7 @@ def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
     for k in range(min(8, (bits + 14) // 8)):
         values |= source[first + k].astype(np.uint64) << np.uint64(8 * k)
     values >>= shift
-    if bits > 57:  # a number that does not start at a byte boundary may extend to a ninth byte
+    if bits > 57:  # a number that does not start at a byte boundary may extend into a ninth byte
         ninth = source[first + 8].astype(np.uint64)
         values |= np.where(shift > 0, ninth << ((np.uint64(64) - shift) & np.uint64(63)), 0)
     return values & np.uint64(2**bits - 1)

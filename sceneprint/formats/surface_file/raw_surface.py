@@ -21,7 +21,7 @@ from sceneprint.types import Floats, Floats32, Ints32
 #: of a mesh.
 MOST_FILE_POINTS, MOST_POINTS = 60_000_000, 10_000_000
 MOST_VERTICES, MOST_TRIANGLES = 15_000_000, 20_000_000
-#: Smallest edge of the voxels of a thinned cloud, metres.
+#: Minimum voxel edge length of a thinned cloud, metres.
 FINEST_M = 0.01
 #: Largest coordinate without subtraction of an origin, units of the file.
 _NEAR_UNITS = 1000.0
@@ -43,7 +43,7 @@ class RawSurface:
     origin : (3,) float64
     triangles : (M, 3) int64 or int32 indices that have not been checked; None for a cloud
     file_points : number of points of the file, including missing points
-    voxel : edge of the voxels of a thinned cloud, units of the file; None if it is not thinned
+    voxel : voxel edge length of a thinned cloud, units of the file; None if it is not thinned
     units_per_metre : units that the file states, or None
     up : (3,) up direction that the file states, or None
     usual_up : (3,) up direction of most files of this format

@@ -147,7 +147,7 @@ def read_surface(
     data: FileBytes, name: str, options: SurfaceOptions | None = None,
     file_format: SurfaceFormat | None = None,
 ) -> ReadSurface:  # fmt: skip
-    """Return the surface of a file of a whole map.
+    """Return the surface from a whole-map file.
 
     Parameters
     ----------

@@ -81,7 +81,8 @@ def dominant_up(normals: Floats, axis: Floats, tilt: float) -> Floats:
     ----------
     normals : (N, 3)
     axis : (3,) unit vector
-    tilt : maximum angle between the result and the axis, radians
+    tilt : maximum angle between the axis and the normals that are tried, radians; the refined
+        result can be slightly beyond it
 
     Returns
     -------

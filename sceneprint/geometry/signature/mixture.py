@@ -74,8 +74,8 @@ def posteriors(features: Floats, mixture: Mixture) -> Floats:
 def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[Mixture]:
     """Fit a mixture by expectation maximisation from a K-Means++ start (Sec. III-F).
 
-    The function yields the start and the mixture after every iteration, to show progress. The last
-    mixture is the result.
+    The function yields the start and the mixture after each of `p.iterations` iterations, to show
+    progress. The last mixture is the result.
 
     Parameters
     ----------

@@ -94,10 +94,10 @@ def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
 
 
 def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intrinsics]:
-    """Mask, reduce and invert a depth image.
+    """Mask and invert a depth image, then halve it as often as `p` says.
 
-    Each halving averages only the samples of a 2 x 2 block that lie on the nearest surface, so it
-    invents no point between an edge and its background.
+    Each halving averages the inverse depths of only those samples of a 2 x 2 block that lie on the
+    nearest surface, so it invents no point between an edge and its background.
 
     Parameters
     ----------

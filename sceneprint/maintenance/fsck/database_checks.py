@@ -186,7 +186,7 @@ class _CheckedFrame:
 
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Find frames whose rows are contradictory, damaged or unreadable."""
+    """Find frames, by their numbers, whose rows are contradictory, damaged or unreadable."""
     for one in read_rows(folder, numbers, partial(_read_frames, folder)):
         folder.counts["frames"] += 1
         if isinstance(one, tuple):

@@ -166,7 +166,7 @@ def is_of_rows(error: Exception) -> bool:
 
 
 def quarantine_blob(folder: Folder, digest: str) -> str:
-    """Move a damaged blob to the quarantine, and return a description.
+    """Move a damaged blob to quarantine, and return a description.
 
     Raises
     ------

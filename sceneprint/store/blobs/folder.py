@@ -30,7 +30,7 @@ from sceneprint.store.database_errors import unusable
 # All processes that share the blobs use one lock: shared while they need the blobs, exclusive for
 # removals. The kernel or the server releases the lock of a process that dies.
 
-#: Time limits for the end of a removal, with and without a turn to write, seconds.
+#: Time limits for finishing a removal, with and without a turn to write, seconds.
 TURN_S, REMOVAL_S = 5.0, 25.0
 #: Seconds after which each removal has ended, even that of a dead process: it sends no request
 #: after REMOVAL_S, and each request ends within `object_client.TRIED_S` and `SMALL_S`.

@@ -186,7 +186,7 @@ def _texts() -> type[Any]:
     from psycopg.types.string import StrDumperUnknown
 
     class Texts(StrDumperUnknown):
-        """Dumper that replaces NUL in texts."""
+        """Dumper that replaces NUL characters in strings."""
 
         def dump(self, obj: str) -> Any:
             """As bytes."""
