@@ -248,7 +248,7 @@ def test_a_map_has_a_title(full: Engine) -> None:
 def test_a_deleted_frame_is_not_edited(full: Engine, ids: Ids) -> None:
     name = ids(full)[0]
     full.delete_frame("hall", name)
-    with pytest.raises(UnknownFrame, match="was deleted"):
+    with pytest.raises(UnknownFrame, match="was already deleted"):
         edit_frame(full.store, "hall", name, {"robot": "r"})
     with pytest.raises(UnknownFrame):
         edit_frame(full.store, "hall", "nobody", {"robot": "r"})

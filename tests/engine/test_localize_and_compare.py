@@ -75,7 +75,7 @@ def test_what_is_not_found_says_why(full: Engine, empty: Engine, uploads: Any, i
     unsure = ask(validation={"ambiguous": 0.0})
     assert (unsure.status, unsure.pose) == ("ambiguous", None)
     assert "another transform explains the frames equally well" in unsure.reason
-    with pytest.raises(InvalidRequest, match="needs validated matches"):
+    with pytest.raises(InvalidRequest, match="requires validated matches"):
         check_localizes(Query(stages=("retrieve", "diversify")))
 
 

@@ -241,8 +241,8 @@ def test_points_without_coordinates(tmp_path: Path, ros: SimpleNamespace) -> Non
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "PNG and"), (b"\x00" * 12, "PNG and"), (b"\x00" * 12 + b"\xff\xd8\xff", "PNG and"),
-        (b"\x00" * 80 + b"\x89PNG\r\n\x1a\n", "PNG and"),
+        (b"", "PNG or RVL"), (b"\x00" * 12, "PNG or RVL"), (b"\x00" * 12 + b"\xff\xd8\xff", "PNG or RVL"),
+        (b"\x00" * 80 + b"\x89PNG\r\n\x1a\n", "PNG or RVL"),
         (b"\x00" * 12 + b"\x89PNG\r\n\x1a\n", "truncated"),
     ],
 )  # fmt: skip
