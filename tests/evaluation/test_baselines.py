@@ -188,4 +188,4 @@ def test_clouds_are_evaluated_as_depth_images_are(
     assert found["counts"] == {"queries": 2, "database": 3, "left_out": 0}
     assert found["VDR"]["within_10cm_10deg"] == 1.0
     assert found["baselines"]["rings"]["recall"]["queries"] == 2
-    assert "made for" in found["baselines"]["thumbnail_l1"]["reason"]
+    assert "does not support" in found["baselines"]["thumbnail_l1"]["reason"]

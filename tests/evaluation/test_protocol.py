@@ -121,7 +121,7 @@ def test_what_cannot_be_measured(tmp_path: Path) -> None:
         choose([PathRanges(path)], database=some, queries=parse_ranges("1:4"))
     with pytest.raises(DatasetError, match=r"outside the 4 frames"):
         choose([PathRanges(path)], database=some, queries=parse_ranges("2:5"))
-    with pytest.raises(DatasetError, match=r"has the name kitchen too"):
+    with pytest.raises(DatasetError, match=r"also has the name kitchen"):
         choose([PathRanges(path)], [twin], database=some, queries=rest)
     with pytest.raises(DatasetError, match=r"No frame is selected as query"):
         choose([PathRanges(path, database=some)])
