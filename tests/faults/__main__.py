@@ -51,6 +51,7 @@ def main() -> int:
 
 def _enumerate(store: str, options: argparse.Namespace) -> dict[tuple[str, str], Trials]:
     operations, faults = options.operation or list(OPERATIONS), options.fault or list(FAULTS)
+    tqdm.monitor_interval = 0  # without its thread, which forks would lack
     with ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sceneprint-faults-")))
         server = None

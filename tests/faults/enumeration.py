@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import shutil
 import signal
 import threading
@@ -11,6 +12,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from benchmarks.postgres import Server
@@ -20,6 +22,7 @@ from tests.faults.injection import Injector
 from tests.faults.operations import (
     ACKNOWLEDGED,
     OPERATIONS,
+    Operation,
     Store,
     contents,
     fill,
@@ -65,15 +68,22 @@ class Child:
                 _say(write, f"! {traceback.format_exc().splitlines()[-1]}")
             os._exit(code)
         os.close(write)
-        self.lines, self.is_alive = list[str](), True
-        until = time.monotonic() + PATIENCE_S
-        with os.fdopen(read) as said:
-            self.lines = [line.rstrip("\n") for line in said]
-        while not (done := os.waitpid(pid, os.WNOHANG))[0]:
-            if time.monotonic() > until:
-                os.kill(pid, signal.SIGKILL)
-            time.sleep(0.001)
-        self.status = done[1]
+        until, data = time.monotonic() + PATIENCE_S, b""
+        while select.select([read], [], [], max(until - time.monotonic(), 0.0))[0]:
+            block = os.read(read, 1 << 16)
+            data += block
+            if not block:
+                break
+        else:
+            os.kill(pid, signal.SIGKILL)
+            data += b"! the process hangs\n"
+        os.close(read)
+        self.lines, self.status = data.decode().splitlines(), os.waitpid(pid, 0)[1]
+
+
+def _prepare(operation: Operation, store: Store, _say: object) -> None:
+    with Engine(store.settings) as engine:
+        operation.prepare(engine, store)
 
 
 def _say(pipe: int, line: str) -> None:
@@ -100,8 +110,10 @@ class Enumeration:
             raise RuntimeError(f"threads outlive the store: {threading.enumerate()}")
         for name, operation in OPERATIONS.items():
             prepared = self._store(name, "base")
-            with Engine(prepared.settings) as engine:
-                operation.prepare(engine, prepared)
+            # the client of object stores starts threads, which a fork of this process would lack
+            child = Child(partial(_prepare, operation, prepared))
+            if child.status:
+                raise RuntimeError(f"the store for {name} cannot be prepared: {child.lines}")
 
     def _store(self, name: str, template: str | None) -> Store:
         folder = self._work / name

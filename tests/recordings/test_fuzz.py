@@ -241,7 +241,8 @@ def test_points_without_coordinates(tmp_path: Path, ros: SimpleNamespace) -> Non
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "PNG or RVL"), (b"\x00" * 12, "PNG or RVL"), (b"\x00" * 12 + b"\xff\xd8\xff", "PNG or RVL"),
+        (b"", "PNG or RVL"), (b"\x00" * 12, "PNG or RVL"),
+        (b"\x00" * 12 + b"\xff\xd8\xff", "PNG or RVL"),
         (b"\x00" * 80 + b"\x89PNG\r\n\x1a\n", "PNG or RVL"),
         (b"\x00" * 12 + b"\x89PNG\r\n\x1a\n", "truncated"),
     ],
