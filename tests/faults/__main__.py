@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 import tempfile
 import time
@@ -30,7 +31,8 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print the counts of calls as JSON")
     parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
     options = parser.parse_args()
-    lines, counts, broken = [measured_on("`make faults`"), ""], dict[str, dict[str, int]](), 0
+    command = shlex.join(["python", "-m", "tests.faults", *sys.argv[1:]])
+    lines, counts, broken = [measured_on(f"`{command}`"), ""], dict[str, dict[str, int]](), 0
     for store in options.store or ("sqlite", "postgresql"):
         start = time.monotonic()
         trials = _enumerate(store, options)

@@ -86,6 +86,19 @@ def _prepare(operation: Operation, store: Store, _say: object) -> None:
         operation.prepare(engine, store)
 
 
+def _say_contents(store: Store, say: Callable[[str], None]) -> None:
+    for name, (upload, vector) in contents(store).items():
+        say(f"{name} {upload.hex()} {vector.hex()}")
+
+
+def _done(work: Callable[[Callable[[str], None]], None]) -> list[str]:
+    """Return what a child says that does some work; raise RuntimeError if it fails."""
+    child = Child(work)
+    if child.status:
+        raise RuntimeError(f"a store cannot be prepared: {child.lines}")
+    return child.lines
+
+
 def _say(pipe: int, line: str) -> None:
     os.write(pipe, f"{line}\n".encode())
 
@@ -103,17 +116,20 @@ class Enumeration:
     def __init__(self, work: Path, uploads: Sequence[Upload], server: Server | None = None) -> None:
         self._work, self._uploads, self._server = work, uploads, server
         self._count = 0
-        base = self._store("base", None)
-        fill(base)  # in this process, which compiles and imports what its children need
-        self._before = contents(base)
+        # in this process, which compiles and imports what its children need
+        (work / "warm").mkdir(parents=True)
+        fill(Store(work / "warm", None, uploads))
         if threading.active_count() > 1:
             raise RuntimeError(f"threads outlive the store: {threading.enumerate()}")
+        # in children: the client of object stores starts threads, which later forks would lack
+        base = self._store("base", None)
+        _done(lambda _: fill(base))
+        self._before = {
+            name: (bytes.fromhex(upload), bytes.fromhex(vector))
+            for name, upload, vector in map(str.split, _done(partial(_say_contents, base)))
+        }
         for name, operation in OPERATIONS.items():
-            prepared = self._store(name, "base")
-            # the client of object stores starts threads, which a fork of this process would lack
-            child = Child(partial(_prepare, operation, prepared))
-            if child.status:
-                raise RuntimeError(f"the store for {name} cannot be prepared: {child.lines}")
+            _done(partial(_prepare, operation, self._store(name, "base")))
 
     def _store(self, name: str, template: str | None) -> Store:
         folder = self._work / name
