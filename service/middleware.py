@@ -35,7 +35,7 @@ from service.limits import (
     too_large,
 )  # fmt: skip
 from service.metrics import Metrics
-from service.problems import problem, status_of
+from service.problems import error_problem
 
 log = logging.getLogger(__name__)
 
@@ -226,6 +226,6 @@ def _call(callbacks: list[Callable[[], None]]) -> None:
 
 def _refusal(request_id: str, error: SceneprintError) -> Response:
     """Return an error response that closes the connection, because the body is not read."""
-    response = problem(request_id, type(error).__name__, status_of(error), str(error))
+    response = error_problem(request_id, error)
     response.headers["Connection"] = "close"
     return response

@@ -17,16 +17,11 @@ from sceneprint import errors
 from sceneprint_client.api import Problem
 from sceneprint_client.api.base import invalid_request
 from service.browser_security import security_headers
-from service.problem_types import PROBLEM_TYPES, problem_type
+from service.problem_types import problem_type
 
 log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
-
-
-def status_of(error: errors.SceneprintError) -> int:
-    """Return the HTTP status code of an error."""
-    return problem_type(type(error)).status
 
 
 def type_of(name: str) -> str:
@@ -47,12 +42,19 @@ def problem(
     }
     if fields:
         document["errors"] = [{"field": place, "reason": reason} for place, reason in fields]
-    known = PROBLEM_TYPES.get(name)
-    retry = known.retry_after_s if known else None
-    headers = {} if retry is None else {"Retry-After": str(retry)}
-    if status == 401:
-        headers["WWW-Authenticate"] = "Bearer"
+    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
     return JSONResponse(document, status, headers, MEDIA_TYPE)
+
+
+def error_problem(request_id: str, error: errors.SceneprintError) -> JSONResponse:
+    """Return the problem document of an error, by the type of its class or nearest base class."""
+    kind = problem_type(type(error))
+    fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
+    detail = kind.detail or str(error)
+    response = problem(request_id, type(error).__name__, kind.status, detail, fields)
+    if kind.retry_after_s is not None:
+        response.headers["Retry-After"] = str(kind.retry_after_s)
+    return response
 
 
 #: Names of RFC 9110 that the standard library has since Python 3.13.
@@ -78,12 +80,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(errors.SceneprintError)
     async def _ours(request: Request, error: errors.SceneprintError) -> JSONResponse:
-        status = status_of(error)
-        if status >= 500 and not isinstance(error, errors.Busy):
+        answer = error_problem(_id(request), error)
+        if answer.status_code >= 500 and not isinstance(error, errors.Busy):
             log.error("request failed", extra={"request_id": _id(request), "error": str(error)})
-        fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
-        detail = problem_type(type(error)).detail or str(error)
-        answer = problem(_id(request), type(error).__name__, status, detail, fields)
         rate = getattr(request.state, "rate", None)
         if rate is not None and isinstance(error, errors.RateLimited):
             answer.headers["Retry-After"] = str(rate.wait_s)
@@ -134,4 +133,4 @@ def _id(request: Request) -> str:
     return str(getattr(request.state, "request_id", ""))
 
 
-__all__ = ["Problem", "install", "problem", "refusals", "status_of"]
+__all__ = ["Problem", "error_problem", "install", "problem", "refusals"]

@@ -374,13 +374,13 @@ def sendable(
     array = library_array(frame)
     if array is not None:
         return array_sendable(array, meta, up=up)
-    known = _meta_without_array(meta)
-    if known is not None and up is not None:
-        known = known.model_copy(update={"up": _direction(up)})
+    metadata = _meta_without_array(meta)
+    if metadata is not None and up is not None:
+        metadata = metadata.model_copy(update={"up": _direction(up)})
     if isinstance(frame, bytes):
-        if known is None and format_of(frame) is None:
+        if metadata is None and format_of(frame) is None:
             raise TypeError("the bytes of a depth image need `meta` with at least the intrinsics")
-        return frame, known or FrameMeta(up=_direction(up))
+        return frame, metadata or FrameMeta(up=_direction(up))
     if isinstance(frame, FrameFile):
         found = frame
     elif not isinstance(frame, str | os.PathLike):
@@ -388,17 +388,20 @@ def sendable(
             "pass a path, the bytes of a file, a FrameFile, a numpy array, or an image or cloud "
             f"of Open3D or Pillow, not {type(frame).__name__}"
         )
-    elif known is not None:
-        data, name = _read_content(Path(frame), is_cloud=known.intrinsics is None), Path(frame).name
-        return data, _with_name(known, name, seven_scenes_number(name)) if with_pose else known
+    elif metadata is not None:
+        path = Path(frame)
+        data = _read_content(path, is_cloud=metadata.intrinsics is None)
+        if with_pose:
+            metadata = _with_name(metadata, path.name, seven_scenes_number(path.name))
+        return data, metadata
     else:
         found = _frame_at(Path(frame))
     data = found.read_bytes()
-    if known is None:
+    if metadata is None:
         return data, meta_of(found, with_pose=with_pose, up=up, with_name=with_pose)
     if not with_pose:
-        return data, known
-    return data, _with_name(known, found.original or found.path.name, found.sequence)
+        return data, metadata
+    return data, _with_name(metadata, found.original or found.path.name, found.sequence)
 
 
 def library_array(frame: Any) -> NDArray[Any] | None:
@@ -431,11 +434,11 @@ def library_array(frame: Any) -> NDArray[Any] | None:
 _MAXIMUM_UNITS = 65_535
 
 
-def _with_name(known: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
+def _with_name(metadata: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
     """Add name and sequence index of the file to metadata that have none."""
     labels = {"name": file_name(name), "sequence": sequence}
-    missing = {field: label for field, label in labels.items() if getattr(known, field) is None}
-    return known.model_copy(update=missing)
+    missing = {field: label for field, label in labels.items() if getattr(metadata, field) is None}
+    return metadata.model_copy(update=missing)
 
 
 def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
@@ -470,19 +473,19 @@ def array_sendable(
     """
     size = (array.shape[1], array.shape[0]) if array.ndim == 2 else None
     if meta is None or isinstance(meta, FrameMeta):
-        known = meta or FrameMeta()
+        metadata = meta or FrameMeta()
     else:
-        known = FrameMeta(intrinsics=camera_of(meta, size or (1, 1)))
+        metadata = FrameMeta(intrinsics=camera_of(meta, size or (1, 1)))
     if up is not None:
-        known = known.model_copy(update={"up": _direction(up)})
-    if known.intrinsics is None:
-        return _npy(_checked_points(array), _ROUNDING_M), known
+        metadata = metadata.model_copy(update={"up": _direction(up)})
+    if metadata.intrinsics is None:
+        return _npy(_checked_points(array), _ROUNDING_M), metadata
     if size is None or not array.size or array.dtype.kind + str(array.dtype.itemsize) not in _DEPTH:
         raise UnreadableFrame(
             f"The array has shape {array.shape} and type {array.dtype}. Convert it to depth of "
             "shape (H, W), uint16 in stored units or float32 in metres."
         )
-    return _npy(array), known
+    return _npy(array), metadata
 
 
 #: Types of depth images: kind and size in bytes.

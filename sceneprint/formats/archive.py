@@ -320,9 +320,8 @@ def _too_many() -> UnreadableArchive:
 #: Maximum ratio of content to archive size, and size of the content that is exempt, bytes. Depth
 #: images are already compressed; NPY files of noisy depth shrink to a fifth.
 MOST_RATIO, FREE = 50, 64 << 20
-_MAXIMUM_STREAMS = (
-    65_536  #: maximum number of concatenated streams; parallel compressors write many
-)
+#: Maximum number of concatenated streams; parallel compressors write many.
+_MAXIMUM_STREAMS = 65_536
 _XZ_MEMORY = 192 << 20  #: bytes; `xz -9` needs less
 
 _MAGIC = (b"PK\x03\x04", b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00")

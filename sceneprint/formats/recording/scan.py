@@ -219,9 +219,8 @@ class _Scanner:
             one.name: one.type for one in bag.of_type(TRANSFORMS, OLD_TRANSFORMS, ODOMETRY, IMU)
         } | ({} if camera is None else {camera.name: camera.type})
         self._scan = BagScan()
-        self._info_numbers: dict[
-            bytes, int
-        ] = {}  # by the bytes after the stamp; -1 if uncalibrated
+        # by the bytes after the stamp; -1 if uncalibrated
+        self._info_numbers: dict[bytes, int] = {}
 
     def scan(self, progress: Progress | None) -> BagScan:
         """Read all messages. Raise the errors of `scan_bag`, and _SeveralClocks."""

@@ -117,9 +117,6 @@ class Evidence:
 _IN_FREE_SPACE = "of the points lie where the other frame saw free space"
 
 
-_IN_FREE_SPACE = "of the points lie where the other frame saw free space"
-
-
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
     """Return the reason to refuse a transform, whatever its rivals; None without one: Sec. III-E.
 
