@@ -90,6 +90,14 @@ def test_quarter_turns_about_the_middle_of_each_plane() -> None:
         np.testing.assert_allclose(T, power, atol=1e-9)
 
 
+def test_shifts_along_both_main_planes_go_both_ways() -> None:
+    found = symmetries(ROOM, P)  # a floor across y and a wall across z: a corridor along x
+    shifts = np.array([T[:3, 3] for T in found if np.allclose(T[:3, :3], np.eye(3))])
+    np.testing.assert_allclose(shifts[:, 1:], 0.0, atol=1e-12)
+    steps = P.shift * np.arange(1, P.n_shifts + 1)
+    np.testing.assert_allclose(np.sort(shifts[:, 0]), [*-steps[::-1], *steps], atol=1e-12)
+
+
 def test_planes_and_directions_are_taken_by_area() -> None:
     one = on_planes(([0, -1, 0], -1.0, 10, 0.1))
     assert len(turns(symmetries(one, P))) == 3
