@@ -133,6 +133,10 @@ def test_equal_rooms_are_ambiguous_and_linked(engine: Engine, rooms: Rooms) -> N
     assert (result.found, result.ambiguous, result.wrong, result.not_found) == (4, 10, 0, 0)
     assert (result.unchecked, result.revision, result.last_revision) == (0, 14, 14)
     frames = frames_of(engine, told)
+    places = [(p.x, p.y, p.z) for frame in frames if (p := frame.position) is not None]
+    np.testing.assert_allclose(sorted(places), sorted(map(tuple, rooms.positions)))
+    parents = Counter(frame.parent_frame for frame in frames)
+    assert parents == {rooms.parents[0]: 10, rooms.parents[1]: 4}
     assert [frame.number for frame in frames] == list(range(14))
     sessions = {frame.frame_id: frame.session for frame in frames}
     for frame in frames:

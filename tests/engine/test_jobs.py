@@ -14,9 +14,9 @@ from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
 from sceneprint.errors import CannotRetry, JobOver, UnknownJob
 from sceneprint.store import queue
-from sceneprint.store.queue import read_clock
+from sceneprint.store.queue import count_jobs, read_clock
 from sceneprint.store.tables import JobRow, jobs
-from sceneprint_client.api import FrameState, JobState
+from sceneprint_client.api import FrameState, JobState, NewMap
 from tests.whole_engine import Engine
 
 DueNow = Callable[[Engine], None]
@@ -132,6 +132,13 @@ def test_all_dead_jobs_are_tried_again_page_by_page(
     }  # fmt: skip
     counted = {"dead": 1, "queued": 2, "succeeded": 1}  # of retried jobs only the latest
     assert empty.statistics.collect(1, "hall").jobs == counted == empty.statistics.collect(1).jobs
+    empty.create_map(NewMap(name="shop", model="depth"))
+    elsewhere, _ = empty.add_frame("shop", uploads[4].data, uploads[4].meta)
+    with empty.store.database.write() as connection:
+        own = jobs.c.id == elsewhere.job_id
+        connection.execute(update(jobs).where(own).values(state=JobState.DEAD))
+        assert count_jobs(connection, empty.row("shop").number) == {"dead": 1}
+        connection.execute(update(jobs).where(own).values(state=JobState.CANCELLED))
     again = empty.retry_dead_jobs()
     assert (again.retried, [one.job_id for one in again.refused]) == ([], [ids[1]])
     assert empty.retry_dead_jobs(map_names=("elsewhere",)).refused == []
