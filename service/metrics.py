@@ -130,7 +130,7 @@ METRICS = {
         "gauge", "Age of the oldest frame without a signature; 0 if there is no such frame."
     ),
     "index_version": MetricFamily(
-        "gauge", "Newest index of each of the 20 maps with the longest tails.", ("map",)
+        "gauge", f"Newest index of each of the {MOST_MAPS} maps with the longest tails.", ("map",)
     ),
     "index_tail_frames": MetricFamily(
         "gauge",
@@ -153,8 +153,8 @@ METRICS = {
     "scrub_bytes": MetricFamily("gauge", "Size of the data that this scrub has read."),
     "scrub_damaged": MetricFamily("gauge", "Number of lost and damaged objects in this scrub."),
     "tenant_requests_total": MetricFamily(
-        "counter", "Number of answered requests of each tenant. The first 50 tenants of a process "
-        "have their own series; all others share `(others)`.", ("tenant", "status"),
+        "counter", f"Number of answered requests of each tenant. The first {MOST_TENANTS} tenants of "
+        f"a process have their own series; all others share `{OTHERS}`.", ("tenant", "status"),
     ),
     "tenant_request_seconds_total": MetricFamily(
         "counter", "Time of the tenant's requests, without streams.", ("tenant",)
