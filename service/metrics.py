@@ -153,8 +153,8 @@ METRICS = {
     "scrub_bytes": MetricFamily("gauge", "Size of the data that this scrub has read."),
     "scrub_damaged": MetricFamily("gauge", "Number of lost and damaged objects in this scrub."),
     "tenant_requests_total": MetricFamily(
-        "counter", f"Number of answered requests of each tenant. The first {MOST_TENANTS} tenants of "
-        f"a process have their own series; all others share `{OTHERS}`.", ("tenant", "status"),
+        "counter", f"Number of answered requests of each tenant. The first {MOST_TENANTS} tenants "
+        f"of a process have their own series; all others share `{OTHERS}`.", ("tenant", "status"),
     ),
     "tenant_request_seconds_total": MetricFamily(
         "counter", "Time of the tenant's requests, without streams.", ("tenant",)

@@ -15,13 +15,35 @@ from typing import Any
 import pytest
 
 from sceneprint import process
+from sceneprint.engine.admin.statistics import Figures
 from sceneprint.process import JsonFormatter, name_request, of_request, request_id
 from sceneprint.settings import Settings
 from sceneprint.store import database
 from sceneprint.store.store_counts import samples_since
 from sceneprint_client.api import Answer
-from service.metrics import Sampler
+from service.metrics import Metrics, Sampler
 from tests.whole_engine import Engine
+
+
+def test_waiting_jobs_have_series_by_kind_while_they_wait(tmp_path: Path) -> None:
+    with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
+        stats = engine.statistics.collect(1)
+    metrics = Metrics()
+
+    def series(ages: dict[str, float]) -> list[str]:
+        figures = Figures(stats.model_copy(update={"oldest_waiting_s": ages}), 0, 0, {})
+        lines = metrics.text(figures, 0, 0, {}, {}).decode().splitlines()
+        return [one for one in lines if one.startswith("sceneprint_oldest_")]
+
+    assert series({"coverage": 9.0, "sign": 3.0}) == [
+        'sceneprint_oldest_waiting_seconds{kind="coverage"} 9.0',
+        'sceneprint_oldest_waiting_seconds{kind="sign"} 3.0',
+        "sceneprint_oldest_unsigned_seconds 3.0",
+    ]
+    assert series({"coverage": 10.0}) == [
+        'sceneprint_oldest_waiting_seconds{kind="coverage"} 10.0',
+        "sceneprint_oldest_unsigned_seconds 0.0",
+    ]
 
 
 @pytest.mark.parametrize("asked", [{"minutes": 0}, {"minutes": 61}, {"minutes": "x"}])
@@ -41,15 +63,19 @@ def test_all_figures_are_there(served, make_map, until):
         seen = figures()
         return sum(int(seen[f'sceneprint_workers{{state="{one}"}}']) for one in ("idle", "busy"))
 
-    until(lambda: worked() == len(served.workers))  # they begin after the service
+    def have_begun() -> bool:  # workers start after the service
+        return worked() == len(served.workers) and figures()["sceneprint_workers_began"] >= 1
+
+    until(have_begun)
     values = figures()
     assert values['sceneprint_index_tail_frames{map="plain"}'] == 0
     assert values["sceneprint_maps"] >= 1
     assert values["sceneprint_disk_free_bytes"] > 0
     assert values['sceneprint_disk_bytes{part="database"}'] > 0
-    assert values["sceneprint_workers_began"] >= 1
     received = 'sceneprint_received_bytes_total{route="/v1/maps"}'
-    assert values[received] >= len(json.dumps({"name": "plain", "model": "depth"}))
+    assert values[received] >= len(
+        json.dumps({"name": "plain", "model": "depth"}, separators=(",", ":"))
+    )
     with Engine(Settings(data_dir=served.folder, database_url=None)) as engine:
 
         def agree() -> bool:  # once the jobs of the tests before have told all
