@@ -17,7 +17,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from sceneprint.geometry.registration.icp import place_covariance
+from sceneprint.geometry.registration.icp import fuse_votes
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import PoseAverage, average_poses
@@ -80,7 +80,7 @@ class PoseEstimate:
     reason : short explanation of the status
     parent : parent frame of the poses
     average : T_parent_query with the spread and number of agreeing votes; None unless found
-    covariance : (6, 6) covariance of `average`, in the order of `place_covariance`; None if a vote
+    covariance : (6, 6) covariance of `average`, in the order of `pose_error`; None if a vote
         has none
     strength : strength of the matches that vote for the answer; None unless found
     verified_by : evidence that decided; None unless found
@@ -447,7 +447,9 @@ def _found(
     covariance = None
     if votes and len(covariances) == len(votes):
         poses = np.stack([vote.T for vote in votes])
-        covariance = place_covariance(average, poses, np.stack(covariances))
+        inflations = 1.0 + np.array([vote.separation / p.same_view for vote in votes]) ** 2
+        T, covariance = fuse_votes(average, poses, np.stack(covariances), inflations)
+        average = replace(average, T=T)
     total = sum(len(each.accepted) for each in places)
     guided = sum(vote.match.validation.guided for vote in accepted)
     reason = _found_reason(average, len(accepted), guided, total, place.support, verified_by)

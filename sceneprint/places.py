@@ -25,10 +25,12 @@ from sceneprint.geometry.validation.map_verification import (
     at_place,
     compare_poses,
     distinct_viewpoints,
+    looks_ahead,
     map_frame,
     prior_starts,
     refine_starts,
     same_place,
+    view_separations,
 )
 from sceneprint.geometry.validation.validation import rank_accepted
 from sceneprint.models.model import AnswerParameters
@@ -43,6 +45,7 @@ class LocalizationParameters:
     confidence: float = 0.99  #: minimum confidence of a pose that is found
     worth: float = 0.05  #: minimum confidence of an alternative
     views: int = 5  #: maximum number of averaged votes, and of alternatives
+    same_view: float = 1 / 30  #: separation of views at which the weight of a vote is halved
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong match has weight 1
     outweigh: float = 2.0  #: minimum ratio of the weights of the best two places, without a map
     voted_only: bool = False  #: whether a pose requires the vote of a match
@@ -112,12 +115,16 @@ _CHI_SQUARE_6 = 22.458
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
-    """The vote of a match: its pose T and its viewpoint, (4, 4) in the parent frame."""
+    """The vote of a match: its pose T and its viewpoint, (4, 4) in the parent frame.
+
+    `separation` is that of the query's view from the match's; see `view_separations`.
+    """
 
     match: PairMatch
     T: Floats
     covariance: Floats | None
     viewpoint: Floats
+    separation: float
     weight: float
 
     @property
@@ -285,18 +292,22 @@ def _votes(
     """Return the votes of accepted matches, best first, then the votes of ambiguous matches."""
     votes: list[_Vote] = []
     for frame in frames:
+        ahead = np.array([looks_ahead(frame.geometry)])
         first = rank_accepted([match.validation for match in frame.matches])
         unsure = [i for i, m in enumerate(frame.matches) if m.validation.status == "ambiguous"]
         for match in [frame.matches[i] for i in [*first, *unsure]]:
             v, viewpoint = match.validation, poses[match.index]
             if v.T_match_query is None:
                 continue
+            sensor = viewpoint @ v.T_match_query
+            T = sensor @ inverse(frame.T)
             covariance = v.covariance
             if covariance is not None:
-                covariance = transform_covariance(covariance, viewpoint[:3, :3], np.zeros(3))
+                lever = T[:3, 3] - sensor[:3, 3]
+                covariance = transform_covariance(covariance, viewpoint[:3, :3], lever)
             weight = 1.0 if v.strength == "strong" else p.weak
-            T = viewpoint @ v.T_match_query @ inverse(frame.T)
-            votes.append(_Vote(match, T, covariance, viewpoint, weight))
+            (apart,) = view_separations(viewpoint[None], ahead, sensor, bool(ahead[0]), p.map)
+            votes.append(_Vote(match, T, covariance, viewpoint, float(apart), weight))
     if len(frames) > 1:
         order = rank_accepted([vote.match.validation for vote in votes])
         votes = [votes[i] for i in order] + [vote for vote in votes if not vote.accepted]

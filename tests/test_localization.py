@@ -116,6 +116,31 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
     assert (itself.T.tolist(), itself.support) == (found.average.T.tolist(), 1)
 
 
+def test_near_views_and_certain_matches_count_more(blank: Geometry) -> None:
+    """The query is at x = 0, and a camera in row 0 looks the same way as the query."""
+
+    def located(rows: Sequence[int], deviations: Sequence[float]) -> float:
+        matches = [
+            match(
+                row,
+                replace(outcome(T=inverse(ROWS[row]) @ shifted(0.03 * (i + 1))),
+                        covariance=np.eye(6) * deviation**2),
+            )
+            for i, (row, deviation) in enumerate(zip(rows, deviations, strict=True))
+        ]  # fmt: skip
+        found = by_pairs(blank, matches)
+        assert found is not None
+        assert found.average is not None
+        return float(found.average.T[0, 3])
+
+    # equal separations: 4 parts of the first, 1 of the second
+    assert located([1, 1], [0.01, 0.02]) == pytest.approx((4 * 0.03 + 0.06) / 5, abs=1e-3)
+    near, far = (1 + (30 * abs(row - x) / 3.5) ** 2 for row, x in ((0, 0.03), (2, 0.06)))
+    expected = (0.03 / near + 0.06 / far) / (1 / near + 1 / far)
+    assert located([0, 2], [0.01, 0.01]) == pytest.approx(expected, abs=1e-6)
+    assert expected < 0.0302
+
+
 @pytest.mark.parametrize(
     ("here", "there", "status", "alternatives"),
     [

@@ -348,7 +348,7 @@ class Alternative(ApiRecord):
 
 
 class Location(ApiRecord):
-    """The query's pose, averaged over the accepted matches that agree on it."""
+    """The query's pose: a weighted mean over the accepted matches that agree on it."""
 
     pose: Transform
     confidence: float | None = Field(default=None, description=_CONFIDENCE)

@@ -621,25 +621,39 @@ def free_directions(
     return tuple(free)
 
 
-def place_covariance(average: PoseAverage, poses: Floats, covariances: Floats) -> Floats:
-    """Return the covariance of an averaged pose, from its votes' covariances and their spread.
+def fuse_votes(
+    average: PoseAverage, poses: Floats, covariances: Floats, inflations: Floats
+) -> tuple[Floats, Floats]:
+    """Return the most likely pose (4, 4) of the votes that agree, and its covariance (6, 6).
 
-    All votes share the query, so only half of the mean covariance is divided by the number of
-    votes. The votes' spread, which contains the errors of the map's poses, is divided too.
+    All votes share the query, so only half of their covariances is independent. The spread of the
+    votes, which contains the errors of the map's poses, is added.
 
     Parameters
     ----------
     average : result of `average_poses`
     poses : (n, 4, 4) poses that were averaged
     covariances : (n, 6, 6) covariances of the poses
+    inflations : (n,) factors of the covariances in the weights of the votes
     """
-    own: Floats = covariances[average.members].mean(axis=0)
-    n = len(average.members)
-    if n == 1:
-        return own
-    errors = np.array([pose_error(average.T, pose) for pose in poses[average.members]])
-    result: Floats = own * (0.5 + 0.5 / n) + errors.T @ errors / (n * (n - 1))
-    return result
+    members, own = poses[average.members], covariances[average.members]
+    information = np.linalg.inv(own) / inflations[average.members, None, None]
+    gains = np.linalg.solve(information.sum(axis=0), information)
+    T, n = average.T.copy(), len(members)
+    errors = np.array([pose_error(T, vote) for vote in members])
+    step = np.einsum("nij,nj->i", gains, errors)
+    apply_rotation(average.T[:3, :3], step[3:], T[:3, :3])
+    T[:3, 3] += step[:3]
+    values, vectors = np.linalg.eigh(own)
+    roots = np.einsum("nij,nj,nkj->nik", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
+    parts = gains @ roots
+    shared = parts.sum(axis=0)
+    covariance: Floats = (np.einsum("nij,nkj->ik", parts, parts) + shared @ shared.T) / 2
+    if n > 1:
+        errors = np.array([pose_error(T, vote) for vote in members])
+        weighted = np.einsum("nij,nj->ni", gains, errors)
+        covariance += weighted.T @ weighted * n / (n - 1)
+    return T, covariance
 
 
 def pose_error(T: Floats, true: Floats) -> Floats:
