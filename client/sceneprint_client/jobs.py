@@ -156,8 +156,10 @@ class JobMethods(ServiceConnection):
         Parameters
         ----------
         archive : zip or tar (plain, .gz, .bz2 or .xz) of a 7-Scenes scene or sequence, a TUM RGB-D
-            folder, or depth images with their intrinsics.json
-        options : metadata of all frames; default: a name from that of the file
+            folder, or depth images with their intrinsics.json; or an MCAP file or ROS 1 bag
+        options : metadata of all frames; default: a name from that of the file. With `as` =
+            `recording`, `name` is the name of the file, and `progress.recording` of the job lists
+            its topics
 
         Returns
         -------

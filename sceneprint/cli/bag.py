@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 from sceneprint.cli import number_within, positive_number
@@ -17,7 +16,6 @@ from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequ
 from sceneprint.formats.dataset.frame_reference import Layout
 from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
 from sceneprint_client.formats import titles_of
-from sceneprint_client.frame_files import meta_of
 from sceneprint_client.sidecars import Camera
 
 _DEFAULT = RecordingOptions()
@@ -136,60 +134,21 @@ def run_bag(options: argparse.Namespace) -> int:
 
 
 def _outline_lines(path: Path, outline: BagOutline) -> list[str]:
-    seconds = max(outline.end_ns - outline.start_ns, 0) * 1e-9
     count = sum(one.count for one in outline.topics)
     lines = [
         f"{one_line(str(path))}: {outline.kind}, {count} messages of {len(outline.topics)} topics, "
-        f"{_span(outline)}"
+        f"{outline.span}"
     ]
     width = max((len(one_line(one.name)) for one in outline.topics), default=0)
     kinds = max((len(one_line(one.type)) for one in outline.topics), default=0)
-    frames = {one.topic.name: one.encoding or "points" for one in outline.frames}
     for one in outline.topics:
-        rate = f"{one.count / seconds:.1f} Hz" if seconds > 0 and one.count > 1 else ""
-        uses = frames.get(one.name, "")
-        if outline.chosen is not None and one.name == outline.chosen.topic.name:
-            uses += ", used"
-        if one.name == outline.camera:
-            uses = "camera"
+        rate = ""
+        if outline.seconds > 0 and one.count > 1:
+            rate = f"{one.count / outline.seconds:.1f} Hz"
         lines.append(
             f"  {one_line(one.name):{width}}  {one_line(one.type):{kinds}}  {one.count:8}  "
-            f"{rate:>9}  {uses}".rstrip()
+            f"{rate:>9}  {outline.use_of(one)}".rstrip()
         )
     if not outline.sequences:
         return [*lines, f"no frame can be used: {one_line(outline.problem)}"]
-    lines += [line for sequence in outline.sequences for line in _sequence_lines(sequence)]
-    return lines if outline.range is None else [*lines, str(outline.range)]
-
-
-def _span(outline: BagOutline) -> str:
-    """Return the start and the duration of a recording."""
-    seconds = (outline.end_ns - outline.start_ns) * 1e-9
-    if not 0 <= seconds < 1e9:
-        return "no messages"
-    try:
-        start = datetime.fromtimestamp(outline.start_ns * 1e-9, UTC)
-    except (ValueError, OverflowError, OSError):
-        return f"{seconds:.1f} s"
-    return f"{seconds:.1f} s from {start:%Y-%m-%dT%H:%M:%SZ}"
-
-
-def _sequence_lines(sequence: FrameSequence) -> list[str]:
-    first = sequence.frames[0]
-    lines = [sequence.note] if sequence.note else []
-    if first.camera is not None:
-        k = first.camera.intrinsics
-        lens = f", distortion {' '.join(f'{d:g}' for d in k.distortion)}" if k.distortion else ""
-        lines.append(
-            f"camera: {k.width} x {k.height}, fx {k.fx:g}, fy {k.fy:g}, cx {k.cx:g}, cy {k.cy:g}"
-            f"{lens}"
-        )
-    lines.append(f"poses: {f'in {sequence.parent_frame}' if first.pose is not None else 'none'}")
-    base = meta_of(first, with_pose=False).T_base_sensor
-    if base is not None and base.matrix is not None:
-        x, y, z = (round(row[3], 3) + 0.0 for row in base.matrix[:3])
-        lines.append(f"mounting: at {x:.3f} {y:.3f} {z:.3f} m in {one_line(base.base_frame)}")
-    sensors = (one.camera or one.cloud for one in sequence.frames)
-    ups = sum(sensor is not None and sensor.up is not None for sensor in sensors)
-    lines.append(f"up: known for {ups} of {len(sequence.frames)} frames")
-    return lines
+    return [*lines, *outline.findings]

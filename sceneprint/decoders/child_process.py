@@ -29,6 +29,7 @@ from sceneprint.errors import SceneprintError
 from sceneprint.formats.depth_file import decode_samples, encode_npy, encode_png
 from sceneprint.formats.points import pcd, ply, rows
 from sceneprint.formats.points.cloud import read_points
+from sceneprint.formats.points.rows import FileBytes
 from sceneprint.geometry.kernel import Kernel
 from sceneprint_client.formats import formats_of, function_at
 from sceneprint_client.sidecars import UNSAID
@@ -63,6 +64,13 @@ def _points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArr
 
 
 TASKS: Mapping[str, Task] = {"samples": _samples, "points": _points}
+
+
+def mapped(descriptor: int) -> FileBytes:
+    """Map an open file into memory, since a confined process can neither open nor seek."""
+    if os.fstat(descriptor).st_size == 0:
+        return b""
+    return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
 
 
 def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None) -> None:

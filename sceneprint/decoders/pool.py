@@ -54,7 +54,7 @@ _ERRORS = {
     one.__name__: one
     for one in (
         errors.UnreadableFrame, errors.UnreadableCloud, errors.UselessFrame,
-        errors.InvalidIntrinsics, errors.MissingDependency,
+        errors.UnreadableArchive, errors.InvalidIntrinsics, errors.MissingDependency,
     )
 }  # fmt: skip
 #: Time limit for the start of a process, which may compile kernels; interval between checks of its

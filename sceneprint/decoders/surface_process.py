@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import base64
 import json
-import mmap
-import os
 import struct
 import sys
 from contextlib import suppress
@@ -21,25 +19,18 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.decoders.child_process import array_samples, serve, text_samples
+from sceneprint.decoders.child_process import array_samples, mapped, serve, text_samples
 from sceneprint.errors import SceneprintError
 from sceneprint.formats.points import pcd, ply, rows
 from sceneprint.formats.points.cloud import thinned
-from sceneprint.formats.points.rows import FileBytes
 from sceneprint.formats.surface_file import SurfaceOptions, ply_faces, read_surface
 from sceneprint.formats.surface_file.reading import SurfaceFormat
 from sceneprint.geometry.kernel import Kernel
 from sceneprint.geometry.surface.upright import estimate_up
 
 
-def _mapped(descriptor: int) -> FileBytes:
-    if os.fstat(descriptor).st_size == 0:
-        return b""
-    return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
-
-
 def _main() -> None:
-    file, form = _mapped(int(sys.argv[6])), cast(SurfaceFormat, sys.argv[7])
+    file, form = mapped(int(sys.argv[6])), cast(SurfaceFormat, sys.argv[7])
 
     def surface(
         _data: bytes, request: dict[str, Any]

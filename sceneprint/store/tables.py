@@ -287,6 +287,8 @@ job_files = Table(
 
 #: Name of the uploaded archive of an import, which counts against the quota of the map.
 ARCHIVE = "archive"
+#: Names of all files of an import; the index of a recording does not count against the quota.
+IMPORT_FILES = (ARCHIVE, "index")
 
 keys = Table(
     "keys",

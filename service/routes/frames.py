@@ -22,6 +22,7 @@ from sceneprint_client.api.base import NOVEL, novelty_of, record_of
 from sceneprint_client.api.frames import (
     MOST_OF_BATCH,
     MOST_PRIORITY,
+    RECORDING_OPTIONS,
     Batch,
     ImportItem,
     ImportOptions,
@@ -293,7 +294,7 @@ TYPES = media_types_of("archive")
 _CHUNK = 1 << 20
 _TEXTS = (
     "as", "name", "robot", "session", "parent_frame", "every", "with_poses", "trust_depth",
-    "units_per_metre",
+    "units_per_metre", *RECORDING_OPTIONS,
 )  # fmt: skip
 _PARAMETERS = (
     *_TEXTS, "tags", "base", "base_frame", "up", "heights", "offset", "camera", "priority",
@@ -317,10 +318,10 @@ def _described_import() -> dict[str, Any]:
     for name in _PARAMETERS:
         own_schema = own.get(name, {})
         schema = OPTIONS.get(name) or {"type": "string"}
-        if name in ("as", "every", "with_poses", "trust_depth", "name"):
+        if "type" in own_schema and name in _TEXTS:
             keys = ("type", "enum", "default", "minimum")
             schema = {key: own_schema[key] for key in keys if key in own_schema}
-        if name == "units_per_metre":
+        if name in ("units_per_metre", "depth_scale"):
             schema = {"type": "number", "exclusiveMinimum": 0}
         text = own_schema.get("description") or base.get(name, {}).get("description", "")
         text = " ".join(filter(None, (text, _WRITTEN.get(name))))
@@ -340,7 +341,7 @@ async def add_import(
     map_name: str, request: Request, here: Here, caller: Sender, response: Response,
     key: IdempotencyKey = None,
 ) -> Job:  # fmt: skip
-    """Import an archive of sequences, or a map in one file. The body is the file itself.
+    """Import an archive of sequences, a map in one file, or a recording. The body is the file.
 
     An archive is a zip or tar file (plain, .gz, .bz2 or .xz) of a 7-Scenes scene or sequence, a TUM
     RGB-D folder, or depth images with their intrinsics.json. The archive is stored durably before
@@ -351,6 +352,11 @@ async def add_import(
     or E57), and `name` is the name of its file. A worker renders views of it and adds them as
     frames with poses. It then queries the map with other views; the `result` of the job
     (MapImportResult) contains the number of views that were found.
+
+    With `as=recording` the body is an MCAP file or a ROS 1 bag, and `name` is the name of its file.
+    A worker selects keyframes and adds them, as `sceneprint upload` does. `progress.recording` of
+    the job (RecordingOutline) lists the topics and findings as soon as the file is read, even if no
+    frame can be used.
     """
     if media_type(request) not in TYPES:
         raise UnsupportedType(

@@ -6,8 +6,10 @@ import io
 import json
 import tarfile
 import zipfile
+from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 
@@ -69,3 +71,34 @@ def test_an_archive_has_a_limit_of_its_own(begin, make_map, small_shots, refused
         archive.addfile(info, io.BytesIO(bytes(info.size)))
     bomb = sent(made.getvalue(), "application/x-xz")
     refused(server.client.post(f"{path}/imports", **bomb), 422, "unreadable-archive", "240000")
+
+
+def test_recordings_are_sent_with_their_options(
+    served, make_map, refused, ros, tmp_path, until
+) -> None:
+    path = make_map(served, "bags")
+
+    def fill(writer: Any) -> None:
+        for name in ("/a", "/b"):
+            writer.image(0, np.full((60, 80), 2000), topic=f"{name}/image_raw")
+            writer.camera_info(0, f"{name}/camera_info")
+
+    bag = ros.write(tmp_path, fill, "ros1").read_bytes()
+    said = {"as": "recording", "name": "run.bag"}
+    kind = "application/octet-stream"
+
+    def imported(**more: str) -> Any:
+        answer = served.client.post(f"{path}/imports", **sent(bag, kind, **said, **more))
+        assert answer.status_code == 202
+        place = answer.headers["Location"]
+        until(lambda: served.client.get(place).json()["finished_at"])
+        return served.client.get(place).json()
+
+    failed = imported()
+    assert (failed["kind"], failed["state"]) == ("import-bag", "failed")
+    assert failed["error"] == failed["progress"]["recording"]["problem"]
+    done = imported(topic="/b/image_raw", keyframe_s="0", depth_scale="500")
+    assert done["result"]["summary"]["depth"]["median"] == 4.0
+    post = partial(served.client.post, f"{path}/imports")
+    refused(post(**sent(b"x" * 600, kind, **said)), 422, "unreadable-archive", "run.bag")
+    refused(post(**sent(bag, kind, topic="/b")), 422, "invalid-request", "topic")

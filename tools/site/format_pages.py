@@ -17,7 +17,7 @@ _TITLES: dict[Kind, str] = {
 }
 #: Kinds of files that the dashboard accepts, in the order of its checks: an array is rather a cloud
 #: than an image, and a cloud rather a frame than a whole map.
-_DASHBOARD: tuple[Kind, ...] = ("cloud", "depth", "map", "archive")
+_DASHBOARD: tuple[Kind, ...] = ("cloud", "depth", "map", "archive", "recording")
 
 
 def formats_page() -> str:
@@ -60,7 +60,7 @@ def formats_module() -> str:
     )  # fmt: skip
     return (
         "// The formats of files, written by `make goldens` from sceneprint_client/formats.py.\n"
-        '\n/** @typedef {"depth"|"cloud"|"map"|"archive"} FileKind */\n'
+        '\n/** @typedef {"depth"|"cloud"|"map"|"archive"|"recording"} FileKind */\n'
         "/** @type {{kind: FileKind, name: string, title: string, suffixes: string[], "
         "signature: string}[]} */\n"
         f"export const FORMATS = [\n{rows}];\n"

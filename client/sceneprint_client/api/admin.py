@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AwareDatetime, Field, StringConstraints
 
 from sceneprint_client.api.base import MAP_OR_EVERY, ApiRecord, Given, JobState, Label, Page
+from sceneprint_client.api.frames import RecordingOutline
 
 #: Scopes of a key for a map. Each scope includes the previous ones.
 Scope = Literal["read", "write", "admin"]
@@ -332,7 +333,7 @@ OUTCOMES: tuple[Outcome, ...] = (
 
 
 #: Phases of the import of a map, in their order.
-ImportPhase = Literal["read", "choose", "render", "sign", "test"]
+ImportPhase = Literal["read", "choose", "render", "sign", "test", "add"]
 
 
 class Progress(ApiRecord):
@@ -342,7 +343,11 @@ class Progress(ApiRecord):
     total: int | None = Field(default=None, description="Total number of steps; null if unknown.")
     phase: ImportPhase | None = Field(
         default=None,
-        description="Phase of a map import. This and the following fields are null for other jobs.",
+        description="Phase of the import of a map or a recording. This and the following fields "
+        "are null for other jobs.",
+    )
+    recording: RecordingOutline | None = Field(
+        default=None, description="Content of the recording; null before it is read."
     )
     points: int | None = Field(default=None, description="Number of points that were read.")
     views: int | None = Field(default=None, description="Number of selected viewpoints.")
@@ -377,9 +382,9 @@ class Job(ApiRecord):
 
     job_id: str
     kind: str = Field(
-        description="`sign`, `import`, `import-map`, `associate`, `coverage`, `difference`, "
-        "`surface`, `reconstruct`, or `reencode`, which signs an indexed frame again, for the "
-        "map's next model or to replace a damaged signature."
+        description="`sign`, `import`, `import-map`, `import-bag`, `associate`, `coverage`, "
+        "`difference`, `surface`, `reconstruct`, or `reencode`, which signs an indexed frame "
+        "again, for the map's next model or to replace a damaged signature."
     )
     state: JobState
     map: str | None = Field(description="Map of the job.")

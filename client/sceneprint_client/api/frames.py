@@ -294,24 +294,31 @@ AxisOrUp = Annotated[
 ]
 #: Tag of frames that were rendered from an imported map.
 VIRTUAL = "virtual"
-#: Options for imports of frames only, and options for imports of whole maps only.
+#: Options for imports of frames and recordings, and options for imports of whole maps only.
 _OF_FRAMES = ("with_poses", "every", "T_base_sensor", "trust_depth")
 _OF_MAP = ("heights", "units_per_metre", "offset", "camera")
+#: Options for imports of recordings only, with the same names as those of `sceneprint upload`.
+RECORDING_OPTIONS = (
+    "topic", "camera_info", "pose_frame", "sensor_frame", "depth_scale", "keyframe_m",
+    "keyframe_deg", "keyframe_s",
+)  # fmt: skip
+_TopicName = Annotated[str, Field(min_length=1, max_length=255)]
 
 
 class ImportOptions(Given):
     """Options of an import: how to read the file, and metadata of the added frames."""
 
-    as_: Literal["frames", "map"] = Field(
+    as_: Literal["frames", "map", "recording"] = Field(
         default="frames",
         alias="as",
         description="`frames`: an archive of sequences; their frames are added. `map`: a cloud or "
-        "mesh of a whole place; rendered views of the place are added, with the tag `virtual`.",
+        "mesh of a whole place; rendered views of the place are added, with the tag `virtual`. "
+        "`recording`: an MCAP file or ROS 1 bag; its keyframes are added.",
     )
     name: FolderName = Field(
         default="import",
-        description="Name for a sequence that is not in a folder of the archive. For a map, the "
-        "name of its file.",
+        description="Name for a sequence that is not in a folder of the archive. For a map or a "
+        "recording, the name of its file.",
     )
     robot: Label | None = Field(
         default=None,
@@ -362,6 +369,43 @@ class ImportOptions(Given):
         default=None,
         description="For a map of depth images: the robot's camera, for which views are rendered.",
     )
+    topic: _TopicName | None = Field(
+        default=None,
+        description="For a recording: topic of depth images or points; default: the only one.",
+    )
+    camera_info: _TopicName | None = Field(
+        default=None,
+        description="For a recording: topic of the camera; default: the one beside the images.",
+    )
+    pose_frame: _TopicName | None = Field(
+        default=None,
+        description="For a recording: frame of the poses; default: the first of `map`, `odom` and "
+        "`world` that exists, otherwise the topmost frame.",
+    )
+    sensor_frame: _TopicName | None = Field(
+        default=None,
+        description="For a recording with points in a world frame: frame of the sensor; default: "
+        "the only frame at the end of the transforms.",
+    )
+    depth_scale: float | None = Field(
+        default=None,
+        gt=0,
+        description="For a recording: stored units per metre of 16-bit depth; default: 1000.",
+    )
+    keyframe_m: float = Field(
+        default=0.3,
+        ge=0,
+        description="For a recording: minimum distance between frames, metres. A frame is also "
+        "taken after `keyframe_deg`; 0 takes every frame.",
+    )
+    keyframe_deg: float = Field(
+        default=15, ge=0, description="For a recording: minimum rotation between frames, degrees."
+    )
+    keyframe_s: float = Field(
+        default=0.5,
+        ge=0,
+        description="For a recording without poses: minimum time between frames, seconds.",
+    )
     priority: int = Field(
         default=0, ge=-MOST_PRIORITY, le=MOST_PRIORITY, description="Priority of the frames' jobs."
     )
@@ -371,12 +415,12 @@ class ImportOptions(Given):
 
     @model_validator(mode="after")
     def _require_matching_options(self) -> ImportOptions:
-        if self.as_ == "map":
-            idle: Sequence[str] = _OF_FRAMES
-            hint = "does not apply to a map; omit it"
-        else:
-            idle, hint = _OF_MAP, "applies only if `as` is `map`"
-        for name in idle:
+        idle = dict.fromkeys(_OF_FRAMES, "does not apply to a map; omit it")
+        if self.as_ != "map":
+            idle = dict.fromkeys(_OF_MAP, "applies only if `as` is `map`")
+        if self.as_ != "recording":
+            idle |= dict.fromkeys(RECORDING_OPTIONS, "applies only if `as` is `recording`")
+        for name, hint in idle.items():
             if getattr(self, name) != type(self).model_fields[name].get_default():
                 raise ValueError(f"{name}: {hint}")
         if self.up is not None and isinstance(self.up, str) != (self.as_ == "map"):
@@ -462,6 +506,44 @@ class MapImportResult(ApiRecord):
     )
     weak: list[WeakArea] = Field(
         description="Areas in which fewer than half of the test views were found, worst first."
+    )
+
+
+#: Maximum number of topics in an outline; those that an upload can use come first.
+MOST_RECORDING_TOPICS = 200
+
+
+class RecordingTopic(ApiRecord):
+    """A topic of a recording."""
+
+    name: str
+    type: str = Field(description="Type of the messages, such as `sensor_msgs/msg/Image`.")
+    count: int = Field(description="Number of messages.")
+    use: str = Field(
+        description="How the import can use the topic, such as `16UC1`, `points` or `camera`, with "
+        "`, used` if it takes its frames from it; empty if it cannot."
+    )
+
+
+class RecordingOutline(ApiRecord):
+    """The content of a recording, and the frames that the import selects."""
+
+    kind: str = Field(description="`ROS 1` or `ROS 2`.")
+    seconds: float = Field(description="Duration, seconds.")
+    span: str = Field(description="Duration and start, as text.")
+    topics: list[RecordingTopic] = Field(
+        description=f"At most {MOST_RECORDING_TOPICS} topics; those of use come first."
+    )
+    findings: list[str] = Field(
+        description="Findings on the selected frames, as `sceneprint bag` prints them: omissions "
+        "with reasons, the camera, poses, mounting, up, and the range of a sample."
+    )
+    problem: str | None = Field(
+        description="Reason why no frame can be used; null if the import adds frames."
+    )
+    lost: int = Field(
+        description="Number of omitted frames and poses that no option excludes, and of damaged "
+        "messages."
     )
 
 

@@ -1,6 +1,6 @@
 """Import of archives: a request stores the file, and a worker adds its frames.
 
-See `map_import` for maps in one file.
+See `map_import` for maps in one file, and `recording_import` for recordings.
 
     chunks  --Receiver-->  a seekable blob  --Imports.begin-->  job  --Imports.handle-->  items
 """
@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,8 @@ from sceneprint.formats.archive import BLOCK, Archive, Inflater, is_archive, ope
 from sceneprint.formats.dataset import FrameReference
 from sceneprint.formats.dataset.frame_reference import (
     FrameSequence,
+    import_meta,
     numbered_sequences,
-    parent_frame_of,
-    session_of,
 )
 from sceneprint.formats.surface_file import surface_format
 from sceneprint.geometry.views import ViewParameters, view_parameters
@@ -43,13 +43,11 @@ from sceneprint.store.deletion import make_room
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import current_map, find_map, model_content
 from sceneprint.store.opaque_ids import row_of
-from sceneprint.store.tables import ARCHIVE, JobRow, MapRow, frames
+from sceneprint.store.tables import ARCHIVE, IMPORT_FILES, JobRow, MapRow, frames
 from sceneprint.types import Intrinsics
 from sceneprint_client.api import Job, Page
-from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.api.frames import ImportItem, ImportOptions, UploadSummary, upload_summary
-from sceneprint_client.formats import HEAD
-from sceneprint_client.frame_files import meta_of
+from sceneprint_client.formats import HEAD, format_at
 
 # Frames of an archive are added in blocks. An error of one frame does not affect the others.
 #
@@ -95,29 +93,34 @@ def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[S
 
 
 def add_block(
-    uploads: Uploads, task: LongJob, archive: Archive, steps: Sequence[Step], options: ImportOptions
+    uploads: Uploads, task: LongJob, block: Sequence[tuple[str, Callable[[], Upload]]]
 ) -> list[ImportItem]:
-    """Add a block of frames in one commit, if this worker still holds the job."""
+    """Add a block of frames in one commit, if this worker still holds the job.
+
+    Parameters
+    ----------
+    block : name of each frame, and the function that reads it
+    """
 
     def fence(connection: Connection) -> None:  # the job may be cancelled
         queue.check_held(connection, task.job)
 
     outcomes: list[UploadOutcome | None] = []
     uploaded = []
-    for step in steps:
+    for _, read in block:
         try:
-            uploaded.append(_upload(archive, step, options))
+            uploaded.append(read())
             outcomes.append(None)
         except errors.StoreError:
             raise
         except errors.SceneprintError as error:
-            outcomes.append(UploadOutcome(None, error=type(error)(archive.message_of(error))))
+            outcomes.append(UploadOutcome(None, error=error))
         except MemoryError:
             outcomes.append(_too_large())
     rest = iter(_added(uploads, task.of_map.name, uploaded, fence))
     return [
-        import_item(step.name, outcome or next(rest))
-        for step, outcome in zip(steps, outcomes, strict=True)
+        import_item(name, outcome or next(rest))
+        for (name, _), outcome in zip(block, outcomes, strict=True)
     ]
 
 
@@ -141,18 +144,13 @@ def _too_large() -> UploadOutcome:
 
 
 def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
-    if step.sequence is None or step.reference is None:
-        raise step.refused or ValueError("neither a frame nor refused")
-    meta = meta_of(
-        step.reference, robot=options.robot,
-        session=options.session or session_of(step.sequence), tags=options.tags,
-        with_pose=options.with_poses,
-        parent_frame=options.parent_frame or parent_frame_of(step.sequence, options.robot),
-        base=options.T_base_sensor,
-        up=options.up.unit if isinstance(options.up, GivenDirection) else None,
-        trust_depth=options.trust_depth,
-    )  # fmt: skip
-    data = archive.data_of(step.reference)
+    try:
+        if step.sequence is None or step.reference is None:
+            raise step.refused or ValueError("neither a frame nor refused")
+        meta = import_meta(step.reference, step.sequence, options)
+        data = archive.data_of(step.reference)
+    except errors.SceneprintError as error:
+        raise type(error)(archive.message_of(error)) from error
     return Upload(data, meta, options.priority, options.if_novel)
 
 
@@ -191,8 +189,8 @@ def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
     )  # fmt: skip
 
 
-#: Kinds of the jobs that import archives, and maps in one file.
-KIND, MAP_KIND = "import", "import-map"
+#: Kinds of the jobs that import archives, maps in one file, and recordings, by `as`.
+KINDS = {"frames": "import", "map": "import-map", "recording": "import-bag"}
 #: Seconds between two removals of archives of finished imports.
 TIDY_S = 5.0
 #: Maximum size of a compressed tar's content, relative to the largest accepted archive.
@@ -203,22 +201,23 @@ _IDS_AT_ONCE = 500
 _MOST_PIXELS = 640
 
 
-class _MapBytes:
-    """Filter that checks the bytes of a map's file.
+class _FileBytes:
+    """Filter that checks the bytes of a map's file or of a recording.
 
     Parameters
     ----------
     name : name of the file
+    is_map : whether the file is a map
     """
 
-    def __init__(self, name: str) -> None:
-        self._name, self._head, self._size = name, b"", 0
+    def __init__(self, name: str, *, is_map: bool) -> None:
+        self._name, self._is_map, self._head, self._size = name, is_map, b"", 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
         """Yield a chunk unchanged; raise InvalidRequest if the file is an archive."""
         if len(self._head) < HEAD:
             self._head += chunk[: HEAD - len(self._head)]
-            if len(self._head) >= BLOCK and is_archive(self._head):
+            if self._is_map and len(self._head) >= BLOCK and is_archive(self._head):
                 raise errors.InvalidRequest(
                     "The file is an archive, but a map must be a single cloud or mesh. Unpack it, "
                     "or omit `as` to import the frames in it.",
@@ -228,8 +227,15 @@ class _MapBytes:
         yield chunk
 
     def end(self) -> Iterator[bytes]:
-        """Raise UnreadableCloud if the file is not a map; yield nothing."""
-        surface_format(self._head, self._name, self._size)
+        """Raise UnreadableCloud or UnreadableArchive for another format; yield nothing."""
+        form = format_at(self._head, "recording")
+        if self._is_map:
+            surface_format(self._head, self._name, self._size)
+        elif form is None or form.name not in ("mcap", "rosbag1"):
+            raise errors.UnreadableArchive(
+                f"{self._name} is neither an MCAP file nor a ROS 1 bag. A rosbag2 folder or "
+                "database can be sent with `sceneprint upload MAP FOLDER`."
+            )
         yield from ()
 
 
@@ -244,7 +250,7 @@ class Receiver:
     """
 
     def __init__(
-        self, blob: IncomingBlob, source: Inflater | _MapBytes, reserve: Callable[[int], None]
+        self, blob: IncomingBlob, source: Inflater | _FileBytes, reserve: Callable[[int], None]
     ) -> None:
         self._blob, self._source, self._reserve = blob, source, reserve
 
@@ -346,9 +352,11 @@ class Imports:
 
         try:
             with self._store.blobs.incoming() as blob:
-                whole = options.as_ == "map"
-                source = _MapBytes(options.name) if whole else Inflater(_UNPACKED * self._most)
-                yield Receiver(blob, source, reserve)
+                if options.as_ == "frames":
+                    yield Receiver(blob, Inflater(_UNPACKED * self._most), reserve)
+                else:
+                    source = _FileBytes(options.name, is_map=options.as_ == "map")
+                    yield Receiver(blob, source, reserve)
         finally:
             incoming.add(row.number, -reserved)
 
@@ -379,10 +387,16 @@ class Imports:
         Conflict : If an import of the same archive has just ended and removed it.
         """
         data = options.model_dump(mode="json", by_alias=True)
-        kind = MAP_KIND if options.as_ == "map" else KIND
         try:
             job, again = queue_task(
-                self._store, self._bell, kind, map_name, data, options.priority, [archive], once
+                self._store,
+                self._bell,
+                KINDS[options.as_],
+                map_name,
+                data,
+                options.priority,
+                [archive],
+                once,
             )
         except Swept as error:
             raise errors.Conflict(
@@ -409,7 +423,7 @@ class Imports:
         first = row_of(cursor) or 0
         with self._store.database.read() as connection:
             row, job = find_map(connection, map_name), queue.find_job(connection, job_id)
-            if job.kind not in (KIND, MAP_KIND) or job.map_number != row.number:
+            if job.kind not in KINDS.values() or job.map_number != row.number:
                 raise queue.unknown_job(job_id)
             rows = queue.items_of(connection, job.number, first, limit + 1)
         more = str(first + limit) if len(rows) > limit else None
@@ -430,7 +444,7 @@ class Imports:
         except errors.UnreadableArchive:  # a retry does not help, and the archive may be large
             with self._store.database.write() as connection:
                 number = task.job.number
-                unused = queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
+                unused = queue.remove_parts(connection, number, items=False, files=IMPORT_FILES)
             collect_deleted_blobs(self._store, unused)
             raise
 
@@ -451,7 +465,7 @@ class Imports:
             unused = [
                 blob
                 for number in queue.finished_with_file(connection, ARCHIVE)
-                for blob in queue.remove_parts(connection, number, items=False, files=[ARCHIVE])
+                for blob in queue.remove_parts(connection, number, items=False, files=IMPORT_FILES)
             ]
         collect_deleted_blobs(self._store, unused)
         return len(unused)
@@ -481,7 +495,8 @@ class Imports:
         items: list[dict[str, Any]] = []
         while progress["done"] < len(steps) and (not items or not is_over()):
             block = next_block(archive, steps, progress["done"])
-            for item in add_block(self._uploads, task, archive, block, options):
+            reads = [(step.name, partial(_upload, archive, step, options)) for step in block]
+            for item in add_block(self._uploads, task, reads):
                 items.append(item.model_dump(mode="json"))
                 progress[{202: "received", 200: "there"}.get(item.status, "refused")] += 1
             progress["done"] += len(block)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sceneprint.engine.context import Context
-from sceneprint.engine.ingest.archive_import import KIND, MAP_KIND, Imports
+from sceneprint.engine.ingest.archive_import import KINDS, Imports
 from sceneprint.engine.ingest.map_import import MapImporter
+from sceneprint.engine.ingest.recording_import import RecordingImporter
 from sceneprint.engine.ingest.uploads import Uploads
 from sceneprint.engine.jobs import lifecycle, signature_job
 from sceneprint.engine.jobs.lifecycle import Work
@@ -37,8 +38,9 @@ class JobRunner:
             Reconstructions(context),
         )  # fmt: skip
         self.handlers: dict[str, Handler] = {
-            KIND: Imports(context, uploads).handle,
-            MAP_KIND: MapImporter(context, uploads, queries),
+            KINDS["frames"]: Imports(context, uploads).handle,
+            KINDS["map"]: MapImporter(context, uploads, queries),
+            KINDS["recording"]: RecordingImporter(context, uploads),
             SURFACE: SurfaceHandler(context.store, context.signers),
             **{one.kind: one.run_slice for one in products},
         }

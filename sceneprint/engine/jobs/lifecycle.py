@@ -23,7 +23,7 @@ from sceneprint.store.maps import frame_of, map_of_number
 from sceneprint.store.queue import fail_dead_worker
 from sceneprint.store.queue import list_jobs as list_stored
 from sceneprint.store.reencoding_rows import REENCODE
-from sceneprint.store.tables import ARCHIVE, FrameRow, JobRow, MapRow
+from sceneprint.store.tables import IMPORT_FILES, FrameRow, JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint_client.api import FrameState, Job, JobState, Page
 from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
@@ -219,7 +219,7 @@ def cancel(store: Store, job_id: str) -> Job:
             queue.cancel(connection, job)
             record_change(connection, "job.cancelled", _map_name(connection, job), job.id)
             fail_frame(connection, job, CANCELLED)
-            unused = queue.remove_parts(connection, job.number, items=False, files=[ARCHIVE])
+            unused = queue.remove_parts(connection, job.number, items=False, files=IMPORT_FILES)
         cancelled = _job_record(connection, queue.find_job(connection, job_id))
     collect_deleted_blobs(store, unused)
     return cancelled

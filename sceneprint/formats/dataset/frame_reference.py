@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -16,9 +16,13 @@ from sceneprint.formats.depth_file import decode_frame
 from sceneprint.formats.points import Scan, decode_scan
 from sceneprint.types import AnyFrame, DepthFrame, Floats
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, data_lines, naming, read_bytes, read_text
-from sceneprint_client.frame_files import FrameFile, is_kitti
+from sceneprint_client.frame_files import FrameFile, is_kitti, meta_of
 from sceneprint_client.poses import SensorTrajectory
 from sceneprint_client.sidecars import CloudSource
+
+if TYPE_CHECKING:
+    from sceneprint_client.api import FrameMeta
+    from sceneprint_client.api.frames import ImportOptions
 
 _TOLERANCE = 1e-2  #: maximum difference of the length of a quaternion from 1
 _MAXIMUM_TRAJECTORY_BYTES = 2**26  #: size of an hour of poses at 200 Hz
@@ -233,7 +237,22 @@ def count_lost(left_out: Counter[str]) -> int:
     return left_out.total() - sum(left_out[reason] for reason in EMPTY_FRAMES)
 
 
-# Names and numbers of frames in uploads.
+# Metadata, names and numbers of frames in uploads.
+
+
+def import_meta(
+    reference: FrameReference, sequence: FrameSequence, options: ImportOptions
+) -> FrameMeta:
+    """Return the metadata of a frame of an import; errors are those of `meta_of`."""
+    up = options.up
+    return meta_of(
+        reference, robot=options.robot, session=options.session or session_of(sequence),
+        tags=options.tags, with_pose=options.with_poses,
+        parent_frame=options.parent_frame or parent_frame_of(sequence, options.robot),
+        base=options.T_base_sensor,
+        up=None if up is None or isinstance(up, str) else up.unit,
+        trust_depth=options.trust_depth,
+    )  # fmt: skip
 
 
 def session_of(sequence: FrameSequence) -> str:

@@ -6,10 +6,9 @@ Only `bag.py` imports rosbags, and only when a bag is opened.
 """
 
 from sceneprint.formats.recording.bag import Bag, is_recording
+from sceneprint.formats.recording.outline import BagOutline, bag_outline
 from sceneprint.formats.recording.selection import (
-    BagOutline,
     RecordingOptions,
-    bag_outline,
     recording_name,
     recording_sequences,
 )

@@ -309,6 +309,16 @@ def _types(*, ros1: bool) -> Typestore:
     return types
 
 
+def load_readers() -> None:
+    """Load rosbags and its decompressors, which a confined process cannot do later."""
+    for ros1 in (False, True):
+        _types(ros1=ros1)
+    import rosbags.serde.primitives  # noqa: F401  (rosbags generates code that imports it)
+
+    _zstd()
+    _lz4()
+
+
 def _limit_decompression() -> None:
     """Limit decompressed chunks to their declared size and to MAXIMUM_CHUNK_BYTES.
 

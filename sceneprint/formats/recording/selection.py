@@ -1,8 +1,7 @@
 """Select the frames of a bag, and compute their poses.
 
-path, RecordingOptions  --recording_sequences-->  FrameSequence of each part Bag  --bag_outline-->
-BagOutline for `sceneprint bag` stamps, poses  --keyframes-->  indices of frames far enough from the
-previous keyframe in space or time
+path, RecordingOptions  --recording_sequences-->  FrameSequence of each part
+stamps, poses  --keyframes-->  indices of frames far enough from the previous keyframe
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.errors import DatasetError, InvalidIntrinsics, SceneprintError
+from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
 from sceneprint.formats.recording.bag import CAMERA, Bag, BagTopic
 from sceneprint.formats.recording.scan import BagPart, BagScan, Progress, scan_bag
@@ -24,13 +23,10 @@ from sceneprint.formats.recording.topics import (
     FrameTopic,
     camera_topic,
     choose_topic,
-    frame_topics,
     listed,
 )
-from sceneprint.formats.sample_range import sample_range
 from sceneprint.types import Floats
 from sceneprint_client.api.base import GivenBase, checked
-from sceneprint_client.api.frames import SampleRange, pooled_range
 from sceneprint_client.errors import printable
 from sceneprint_client.files import naming
 from sceneprint_client.ros_messages import DEPTH_SCALE, camera_intrinsics
@@ -143,10 +139,10 @@ def recording_sequences(
     bag = Bag(path)
     frames = choose_topic(bag, options.topic)
     name = recording_name(path) if name is None else name
-    return tuple(_sequences_of(bag, frames, options, name))
+    return tuple(sequences_of(bag, frames, options, name))
 
 
-def _sequences_of(
+def sequences_of(
     bag: Bag, frames: FrameTopic, options: RecordingOptions, name: str
 ) -> list[FrameSequence]:
     """Return the keyframes of a topic; see `recording_sequences`."""
@@ -193,24 +189,6 @@ def _sequences_of(
                 )
             )  # fmt: skip
     return sequences
-
-
-#: Number of frames of a recording that are read to determine its range.
-_SAMPLED = 9
-
-
-def sampled_range(
-    sequences: Sequence[FrameSequence],
-) -> tuple[SampleRange | None, SceneprintError | None]:
-    """Return the range of a sample of the frames, and the error if none can be read."""
-    frames = [one for sequence in sequences for one in sequence.frames]
-    ranges, error = list[SampleRange](), None
-    for place in sorted(set(np.linspace(0, len(frames) - 1, _SAMPLED).round().astype(int))):
-        try:
-            ranges.append(sample_range(frames[place].read()))
-        except SceneprintError as cause:
-            error = cause
-    return pooled_range(ranges), None if ranges else error
 
 
 def recording_name(path: Path) -> str:
@@ -541,75 +519,3 @@ def _reasons(frames: FrameTopic, motions: list[_Motion]) -> str:
             "moves"
         )
     return ", ".join(reasons)
-
-
-# Outline of a bag for users.
-
-
-@dataclass(frozen=True)
-class BagOutline:
-    """Content of a bag, and the frames that an upload would select.
-
-    Parameters
-    ----------
-    kind : format of the files
-    start_ns, end_ns : times of recording of the first and the last message, nanoseconds
-    topics : all topics
-    frames : topics with frames
-    chosen : selected topic, or None
-    sequences : sequences of the selected frames; may be empty
-    range : range of a sample of these frames
-    problem : reason why no frames are selected; empty if there are some
-    """
-
-    kind: str
-    start_ns: int
-    end_ns: int
-    topics: tuple[BagTopic, ...]
-    frames: tuple[FrameTopic, ...]
-    chosen: FrameTopic | None
-    camera: str | None
-    sequences: tuple[FrameSequence, ...]
-    range: SampleRange | None
-    problem: str
-
-
-def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
-    """Return the content of a bag, and the frames that an upload with these options would select.
-
-    Raises
-    ------
-    DatasetError : If the bag cannot be read.
-    MissingDependency : If rosbags is not installed.
-    """
-    bag = Bag(path)
-    try:
-        frames = tuple(frame_topics(bag))
-        chosen, camera, depth, problem = None, None, None, ""
-        sequences: tuple[FrameSequence, ...] = ()
-        try:
-            chosen = choose_topic(bag, options.topic)
-            if chosen.encoding is not None:
-                topic = camera_topic(bag, chosen, options.camera_info)
-                camera = None if topic is None else topic.name
-            sequences = tuple(_sequences_of(bag, chosen, options, recording_name(path)))
-            depth, unreadable = sampled_range(sequences)
-            if unreadable is not None:
-                sequences, problem = (), str(unreadable)
-        except (DatasetError, InvalidIntrinsics) as error:
-            problem = str(error)
-        kind = "ROS 1" if bag.is_ros1 else "ROS 2"
-        return BagOutline(
-            kind,
-            bag.start_ns,
-            bag.end_ns,
-            bag.topics,
-            frames,
-            chosen,
-            camera,
-            sequences,
-            depth,
-            problem,
-        )
-    finally:
-        bag.close()

@@ -1,6 +1,6 @@
 // The formats of files, written by `make goldens` from sceneprint_client/formats.py.
 
-/** @typedef {"depth"|"cloud"|"map"|"archive"} FileKind */
+/** @typedef {"depth"|"cloud"|"map"|"archive"|"recording"} FileKind */
 /** @type {{kind: FileKind, name: string, title: string, suffixes: string[], signature: string}[]} */
 export const FORMATS = [
   {"kind": "cloud", "name": "ply", "title": "PLY", "suffixes": [".ply"], "signature": "ply[\\n\\r ]"},
@@ -23,4 +23,7 @@ export const FORMATS = [
   {"kind": "archive", "name": "gzip", "title": "tar.gz", "suffixes": [".gz", ".tgz"], "signature": "\\x1f\\x8b"},
   {"kind": "archive", "name": "bzip2", "title": "tar.bz2", "suffixes": [".bz2", ".tbz2"], "signature": "BZh"},
   {"kind": "archive", "name": "xz", "title": "tar.xz", "suffixes": [".xz", ".txz"], "signature": "\\xfd7zXZ\\x00"},
+  {"kind": "recording", "name": "mcap", "title": "MCAP", "suffixes": [".mcap"], "signature": "\\x89MCAP0\\r\\n"},
+  {"kind": "recording", "name": "rosbag2", "title": "rosbag2", "suffixes": [".db3"], "signature": "SQLite format 3\\x00"},
+  {"kind": "recording", "name": "rosbag1", "title": "ROS 1", "suffixes": [".bag"], "signature": "#ROSBAG V2"},
 ];

@@ -10,7 +10,7 @@ import { mapField } from "./mapfield.js";
 import { poll, renewTimes, rows } from "./poll.js";
 
 const STATES = ["queued", "running", "dead", "failed", "cancelled", "succeeded"];
-const KINDS = ["sign", "import", "import-map", "associate", "coverage", "difference", "surface", "reconstruct", "reencode"];
+const KINDS = ["sign", "import", "import-map", "import-bag", "associate", "coverage", "difference", "surface", "reconstruct", "reencode"];
 const AT_ONCE = 50;
 const POLL_S = 5;
 

@@ -1,0 +1,129 @@
+"""Read a ROS recording in a confined process, which inherits the open file.
+
+descriptor, name  --RecordingDecoder-->  outline(options), frame(topic, place)
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from sceneprint.decoders.pool import DecoderEnded, DecoderProcess
+from sceneprint.errors import Busy, DecoderFailure, UnreadableArchive
+from sceneprint_client.api.frames import ImportOptions, RecordingOutline
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES
+
+_PROGRAM = "sceneprint.decoders.recording_process"
+#: Maximum memory of the process besides the file, bytes.
+_MORE_BYTES = 2 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingIndex:
+    """The outline of a recording and its selected frames.
+
+    Parameters
+    ----------
+    outline : content of the recording
+    topic : name and type of the frames' topic
+    frames : name, metadata and place in the recording of each frame
+    notes : notes on omitted data
+    sequences : number of sequences
+    """
+
+    outline: RecordingOutline
+    topic: tuple[str, str] | None
+    frames: list[dict[str, Any]]
+    notes: list[str]
+    sequences: int
+
+    @classmethod
+    def parse(cls, text: bytes) -> RecordingIndex:
+        """Check a document of the process; raise ValueError, KeyError or TypeError if invalid."""
+        document = json.loads(text)
+        topic = document["topic"]
+        return cls(
+            RecordingOutline.model_validate(document["outline"]),
+            None if topic is None else (str(topic[0]), str(topic[1])),
+            [{name: one[name] for name in ("name", "meta", "place")} for one in document["frames"]],
+            [str(note) for note in document["notes"]],
+            int(document["sequences"]),
+        )
+
+
+class RecordingDecoder:
+    """A confined process that has a recording open, and is used by one thread.
+
+    Parameters
+    ----------
+    file : descriptor of the recording
+    name : name of its file, whose suffix identifies the format
+    seconds : maximum processor time of a request
+
+    Raises
+    ------
+    Busy : If the process cannot be started.
+    """
+
+    def __init__(self, file: int, name: str, seconds: float) -> None:
+        self._name, self._seconds = name, seconds
+        self._process = DecoderProcess(
+            _PROGRAM, _MORE_BYTES, compiled=False, files=(file,), more=(name,)
+        )
+        try:
+            self._process.await_ready()
+        except (DecoderEnded, DecoderFailure) as error:
+            self._process.end()
+            raise Busy(
+                f"No process can be started to read {name} ({error}). Retry in a minute."
+            ) from error
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.end()
+
+    def outline(self, options: ImportOptions) -> bytes:
+        """Return the document from which `RecordingIndex.parse` makes an index.
+
+        Raises
+        ------
+        UnreadableArchive : If the recording cannot be read with the memory and time of a process.
+        MissingDependency : If rosbags is not installed.
+        """
+        fields = options.model_dump(mode="json", by_alias=True)
+        text = self._run({"task": "outline", "options": fields})
+        try:
+            RecordingIndex.parse(text)
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise UnreadableArchive(f"{self._name}: Its outline is invalid.") from error
+        return text
+
+    def frame(self, topic: tuple[str, str], place: list[Any]) -> bytes:
+        """Return the bytes of the frame at a place.
+
+        Raises
+        ------
+        UnreadableFrame, UnreadableCloud : If the message is damaged.
+        UnreadableArchive : If the recording cannot be read.
+        """
+        data = self._run({"task": "frame", "topic": topic, "place": place})
+        self._process.clear()
+        return data
+
+    def _run(self, request: dict[str, Any]) -> bytes:
+        def checked(process: DecoderProcess, reply: dict[str, Any]) -> bytes:
+            size = int(reply["size"])
+            if not 0 <= size <= MAXIMUM_CLOUD_BYTES:
+                raise ValueError(f"{size} bytes")
+            return process.array_of("u1", (size,)).tobytes()
+
+        try:
+            reply = self._process.run(request, b"", self._seconds)
+            data: bytes = self._process.result(reply, checked)
+        except (DecoderEnded, DecoderFailure) as error:
+            raise UnreadableArchive(
+                f"{self._name} cannot be read: {error}. Split the recording, or send only the "
+                "topics of the sensor, its camera, /tf and /tf_static."
+            ) from error
+        return data

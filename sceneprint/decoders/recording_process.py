@@ -1,0 +1,179 @@
+"""Process that reads one ROS recording.
+
+    python -m sceneprint.decoders.recording_process CONTROL MEMORY PARENT BYTES plain FILE NAME
+
+Before its confinement the process maps FILE into memory and loads the readers. See
+child_process.py.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar
+
+import numpy as np
+import numpy.ma  # percentiles need it, and a confined process cannot import
+from numpy.typing import NDArray
+
+from sceneprint.decoders.child_process import load_decoders, mapped, serve
+from sceneprint.errors import DatasetError, UnreadableArchive
+from sceneprint.formats.dataset.frame_reference import import_meta, numbered_sequences
+from sceneprint.formats.points.rows import FileBytes
+from sceneprint.formats.recording import RecordingOptions, bag_outline
+from sceneprint.formats.recording.bag import BagTopic, load_readers, shared_bag
+from sceneprint.formats.recording.topics import BagSource
+from sceneprint_client.api.frames import (
+    MOST_RECORDING_TOPICS,
+    ImportOptions,
+    RecordingOutline,
+    RecordingTopic,
+)
+from sceneprint_client.errors import printable
+from sceneprint_client.formats import HEAD, format_at
+
+#: Maximum number of frames that a recording may select.
+MOST_FRAMES = 100_000
+
+Reply = tuple[dict[str, Any], NDArray[np.uint8]]
+
+
+class _MappedFile(io.RawIOBase):
+    """Open file whose bytes are in memory: the process may not position a real one."""
+
+    def __init__(self, data: FileBytes) -> None:
+        self._data, self._place = data, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        piece = self._data[self._place : self._place + len(buffer)]
+        buffer[: len(piece)] = piece
+        self._place += len(piece)
+        return len(piece)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._place = offset + (0, self._place, len(self._data))[whence]
+        return self._place
+
+
+class _MappedPath(type(Path())):  # type: ignore[misc]  # the class of paths of this system
+    """Path of the mapped recording, the only file that this process can open."""
+
+    data: ClassVar[FileBytes] = b""
+
+    def exists(self, **_: Any) -> bool:
+        return True
+
+    def is_dir(self, **_: Any) -> bool:
+        return False
+
+    def is_file(self, **_: Any) -> bool:
+        return False  # there is no camera beside the recording
+
+    def absolute(self) -> _MappedPath:
+        return self
+
+    def open(self, *_: Any, **__: Any) -> BinaryIO:
+        return io.BufferedReader(_MappedFile(self.data))
+
+
+def _outline(path: Path, request: dict[str, Any]) -> Reply:
+    """Return the outline of the recording and the selected frames as JSON."""
+    options = ImportOptions.model_validate(request["options"])
+    choice = RecordingOptions(
+        options.topic, options.camera_info, options.pose_frame, options.keyframe_m,
+        options.keyframe_deg, options.keyframe_s, options.sensor_frame, options.depth_scale,
+    )  # fmt: skip
+    outline = bag_outline(path, choice)
+    frames = [
+        {
+            "name": one.name,
+            "meta": import_meta(one, sequence, options).model_dump(
+                mode="json", exclude_defaults=True
+            ),
+            "place": _place_of(one.source),
+        }
+        for sequence in numbered_sequences(outline.sequences, options.session)
+        for one in sequence.frames[:: options.every]
+    ]  # fmt: skip
+    if len(frames) > MOST_FRAMES:
+        raise UnreadableArchive(
+            f"The recording has {len(frames)} keyframes; the limit is {MOST_FRAMES}. Increase "
+            "`keyframe_m`, or split the recording."
+        )
+    shown = sorted(outline.topics, key=lambda one: not outline.use_of(one))
+    record = RecordingOutline(
+        kind=outline.kind, seconds=outline.seconds, span=outline.span,
+        topics=[
+            RecordingTopic(
+                name=printable(one.name)[:200], type=printable(one.type)[:200], count=one.count,
+                use=outline.use_of(one)[:200],
+            )
+            for one in shown[:MOST_RECORDING_TOPICS]
+        ],
+        findings=[printable(line)[:1000] for line in outline.findings[:20]],
+        problem=outline.problem[:4000] or None,
+        lost=sum(one.lost for one in outline.sequences if options.with_poses),
+    )  # fmt: skip
+    topic = None if outline.chosen is None else outline.chosen.topic
+    document = {
+        "outline": record.model_dump(mode="json"), "frames": frames,
+        "topic": None if topic is None else [topic.name, topic.type],
+        "sequences": len(outline.sequences),
+        "notes": [one.note[:1000] for one in outline.sequences if one.note],
+    }  # fmt: skip
+    return {}, np.frombuffer(json.dumps(document).encode(), np.uint8)
+
+
+def _place_of(source: Any) -> list[Any]:
+    T = source.T_cloud_sensor
+    return [source.log_ns, source.occurrence, None if T is None else T.tolist()]
+
+
+def _frame(path: Path, request: dict[str, Any]) -> Reply:
+    """Return the bytes of one frame."""
+    log_ns, occurrence, T = request["place"]
+    T_cloud_sensor = None if T is None else np.array(T)
+    name, kind = request["topic"]
+    topic = BagTopic(name, kind, 0)
+    source = BagSource(shared_bag(path), topic, log_ns, occurrence, T_cloud_sensor)
+    return {}, np.frombuffer(source.read_bytes(), np.uint8)
+
+
+def _main() -> None:
+    data = _MappedPath.data = mapped(int(sys.argv[6]))
+    form = format_at(bytes(data[:HEAD]), "recording")
+    suffix = "" if form is None else form.suffixes[0]  # readers identify formats by it
+    path = _MappedPath(sys.argv[7].removesuffix(suffix) + suffix)
+
+    def run(task: Any, request: dict[str, Any]) -> Reply:
+        try:
+            reply, data = task(path, request)
+        except DatasetError as error:
+            raise UnreadableArchive(str(error)) from error
+        return {**reply, "size": len(data)}, data
+
+    serve(
+        {
+            "outline": lambda _, request: run(_outline, request),
+            "frame": lambda _, request: run(_frame, request),
+        },
+        _load,
+    )
+
+
+def _load(kernels: bool) -> None:
+    """Load all code, since a confined process cannot import."""
+    load_decoders(kernels)
+    load_readers()
+
+
+if __name__ == "__main__":
+    _main()

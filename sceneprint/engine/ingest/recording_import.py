@@ -1,0 +1,146 @@
+"""Import of the keyframes of a ROS recording.
+
+    file  --read-->  outline and index  --add-->  items
+
+The first slice reads the recording once, and stores the selected frames as an index. The other
+slices read single messages. A confined process reads the file in all slices.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+from sceneprint.decoders.recording_decoder import RecordingDecoder, RecordingIndex
+from sceneprint.engine.context import Context
+from sceneprint.engine.ingest.archive_import import add_block
+from sceneprint.engine.ingest.uploads import Upload, Uploads
+from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
+from sceneprint.errors import UnreadableArchive
+from sceneprint.store import queue
+from sceneprint.store.database_errors import unusable
+from sceneprint.store.tables import ARCHIVE, IMPORT_FILES
+from sceneprint_client.api import FrameMeta
+from sceneprint_client.api.frames import ImportItem, ImportOptions, upload_summary
+
+_INDEX = IMPORT_FILES[1]
+#: Maximum number of frames in one commit, and of their bytes in memory, as for archives.
+_AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
+
+
+class RecordingImporter:
+    """Handler of jobs that import recordings."""
+
+    def __init__(self, context: Context, uploads: Uploads) -> None:
+        # processor time; the rest of the job's time remains for writing
+        self._seconds = 0.75 * context.settings.job_timeout_s
+        self._store, self._uploads = context.store, uploads
+
+    def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
+        """Run a slice: read the recording, or add at least one block of its frames."""
+        options = ImportOptions.model_validate(task.data)
+        with self._store.database.read() as connection:
+            files = queue.files_of(connection, task.job.number)
+        if ARCHIVE not in files:
+            raise UnreadableArchive(
+                "The recording was removed when its import failed or was cancelled. Send it again."
+            )
+        with self._decoder(files[ARCHIVE], options.name) as decoder:
+            if _INDEX not in files:
+                return self._read(decoder, options)
+            with self._store.blobs.open(files[_INDEX].blob) as stored:
+                index = RecordingIndex.parse(stored.read())
+            if index.outline.problem is not None:
+                raise UnreadableArchive(index.outline.problem)
+            return self._add(task, options, decoder, index, is_over)
+
+    @contextmanager
+    def _decoder(self, file: queue.JobFile, name: str) -> Iterator[RecordingDecoder]:
+        try:
+            source = self._store.blobs.open(file.blob)
+        except OSError as error:
+            raise unusable("The recording cannot be read", error) from error
+        with source, tempfile.TemporaryFile() as local:
+            try:
+                descriptor = source.fileno()
+            except OSError:  # a file of an object store has no descriptor
+                shutil.copyfileobj(source, local)
+                local.flush()
+                descriptor = local.fileno()
+            decoder = RecordingDecoder(descriptor, name, self._seconds)
+            try:
+                yield decoder
+            finally:
+                decoder.close()
+
+    def _read(self, decoder: RecordingDecoder, options: ImportOptions) -> SliceResult:
+        """Store the outline, which users see even if no frame can be used, and the index."""
+        text = decoder.outline(options)
+        index = RecordingIndex.parse(text)
+        progress = {
+            "done": 0, "total": len(index.frames), "phase": "add", "received": 0, "there": 0,
+            "refused": 0, "recording": index.outline.model_dump(mode="json"),
+        }  # fmt: skip
+        with self._store.blobs.incoming() as blob:
+            blob.write(text)
+            file = queue.JobFile(_INDEX, blob.keep(), blob.size, "application/json")
+        return SliceResult(False, progress, files=[file])
+
+    def _add(
+        self, task: LongJob, options: ImportOptions, decoder: RecordingDecoder,
+        index: RecordingIndex, is_over: IsOver,
+    ) -> SliceResult:  # fmt: skip
+        topic, frames, progress = index.topic, index.frames, dict(task.progress)
+        items = list[dict[str, Any]]()
+        largest = _BYTES_AT_ONCE  # sizes are unknown until a frame is read, so begin with one
+
+        def upload(frame: dict[str, Any]) -> Upload:
+            nonlocal largest
+            if topic is None:
+                raise UnreadableArchive("The recording has no topic of frames.")
+            meta = FrameMeta.model_validate(frame["meta"])
+            data = decoder.frame(topic, frame["place"])
+            largest = max(len(data), largest if items else 1)
+            return Upload(data, meta, options.priority, options.if_novel)
+
+        while progress["done"] < len(frames) and (not items or not is_over()):
+            count = max(1, min(_AT_ONCE, _BYTES_AT_ONCE // largest))
+            block = frames[progress["done"] :][:count]
+            reads = [(str(one["name"]), partial(upload, one)) for one in block]
+            for item in add_block(self._uploads, task, reads):
+                items.append(item.model_dump(mode="json"))
+                progress[{202: "received", 200: "there"}.get(item.status, "refused")] += 1
+            progress["done"] += len(block)
+        if progress["done"] < len(frames):
+            return SliceResult(False, progress, items)
+        result = self._result(task, options, index, progress, items)
+        return SliceResult(
+            True, progress, items, drop=IMPORT_FILES, result=result, event="import.done"
+        )
+
+    def _result(
+        self, task: LongJob, options: ImportOptions, index: RecordingIndex,
+        progress: dict[str, Any], items: list[dict[str, Any]],
+    ) -> dict[str, Any]:  # fmt: skip
+        with self._store.database.read() as connection:
+            before = queue.items_of(connection, task.job.number)
+        results = [ImportItem.model_validate(one) for one in [*before, *items]]
+        without = Counter(
+            "refused" if one.frame_id is None else "" if options.with_poses else
+            "with_poses is false"
+            for one in results if one.frame_id is None or not one.has_pose
+        )  # fmt: skip
+        ranges = [one.samples for one in results if one.samples is not None]
+        summary = upload_summary(
+            len(results), without, ranges, index.notes, lost=index.outline.lost
+        )
+        counts = {name: progress[name] for name in ("received", "there", "refused")}
+        return {
+            "sequences": index.sequences, **counts, "ignored": 0,
+            "summary": summary.model_dump(mode="json"),
+        }  # fmt: skip

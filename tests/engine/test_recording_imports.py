@@ -1,0 +1,227 @@
+"""Tests of the import of recordings: the same frames as those of an upload, once each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from sceneprint.engine.jobs.lifecycle import cancel
+from sceneprint.engine.jobs.tasks import LongJob
+from sceneprint.errors import InvalidRequest, QuotaExceeded, UnreadableArchive
+from sceneprint.formats.recording import RecordingOptions, recording_sequences
+from sceneprint.store.maps import find_map
+from sceneprint.store.queue import files_of
+from sceneprint_client.api import Job, JobState, NewMap
+from sceneprint_client.api.frames import ImportOptions
+from sceneprint_client.frame_files import meta_of
+from tests.whole_engine import Engine
+
+ROOM = 2.5  #: metres from the camera to the wall
+FRAMES = 6
+
+
+def wall(i: int) -> np.ndarray:
+    """Depth of a wall with steps, in millimetres."""
+    rows, columns = np.mgrid[:60, :80]
+    samples = 1000 * ROOM + 40 * ((rows // 12 + columns // 16 + i) % 7)
+    return samples.astype(np.uint16)
+
+
+def write_drive(ros: SimpleNamespace, folder: Path, container: str = "mcap", **more: Any) -> Path:
+    """Write a recording with an image every half metre, and return its path."""
+
+    def fill(writer: Any) -> None:
+        writer.transforms(0, {("base_link", "camera"): ros.camera}, "/tf_static")
+        for i in range(FRAMES):
+            writer.transforms(i, {("odom", "base_link"): ros.transform(0.5 * i, 0, 0)})
+            writer.camera_info(i)
+            writer.image(i, wall(i), **more)
+
+    path: Path = ros.write(folder, fill, container)
+    return path
+
+
+def begun(engine: Engine, path: Path, **more: Any) -> Job:
+    options = ImportOptions.model_validate({"as": "recording", "name": path.name, **more})
+    with engine.imports.receive("hall", options) as receiver:
+        receiver.write(path.read_bytes())
+        file = receiver.end()
+    return engine.imports.begin("hall", file, options)[0]
+
+
+def run_import(engine: Engine) -> list[JobState | None]:
+    """Run the slices of the import, and no other job; return the state after each."""
+    states = []
+    while (work := engine.claim("test")) is not None:
+        if isinstance(work, LongJob):
+            states.append(engine.run(work))
+    return states
+
+
+@pytest.fixture
+def engine(make_engine: Callable[..., Engine]) -> Engine:
+    engine = make_engine()
+    engine.create_map(NewMap(name="hall", model="depth"))
+    return engine
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1"])
+def test_frames_are_those_of_an_upload(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path, container: str
+) -> None:
+    path = write_drive(ros, tmp_path, container)
+    job = begun(engine, path, robot="r1", tags=["seen"])
+    assert run_import(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
+    done = engine.get_job(job.job_id)
+    assert done.result is not None
+    assert (done.result["received"], done.result["refused"]) == (FRAMES, 0)
+    assert done.result["summary"]["poses"] == FRAMES
+    engine.create_map(NewMap(name="sent", model="depth"))
+    [sequence] = recording_sequences(path, RecordingOptions())
+    for reference in sequence.frames:
+        meta = meta_of(
+            reference, robot="r1", session=sequence.name, tags=["seen"],
+            parent_frame=f"r1/{sequence.parent_frame}",
+        )  # fmt: skip
+        engine.add_frame("sent", reference.read_bytes(), meta)
+    ours, theirs = (
+        sorted(engine.list_frames(name).items, key=lambda one: one.sequence or 0)
+        for name in ("hall", "sent")
+    )
+    assert len(ours) == FRAMES
+    own = {"map", "frame_id", "job_id", "state", "received_at", "created_at", "etag"}
+    for one, other in zip(ours, theirs, strict=True):
+        texts = [
+            frame.model_dump_json(exclude=own).replace(frame.frame_id, "ID")
+            for frame in (one, other)
+        ]
+        assert texts[0] == texts[1]
+
+
+def test_the_outline_is_there_before_the_frames(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path
+) -> None:
+    job = begun(engine, write_drive(ros, tmp_path))
+    work = engine.claim("test")
+    assert isinstance(work, LongJob)
+    assert engine.run(work) == JobState.QUEUED
+    progress = engine.get_job(job.job_id).progress
+    assert progress is not None
+    assert (progress.done, progress.total, progress.phase) == (0, FRAMES, "add")
+    assert progress.recording is not None
+    uses = {one.name: (one.count, one.use) for one in progress.recording.topics}
+    assert uses == {
+        "/camera/depth/image_raw": (FRAMES, "16UC1, used"),
+        "/camera/depth/camera_info": (FRAMES, "camera"),
+        "/tf": (FRAMES, ""),
+        "/tf_static": (1, ""),
+    }
+    assert progress.recording.problem is None
+    assert "mounting: at 0.210 -0.050 0.930 m in base_link" in progress.recording.findings
+
+
+def test_topics_are_shown_if_none_can_be_chosen(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path
+) -> None:
+    def fill(writer: Any) -> None:
+        for name in ("/a", "/b"):
+            writer.image(0, wall(0), topic=f"{name}/image_raw")
+            writer.camera_info(0, f"{name}/camera_info")
+
+    path = ros.write(tmp_path, fill, "mcap")
+    job = begun(engine, path)
+    assert run_import(engine) == [JobState.QUEUED, JobState.FAILED]
+    failed = engine.get_job(job.job_id)
+    assert failed.progress is not None
+    assert failed.progress.recording is not None
+    assert failed.error == failed.progress.recording.problem
+    used = [one.name for one in failed.progress.recording.topics if one.use == "16UC1"]
+    assert used == ["/a/image_raw", "/b/image_raw"]
+    begun(engine, path, topic="/b/image_raw")
+    assert run_import(engine)[-1] == JobState.SUCCEEDED
+    [frame] = engine.list_frames("hall").items
+    assert frame.name is not None
+    assert frame.name.startswith("b/image_raw/")
+
+
+def test_a_slice_that_is_run_again_adds_no_frame_twice(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path
+) -> None:
+    begun(engine, write_drive(ros, tmp_path))
+    work = engine.claim("test")
+    assert isinstance(work, LongJob)
+    engine.run(work)
+    work = engine.claim("test")
+    assert isinstance(work, LongJob)
+    first = engine.jobs.handlers["import-bag"](work, lambda: True)  # its worker dies
+    assert (first.over, first.progress["done"]) == (False, 1)
+    assert engine.run(work) == JobState.SUCCEEDED
+    assert len(engine.list_frames("hall").items) == FRAMES
+    done = engine.get_job(work.job.id).result
+    assert done is not None
+    assert (done["received"], done["there"]) == (FRAMES - 1, 1)
+
+
+def test_files_and_their_bytes_go_with_a_cancelled_import(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path
+) -> None:
+    path = write_drive(ros, tmp_path)
+    job = begun(engine, path)
+    work = engine.claim("test")
+    assert isinstance(work, LongJob)
+    engine.run(work)
+
+    def stored() -> tuple[list[str], int]:
+        with engine.store.database.read() as connection:
+            names = list(files_of(connection, work.job.number))
+            return names, find_map(connection, "hall").used_bytes
+
+    assert stored() == (["archive", "index"], path.stat().st_size)
+    cancel(engine.store, job.job_id)
+    assert stored() == ([], 0)
+
+
+def test_a_recording_counts_against_the_quota_while_it_arrives(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path
+) -> None:
+    path = write_drive(ros, tmp_path)
+    engine.create_map(NewMap(name="small", model="depth", quota_bytes=path.stat().st_size - 1))
+    options = ImportOptions.model_validate({"as": "recording", "name": path.name})
+    with (
+        pytest.raises(QuotaExceeded),
+        engine.imports.receive("small", options) as receiver,
+    ):
+        receiver.write(path.read_bytes())
+
+
+def test_damage_is_the_fault_of_the_file(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path
+) -> None:
+    path = write_drive(ros, tmp_path)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-200])
+    job = begun(engine, cut)
+    assert run_import(engine) == [JobState.FAILED]
+    assert "mcap recover" in str(engine.get_job(job.job_id).error)
+    with pytest.raises(UnreadableArchive, match=r"notes\.txt"):
+        begun(engine, _written(tmp_path / "notes.txt", b"no recording" * 1000))
+
+
+def _written(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize(
+    "more", [{"as": "frames", "topic": "/a"}, {"as": "map", "keyframe_m": 1.0},
+             {"as": "recording", "heights": [1.0]}],
+)  # fmt: skip
+def test_options_of_other_imports_are_refused(more: dict[str, Any]) -> None:
+    with pytest.raises((ValidationError, InvalidRequest)):
+        ImportOptions.model_validate(more)
