@@ -1,4 +1,4 @@
-"""Tests of the pages' language against docs/style.md, by counts."""
+"""Tests of the pages' language against CONTRIBUTING.md, by counts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ ROOT = Path(__file__).resolve().parent.parent
 #: Pages that were edited sentence by sentence; add a page after editing it.
 EDITED = [
     "CONTRIBUTING.md",
-    "docs/style.md",
     "README.md",
     "docs/getting_started.md",
     "docs/library.md",
@@ -53,7 +52,7 @@ EDITED = [
     *(f"docs/sensors/{path.name}" for path in sorted((ROOT / "docs/sensors").glob("*.md"))),
 ]
 MEDIAN_WORDS, MOST_WORDS = 18, 45
-#: Phrases that follow another language's syntax, or that docs/style.md retires.
+#: Phrases that follow another language's syntax, or that CONTRIBUTING.md retires.
 STUMBLES = re.compile(
     r"so that no\b|of whom\b|what is none|made anew|is to be had|has to do with|are told\b"
     r"|is told\b|whoever asks|is asked for|is led there|goes on as|tells how|tells of|tells whether"

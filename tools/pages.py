@@ -6,6 +6,7 @@ python -m tools.pages        # writes the pages
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -62,15 +63,16 @@ def settings_page() -> str:
 def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
     assert field.description is not None
     extra: dict[str, Any] = dict(field.json_schema_extra)  # type: ignore[arg-type]
-    bounds = [
+    bounds = ", ".join(
         text.format(getattr(limit, key))
         for limit in field.metadata
         if type(limit) in _BOUNDS
         for key, text in [_BOUNDS[type(limit)]]
-    ]
+    )
+    bounds = re.sub(r"^at least (.*), at most ", r"\1 to ", bounds)
     return (
         f"`{name.upper()}`",
-        ", ".join([_type_of(field), *bounds]),
+        ", ".join(filter(None, (_type_of(field), bounds))),
         extra["shown"] or _default_text(name, field.default),
         cell(field.description),
         cell(extra["change"]),

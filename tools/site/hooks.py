@@ -39,7 +39,7 @@ RANKED_LAST = {
     f"docs/{name}.md"
     for name in (
         "architecture", "dependencies", "evaluation", "fault_injection", "model", "paper",
-        "performance", "style",
+        "performance",
     )
 }  # fmt: skip
 #: Factor of their scores: a match in a title has a thousand times the score of one in the text.
