@@ -87,7 +87,7 @@ def parameters() -> list[dict[str, Any]]:
             whole,
             "Height of the camera's image, pixels; default: the height of the uploaded image.",
         ),
-        "distortion": (text, "OpenCV distortion coefficients k1,k2,p1,p2[,k3]."),
+        "distortion": (text, "OpenCV distortion coefficients k1,k2,p1,p2[,k3[,k4,k5,k6]]."),
         "depth_scale": (number, "Stored units per metre; default: 1000."),
         "depth_along_ray": (
             {"type": "boolean"},

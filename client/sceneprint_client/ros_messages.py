@@ -280,22 +280,22 @@ def topic_without_transport(topic: str) -> str:
 
 
 def _distortion(info: Any) -> tuple[float, ...]:
-    """Return the coefficients k1, k2, p1, p2[, k3] of a lens; none without distortion."""
+    """Return the coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of a lens; none if all are 0."""
     distortion = getattr(info, "d", None)
     d = [float(value) for value in (info.D if distortion is None else distortion)]
     if not any(d):
         return ()
     model = str(info.distortion_model)
     if model in ("plumb_bob", "rational_polynomial", "") and len(d) in (4, 5, 8, 12, 14):
-        if not any(d[5:]):
-            return tuple(d[:5])
+        if not any(d[8:]):
+            return tuple(d[:8] if any(d[5:]) else d[:5])
         raise InvalidIntrinsics(
-            "The camera info has the lens model rational_polynomial with k4, k5 or k6; only k1, "
-            "k2, p1, p2 and k3 are supported. Record the rectified images."
+            "The camera info has a lens with thin prisms or a tilted sensor; only the coefficients "
+            "k1 to k6, p1 and p2 are supported. Record the rectified images."
         )
     raise InvalidIntrinsics(
         f"The camera info has the lens model {model!r:.40} with {len(d)} coefficients; only "
-        "plumb_bob is supported. Record the rectified images."
+        "plumb_bob and rational_polynomial are supported. Record the rectified images."
     )
 
 

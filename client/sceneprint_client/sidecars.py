@@ -129,7 +129,7 @@ def _camera(fields: dict[str, object]) -> Camera:
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
         raise InvalidIntrinsics(
-            "distortion is not a list. Write [k1, k2, p1, p2] or [k1, k2, p1, p2, k3]."
+            "distortion is not a list. Write [k1, k2, p1, p2], and after it k3, or k3 to k6."
         )
     along_ray = fields.get("depth_along_ray", False)
     if not isinstance(along_ray, bool):

@@ -1,6 +1,7 @@
 """Tests of undistortion and of ranges along rays against a simple loop and known planes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,13 +15,16 @@ from sceneprint.types import Intrinsics
 
 LENS = (-0.28, 0.09, 0.0015, -0.0022, -0.012)  # every term of the model is at work
 CAMERA = Intrinsics(64, 48, 50.0, 52.0, 30.5, 24.25, LENS)
+#: A lens whose radial factor is a quotient, as that of an Azure Kinect.
+QUOTIENT = replace(CAMERA, distortion=(0.1, 0.05, 0.0015, -0.0022, 0.012, 0.45, 0.12, 0.03))
 
 
 def seen(x: float, y: float, k: tuple[float, ...]) -> tuple[float, float]:
     """OpenCV's formula, written a second time from its documentation."""
-    k1, k2, p1, p2, k3 = (*k, 0.0)[:5]
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*k, *[0.0] * 4)[:8]
     r = math.hypot(x, y)
     radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
+    radial /= 1 + k4 * r**2 + k5 * r**4 + k6 * r**6
     return (
         x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
         y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
@@ -55,38 +59,40 @@ def test_tangential_order_by_hand() -> None:
         assert undistort(depth, camera)[4, 6] == depth[round(row), round(column)]
 
 
-def test_undistort_equals_the_loop() -> None:
-    numbers = np.arange(1, CAMERA.width * CAMERA.height + 1, dtype=np.float32)
-    image = numbers.reshape(CAMERA.height, CAMERA.width)
+@pytest.mark.parametrize("camera", [CAMERA, QUOTIENT])
+def test_undistort_equals_the_loop(camera: Intrinsics) -> None:
+    numbers = np.arange(1, camera.width * camera.height + 1, dtype=np.float32)
+    image = numbers.reshape(camera.height, camera.width)
     expected = np.zeros_like(image)
-    for v in range(CAMERA.height):
-        for u in range(CAMERA.width):
-            x, y = seen((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, LENS)
-            column = math.floor(x * CAMERA.fx + CAMERA.cx + 0.5)
-            row = math.floor(y * CAMERA.fy + CAMERA.cy + 0.5)
-            if 0 <= column < CAMERA.width and 0 <= row < CAMERA.height:
+    for v in range(camera.height):
+        for u in range(camera.width):
+            x, y = seen((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, camera.distortion)
+            column = math.floor(x * camera.fx + camera.cx + 0.5)
+            row = math.floor(y * camera.fy + camera.cy + 0.5)
+            if 0 <= column < camera.width and 0 <= row < camera.height:
                 expected[v, u] = image[row, column]
-    result = undistort(image, CAMERA)
+    result = undistort(image, camera)
     np.testing.assert_array_equal(result, expected)
     assert (result > 0).mean() > 0.8
 
 
-def test_a_plane_seen_through_a_lens_comes_back() -> None:
+@pytest.mark.parametrize("camera", [CAMERA, QUOTIENT])
+def test_a_plane_seen_through_a_lens_comes_back(camera: Intrinsics) -> None:
     """n . p = 2 is filmed as ranges through the lens; z must be right at each pixel."""
     normal, offset = np.array([0.3, -0.2, 0.933]), 2.0
-    ranges = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    ranges = np.zeros((camera.height, camera.width), np.float32)
     z_taken = np.zeros_like(ranges)
-    for v in range(CAMERA.height):
-        for u in range(CAMERA.width):
-            ray = np.array([*true_ray(u, v, CAMERA), 1.0])
+    for v in range(camera.height):
+        for u in range(camera.width):
+            ray = np.array([*true_ray(u, v, camera), 1.0])
             z_taken[v, u] = offset / (normal @ ray)
             ranges[v, u] = z_taken[v, u] * np.linalg.norm(ray)
-    z = ray_to_axis(ranges, CAMERA)
+    z = ray_to_axis(ranges, camera)
     np.testing.assert_allclose(z, z_taken, rtol=2e-6)
 
-    flat = undistort(z, CAMERA)
+    flat = undistort(z, camera)
     v, u = np.indices(flat.shape)
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)])
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)])
     expected = offset / np.tensordot(normal, rays, axes=1)
     known = flat > 0
     # nearest sampling is off by half a pixel; the plane changes by so much over one
@@ -166,6 +172,15 @@ def test_a_fold_has_rays_only_before_it(k1: float) -> None:
         assert got == pytest.approx(1.0 / math.hypot(1.0, r), rel=1e-5)
 
 
+def test_nothing_is_taken_behind_a_pole() -> None:
+    """1 / (1 - 4 r^2) has a pole at r = 1/2, beyond which it is negative."""
+    lens = (0.0, 0.0, 0.0, 0.0, 0.0, -4.0, 0.0, 0.0)
+    camera = Intrinsics(201, 3, 100.0, 100.0, 100.0, 1.0, lens)
+    seen_x = np.flatnonzero(undistort(np.ones((3, 201), np.float32), camera)[1]) / 100 - 1
+    # r / (1 - 4 r^2) = 1 at r = (sqrt(17) - 1) / 8 = .39
+    np.testing.assert_allclose([seen_x.min(), seen_x.max()], [-0.39, 0.39])
+
+
 def test_nothing_is_taken_behind_a_narrow_fold() -> None:
     """Growth (1 - r^2 / a)(1 - r^2 / b) is negative for 0.51 < r < 0.53 and positive beyond."""
     a, b = 0.51**2, 0.53**2
@@ -185,7 +200,7 @@ centre = st.one_of(st.floats(-10, 20), st.floats(-1e7, 1e7))
 
 
 @settings(max_examples=50)
-@given(length, length, centre, centre, st.lists(coefficient, min_size=5, max_size=5))
+@given(length, length, centre, centre, st.lists(coefficient, min_size=8, max_size=8))
 def test_any_camera_gives_samples_or_nothing(
     fx: float, fy: float, cx: float, cy: float, k: list[float]
 ) -> None:

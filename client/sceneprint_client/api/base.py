@@ -345,13 +345,13 @@ class Intrinsics:
     width, height : size of the image, pixels
     fx, fy : focal lengths, pixels
     cx, cy : principal point, pixels
-    distortion : Brown-Conrady coefficients k1, k2, p1, p2[, k3] in OpenCV's order and
-        meaning; empty for an image without distortion
+    distortion : coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] in OpenCV's order and meaning;
+        empty for an image without distortion
 
     Raises
     ------
     InvalidIntrinsics : If a size is below 1, a focal length is not positive and finite, the
-        principal point is not finite, or the number of coefficients is not 0, 4 or 5.
+        principal point is not finite, or the number of coefficients is not 0, 4, 5 or 8.
     """
 
     width: int
@@ -394,15 +394,15 @@ class Intrinsics:
                 f"The principal point ({self.cx:g}, {self.cy:g}) is impossible for a camera. "
                 "Specify cx and cy in pixels, as in the sensor's calibration."
             )
-        if len(self.distortion) not in (0, 4, 5):
+        if len(self.distortion) not in (0, 4, 5, 8):
             raise InvalidIntrinsics(
                 f"There are {len(self.distortion)} distortion coefficients. "
-                "Specify k1, k2, p1, p2 and optionally k3, or none."
+                "Specify k1, k2, p1, p2, optionally k3, and optionally k4, k5, k6; or none."
             )
         if not all(math.isfinite(k) for k in self.distortion):
             raise InvalidIntrinsics(
                 f"The distortion coefficients {self.distortion} are not all finite. "
-                "Specify k1, k2, p1, p2 and optionally k3, as in the sensor's calibration."
+                "Specify them as in the sensor's calibration."
             )
 
     def without_distortion(self) -> Intrinsics:
@@ -432,8 +432,9 @@ class CameraIntrinsics(Given):
     cy: float
     distortion: list[float] = Field(
         default=[],
-        max_length=5,
-        description="OpenCV distortion coefficients k1, k2, p1, p2[, k3]; default: no distortion.",
+        max_length=8,
+        description="OpenCV distortion coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; default: "
+        "no distortion.",
     )
 
 

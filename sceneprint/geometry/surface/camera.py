@@ -248,8 +248,8 @@ def _check_size(depth: Floats32, intrinsics: Intrinsics) -> None:
 
 
 def _coefficients(intrinsics: Intrinsics) -> tuple[float, ...]:
-    """Return k1, k2, p1, p2, k3; missing coefficients are 0."""
-    return (*intrinsics.distortion, *(0.0,) * (5 - len(intrinsics.distortion)))
+    """Return k1, k2, p1, p2, k3, k4, k5, k6; missing coefficients are 0."""
+    return (*intrinsics.distortion, *(0.0,) * (8 - len(intrinsics.distortion)))
 
 
 def _directions(c: Intrinsics) -> Iterator[tuple[slice, Floats, Floats]]:
@@ -261,11 +261,22 @@ def _directions(c: Intrinsics) -> Iterator[tuple[slice, Floats, Floats]]:
             yield block, (u - c.cx) / c.fx, (v - c.cy) / c.fy
 
 
+def _radial(r2: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats, Floats]:
+    """Return the radial factor, its derivative with respect to r2, and its denominator."""
+    k1, k2, _, _, k3, k4, k5, k6 = k
+    below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    factor = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+    slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+    return factor, (slope - factor * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) / below, below
+
+
 def _distort(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats]:
-    """Distort directions by the Brown-Conrady model; `k` has OpenCV's order."""
-    k1, k2, p1, p2, k3 = k
+    """Distort directions by the Brown-Conrady model, with a quotient of radial polynomials if k4 to
+    k6 are not 0; `k` has OpenCV's order.
+    """
+    p1, p2 = k[2:4]
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = _radial(r2, k)[0]
     return (
         x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
         y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
@@ -274,10 +285,9 @@ def _distort(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats
 
 def _jacobian(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats, Floats]:
     """Return the elements xx, xy and yy of the symmetric Jacobian of `_distort`."""
-    k1, k2, p1, p2, k3 = k
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+    p1, p2 = k[2:4]
+    radial, slope, _ = _radial(x * x + y * y, k)
+    slope = 2.0 * slope
     return (
         radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
         slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
@@ -295,11 +305,11 @@ def _unfolded(x: Floats, y: Floats, k: tuple[float, ...]) -> NDArray[np.bool_]:
 
 
 def _first_fold(k: tuple[float, ...]) -> float:
-    """Return the minimum tan(angle to the axis) at which the radial polynomial stops growing."""
-    k1, k2, _, _, k3 = k
+    """Return the minimum tan(angle to the axis) at which the radial function stops growing."""
     r = np.tan(np.linspace(0.0, math.radians(89.9), 4096))
-    r2 = r * r
-    grows = 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) > 0.0
+    with np.errstate(all="ignore"):  # at a pole
+        radial, slope, below = _radial(r * r, k)
+        grows = (radial + 2.0 * r * r * slope > 0.0) & (below > 0.0)
     return math.inf if grows.all() else float(r[max(int(np.argmin(grows)) - 1, 0)])
 
 
