@@ -429,6 +429,11 @@ def one_image(
         ((0.1, -0.2, 0.001, 0.002, 0.03), "plumb_bob", (0.1, -0.2, 0.001, 0.002, 0.03)),
         ((0.1, -0.2, 0.001, 0.002), "plumb_bob", (0.1, -0.2, 0.001, 0.002)),
         ((0.1, 0.2, 0, 0, 0.3, 0, 0, 0), "rational_polynomial", (0.1, 0.2, 0, 0, 0.3)),
+        (
+            (0.1, 0.2, 0, 0, 0.3, 0.4, 0, 0.5, 0, 0, 0, 0),
+            "rational_polynomial",
+            (0.1, 0.2, 0, 0, 0.3, 0.4, 0, 0.5),
+        ),
         ((0, 0, 0, 0), "equidistant", ()),
     ],
 )
@@ -445,7 +450,7 @@ def test_lenses(
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"d": (0.1, 0.2, 0, 0, 0.3, 0.4, 0, 0), "model": "rational_polynomial"}, "k4, k5 or k6"),
+        ({"d": (0.1, *[0] * 10, 0.2), "model": "rational_polynomial"}, "thin prisms"),
         ({"d": (0.1, 0.2, 0.3, 0.4), "model": "equidistant"}, "'equidistant' with 4"),
         ({"binning": 2}, "binning of 2"),
         ({"k": (70.0, 71.0, float("nan"), 29.5)}, "principal point"),
@@ -501,6 +506,34 @@ def test_a_camera_of_another_size(tmp_path: Path, ros: SimpleNamespace) -> None:
 
 
 # Topics.
+
+
+def test_images_that_are_no_depth_by_name_must_be_named(
+    tmp_path: Path, ros: SimpleNamespace, depth: Samples
+) -> None:
+    confidence = "/zed/confidence/confidence_map"
+
+    def fill(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.image(0.0, depth(0), topic=confidence)
+        writer.image(0.0, depth(0), topic="/ir/image_raw")
+        writer.image(0.0, depth(0), topic="/camera/depth/infra")
+
+    path = ros.write(tmp_path, fill)
+    with pytest.raises(DatasetError, match=r"no topic .*confidence_map \('16UC1'\).*--topic"):
+        only(path)
+    outline = bag_outline(path, RecordingOptions())
+    assert {outline.use_of(one.topic) for one in outline.frames} == {"not depth by its name"}
+    camera = RecordingOptions(topic=confidence, camera_info="/camera/depth/camera_info")
+    assert len(only(path, camera).frames) == 1
+
+    def fill_both(writer: Any) -> None:
+        fill(writer)
+        writer.image(0.0, depth(0), topic="/ir_camera/depth/image_raw")
+
+    both = ros.write(tmp_path / "both", fill_both)
+    sequence = only(both, RecordingOptions(camera_info="/camera/depth/camera_info"))
+    assert "1 of 1 frames of /ir_camera/depth/image_raw taken" in sequence.note
 
 
 def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:

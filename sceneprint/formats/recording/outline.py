@@ -62,7 +62,7 @@ class BagOutline:
     @property
     def span(self) -> str:
         """Duration and start of the recording."""
-        if not self.start_ns <= self.end_ns < self.start_ns + 10**18:
+        if self.end_ns < self.start_ns:
             return "no messages"
         try:
             start = datetime.fromtimestamp(self.start_ns * 1e-9, UTC)
@@ -74,7 +74,10 @@ class BagOutline:
         """Return how an upload can use a topic; empty if it cannot."""
         if topic.name == self.camera:
             return "camera"
-        use = next((one.encoding or "points" for one in self.frames if one.topic == topic), "")
+        frames = next((one for one in self.frames if one.topic == topic), None)
+        if frames is None:
+            return ""
+        use = "not depth by its name" if frames.is_beside_depth else frames.encoding or "points"
         is_used = self.chosen is not None and topic == self.chosen.topic
         return f"{use}, used" if is_used else use
 

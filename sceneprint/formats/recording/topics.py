@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sceneprint.errors import DatasetError, FrameError, UnreadableCloud, UnreadableFrame
+from sceneprint.formats.dataset.frame_names import OMITTED_IMAGES, is_beside_depth
 from sceneprint.formats.depth_file import decode_png, encode_npy, encode_png
 from sceneprint.formats.recording.bag import (
     CAMERA,
@@ -110,6 +111,16 @@ class FrameTopic:
     def is_rectified(self) -> bool:
         """Whether the images are rectified according to the ROS naming convention."""
         return is_rectified(self.topic.name)
+
+    @property
+    def is_beside_depth(self) -> bool:
+        """Whether the name indicates colour, infrared, confidence or labels.
+
+        Of `/depth/confidence` and `/ir_camera/depth/image`, only the first does.
+        """
+        parts = topic_without_transport(self.topic.name).split("/")
+        last = max((i for i, part in enumerate(parts) if "depth" in part.lower()), default=0)
+        return self.encoding is not None and any(map(is_beside_depth, parts[last:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +218,8 @@ def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
 
     Raises
     ------
-    DatasetError : If no topic fits, or several topics fit and `name` is None.
+    DatasetError : If no topic fits, or several topics fit and `name` is None. Infrared and the like
+        must be named.
     """
     candidates = frame_topics(bag)
     if name is not None:
@@ -227,10 +239,12 @@ def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
                 f"Select one of {listed(one.topic for one in candidates)}."
             )
         return frames
+    candidates = [one for one in candidates if not one.is_beside_depth]
     if not candidates:
         raise DatasetError(
-            f"{bag.path}: There is no topic of depth images ({_SUPPORTED}) or of points "
-            f"(PointCloud2). Images are {_encodings(bag)}. `sceneprint bag` lists all topics."
+            f"{bag.path}: There is no topic of depth images ({_SUPPORTED}; not {OMITTED_IMAGES}) "
+            f"or of points (PointCloud2). Images are {_encodings(bag)}. `sceneprint bag` lists all "
+            "topics; --topic selects one."
         )
     if len(candidates) > 1:
         raise DatasetError(
