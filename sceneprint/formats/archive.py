@@ -28,7 +28,7 @@ import unicodedata
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -485,6 +485,8 @@ class Archive:
     def __init__(self, file: BinaryIO, root: Path) -> None:
         self._file, self._root = file, root
         self._members: dict[Path, ArchiveEntry] = {}
+        #: Folders that are omitted because of their names, so that a note can name them.
+        self._omitted: set[tuple[str, ...]] = set()
         #: Names of refused members and sequences, each with the reason.
         self.refused: list[tuple[str, str]] = []
         #: Number of members that belong to no sequence, such as colour images.
@@ -577,6 +579,9 @@ class Archive:
                 self._refuse(member, member.trouble)
             elif role == "text":
                 left -= self._unpack(path, member, left)
+        for parts in self._omitted:
+            with suppress(FileExistsError, NotADirectoryError):  # a member has the name
+                above.joinpath(*parts).mkdir(parents=True, exist_ok=True)
         root = above / tops.pop() if single else above
         if root.is_dir():
             try:
@@ -628,6 +633,9 @@ class Archive:
             else:
                 self.ignored += 1
                 self.is_record3d |= parts[-2:-1] == (FRAMES,) and parts[-1].endswith(DEPTH_SUFFIX)
+                omitted = None if _is_hidden(parts) else _omitted_folder(parts)
+                if omitted is not None:
+                    self._omitted.add(omitted)
         return members
 
     def _refuse(self, member: ArchiveEntry, reason: str) -> None:
@@ -693,12 +701,24 @@ def _is_of_export(parts: tuple[str, ...]) -> bool:
     return of_camera or name == TRANSFORMS
 
 
+def _is_hidden(parts: tuple[str, ...]) -> bool:
+    return any(part.startswith(".") or part == "__MACOSX" for part in parts)
+
+
+def _omitted_folder(parts: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Return the path of a member's folder whose name indicates colour, infrared or the like.
+
+    The first folder may be the packed data set, whose name is arbitrary.
+    """
+    ends = (end for end in range(2, len(parts)) if is_beside_depth(parts[end - 1]))
+    end = next(ends, None)
+    return None if end is None else parts[:end]
+
+
 def _role_of(parts: tuple[str, ...]) -> Role | None:
     """Return the role of a member in a sequence by its name; None if it has none."""
     *folders, name = parts
-    hidden = any(part.startswith(".") or part == "__MACOSX" for part in parts)
-    # the first folder may be the packed data set, whose name is arbitrary
-    if hidden or any(is_beside_depth(folder) for folder in folders[1:]):
+    if _is_hidden(parts) or _omitted_folder(parts) is not None:
         return None
     # `find_pose_file` assigns pose files to frames
     is_pose = name.endswith(".txt") and ("pose" in name or {*folders[-1:]} & {*POSE_FOLDERS})

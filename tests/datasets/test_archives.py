@@ -195,6 +195,19 @@ def test_it_is_read_as_the_folder_is(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_folders_that_are_left_out_are_named(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for place in ("depth", "ir/deep", "__MACOSX/ir"):
+        (scene / place).mkdir(parents=True)
+        write_depth_png(scene / place / "0.png", DEPTH, 1000.0)
+    write_intrinsics(scene, CAMERA)
+    (private := tmp_path / "private").mkdir()
+    with looked_into(tarred(scene), private) as archive:
+        (sequence,) = archive.sequences
+        assert sequence.note.startswith("skipped: scene/ir (colour, infrared")
+        assert archive.ignored == 2
+
+
 def test_several_streams_and_any_chunks_are_one_tar(kitchen: Path) -> None:
     plain = tarred(kitchen)
     for pack in PACKERS.values():

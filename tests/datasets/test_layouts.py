@@ -133,6 +133,19 @@ def test_what_is_left_out_is_named(tmp_path: Path) -> None:
         find_sequences(scene)
 
 
+def test_folders_below_frames_are_named(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for place in ("", "more", "ir", "pose"):
+        (scene / place).mkdir(exist_ok=True, parents=True)
+        if place != "pose":
+            write_depth_png(scene / place / "0.png", DEPTH, 1000.0)
+    write_intrinsics(scene, CAMERA)
+    (sequence,) = find_sequences(scene)
+    assert [frame.name for frame in sequence.frames] == ["scene/0"]
+    assert sequence.note.startswith("not read: scene/more (below")
+    assert sequence.lost == 1
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

@@ -13,6 +13,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -561,10 +562,27 @@ def _sequences_in(
         sequence = _sequence_of(path, layout, name, frames, unposed)
         if _TRAJECTORY in files and all(one.pose_source is None for one in frames):
             sequence = replace(sequence, lost=len(frames))  # the trajectory fits no frame
+        unread = _unread_folders(path) if layout in (Layout.PLAIN, Layout.CLOUDS) else {}
+        if unread:
+            names = ", ".join(list(unread)[:_MOST_NAMES])
+            note = f"not read: {names} (below a folder with frames; specify it separately)"
+            sequence = replace(sequence, note=note, lost=sequence.lost + sum(unread.values()))
         return (sequence,)
     if path.is_file():
         return exports.file_sequences(path, _name(path.with_suffix(""), root))
     return (exports.folder_sequence(path, layout, _name(path, root)),)
+
+
+def _unread_folders(folder: Path) -> dict[str, int]:
+    """Return the folders in a folder of frames that have frames too, with their numbers."""
+    found = {}
+    for name in list_folder(folder)[1]:
+        if is_beside_depth(name):
+            continue
+        with suppress(DatasetError):  # the folder may not be read
+            files = list_folder(folder / name)[0]
+            found[f"{folder.name}/{name}"] = sum(is_depth(one) or is_cloud(one) for one in files)
+    return {name: count for name, count in found.items() if count}
 
 
 def _sequence_of(
