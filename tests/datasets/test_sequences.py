@@ -228,6 +228,8 @@ def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen: Path
     singles = [one for file in files for one in find_sequences(file)]
     assert places(singles, None) == [[1], [0], [1], [0]]
     assert places(singles, "all") == [[1], [0], [3], [2]]
+    in_turns = [singles[i] for i in (1, 3, 0, 2)]
+    assert places(in_turns, "all") == [[0], [2], [1], [3]]
 
 
 def test_files_without_a_number_are_numbered_as_they_were_named(tmp_path: Path) -> None:

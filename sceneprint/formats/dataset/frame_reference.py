@@ -273,31 +273,38 @@ def numbered_sequences(
 ) -> list[FrameSequence]:
     """Return sequences whose frames have numbers within their session.
 
-    If several sequences form one session, each continues the numbers of the previous one. Frames
-    of one folder that the user lists one by one keep the order of their numbers in the folder; a
-    frame without a number gets the next unused one. The only sequence of a session is unchanged.
+    If several sequences form one session, each folder continues the numbers of the previous one.
+    Frames of one folder that the user lists one by one keep the order of their numbers in the
+    folder; a frame without a number gets the next unused one. The only sequence of a session is
+    unchanged.
 
     Parameters
     ----------
     sequences : sequences in chronological order
     session : session of all sequences; None: that of `session_of`, which several may share
     """
-    unnumbered, numbered = list(sequences), []
-    names = [session or session_of(one) for one in unnumbered]
-    alone = {name for name in names if names.count(name) == 1}
-    first: dict[tuple[str, Path], int] = {}
+    numbered = list(sequences)
+    keys = [(session or session_of(one), one.folder) for one in numbered]
+    sizes = Counter(name for name, _ in keys)
+    rank = {key: place for place, key in enumerate(dict.fromkeys(keys))}
+    offsets: dict[tuple[str, Path], int] = {}
     free: dict[str, int] = {}  # next unused number of each session
-    for name, one in zip(names, unnumbered, strict=True):
-        if name in alone:
-            numbered.append(one)
+
+    def place_in_order(i: int) -> tuple[int, bool]:
+        # the frames of a folder may be listed in turns with those of another
+        return rank[keys[i]], numbered[i].frames[0].sequence is None
+
+    for i in sorted(range(len(keys)), key=place_in_order):
+        name = keys[i][0]
+        if sizes[name] == 1:
             continue
-        offset = first.setdefault((name, one.folder), free.get(name, 0))
+        offset = offsets.setdefault(keys[i], free.get(name, 0))
         frames = []
-        for frame in one.frames:
+        for frame in numbered[i].frames:
             place = free.get(name, 0)
             if frame.sequence is not None:
                 place = offset + frame.sequence
             frames.append(replace(frame, sequence=place))
             free[name] = max(free.get(name, 0), place + 1)
-        numbered.append(replace(one, frames=tuple(frames)))
+        numbered[i] = replace(numbered[i], frames=tuple(frames))
     return numbered
