@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import SceneprintError, UnreadableGeometry
-from sceneprint.formats.artifact import MAGIC, SCHEMA_VERSION, read_geometry, write_geometry
+from sceneprint.formats.artifact import (
+    MAGIC,
+    SCHEMA_VERSION,
+    pack_image,
+    read_geometry,
+    unpack_image,
+    write_geometry,
+)
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
@@ -74,6 +81,15 @@ def assert_equal_patches(a: Patches, b: Patches) -> None:
         np.testing.assert_array_equal(one, other.astype(np.float32))
     assert a.sizes.dtype == np.int32
     np.testing.assert_array_equal(a.sizes, b.sizes)
+
+
+def test_coarse_normals_of_a_camera_are_unpacked_with_their_number() -> None:
+    surface = made(4, 5, 0).surface
+    tilted = np.broadcast_to(np.float32([0.6, 0.0, -0.8]), surface.normals.shape)
+    packed, scale = pack_image(replace(surface, normals=tilted), 255)
+    assert surface.camera is not None
+    back = unpack_image(packed, scale, surface.camera, 255)
+    np.testing.assert_allclose(back.normals, tilted, atol=0.01)
 
 
 def test_round_trip(geometries: list[Geometry]) -> None:

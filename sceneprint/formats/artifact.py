@@ -102,8 +102,9 @@ def _pack_image(
 
 @disjoint_kernel
 def _unpack_line(
-    inverse: Floats, across: Floats, down: Floats, xn: Floats, yn: float, area: float, out: Floats
-) -> None:
+    inverse: Floats, across: Floats, down: Floats, most: float, xn: Floats, yn: float, area: float,
+    out: Floats,
+) -> None:  # fmt: skip
     """Write points, normals and areas (7, w) of a row of pixels to `out`.
 
     Invalid pixels are computed too, so that the compiler can vectorise the loop.
@@ -111,7 +112,7 @@ def _unpack_line(
     px, py, pz, nx, ny, nz, areas = out[0], out[1], out[2], out[3], out[4], out[5], out[6]
     for x in range(len(inverse)):
         z = 1.0 / inverse[x]
-        u, v = across[x] / 65535.0 * 2.0 - 1.0, down[x] / 65535.0 * 2.0 - 1.0
+        u, v = across[x] / most * 2.0 - 1.0, down[x] / most * 2.0 - 1.0
         facing = -(1.0 - abs(u) - abs(v))
         folded_u = (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0)
         folded_v = (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0)
@@ -127,7 +128,7 @@ def _unpack_line(
 
 @kernel
 def _unpack_pinhole(
-    packed: Packed, scale: float, camera: Floats, points: Floats32,
+    packed: Packed, scale: float, most: float, camera: Floats, points: Floats32,
     normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     height, width = packed.shape[0], packed.shape[1]
@@ -138,7 +139,7 @@ def _unpack_pinhole(
             for k in range(3):
                 line[k, x] = packed[y, x, k]
             line[0, x] = line[0, x] * scale if packed[y, x, 0] > 0 else 1.0
-        _unpack_line(line[0], line[1], line[2], xn, (y - cy) / fy, fx * fy, out)
+        _unpack_line(line[0], line[1], line[2], most, xn, (y - cy) / fy, fx * fy, out)
         for x in range(width):
             if packed[y, x, 0] == 0:
                 continue
@@ -219,15 +220,14 @@ def unpack_image(
     ----------
     packed : (h, w, 3) uint16; pixels whose first number is 0 are invalid
     scale : inverse depth (pinhole) or range (sphere) that 1 represents
-    most : greatest number of a packed normal, as it was passed to `pack_image`; the images of
-        pinhole cameras always have the default
+    most : greatest number of a packed normal, as it was passed to `pack_image`
     """
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
     areas, valid = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
     if isinstance(camera, Intrinsics):
         of = camera_of(camera, 0.0)
-        _unpack_pinhole(packed, scale, of, points, normals, areas, valid)
+        _unpack_pinhole(packed, scale, float(most), of, points, normals, areas, valid)
     else:
         elevation = camera.top - camera.step * np.arange(camera.height)
         solid = camera.step**2 * np.maximum(np.cos(elevation), 0.0)
