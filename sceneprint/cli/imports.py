@@ -78,6 +78,8 @@ def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
     """Return why jobs have not ended, from the statistics of the service."""
     from sceneprint_client.api import JobState
 
+    if is_starting(client):
+        return "They are signed when it is ready."
     try:
         stats = client.stats(minutes=1)
         own = sum(job.state is JobState.QUEUED for job in client.wait(jobs, timeout_s=0.0))

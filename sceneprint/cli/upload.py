@@ -294,7 +294,10 @@ def run_upload(options: argparse.Namespace) -> int:
     if options.as_map:
         with open_client(options) as client:
             _ensure_map(client, options)
-            return import_maps(client, options)
+            code = import_maps(client, options)
+            for line in map_lines(client, options.map, clouds=0):
+                print(line)
+            return code
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
     sequences = sequences_of(paths, options)

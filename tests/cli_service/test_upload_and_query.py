@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.cli.imports import is_starting
+from sceneprint.cli.imports import unsigned_reason
 from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.formats.dataset import read_pose, write_depth_png
 from sceneprint_client import Client, http
@@ -393,7 +393,7 @@ def test_an_upload_waits_for_a_service_that_compiles(
     monkeypatch.setattr(http, "LIMIT_S", 0.0)  # asked once
     with Client.embedded(tmp_path) as client:
         client._worker._runner._context.signers._compiled.clear()  # type: ignore[union-attr]
-        assert is_starting(client)
+        assert unsigned_reason(client, []) == "They are signed when it is ready."
     assert "the service is compiling its kernels" in capsys.readouterr().err
 
 
@@ -410,7 +410,7 @@ def test_an_upload_ends_at_its_timeout(sceneprint: Run, tmp_path: Path, rooms: P
 
 @pytest.mark.thorough
 def test_a_map_that_is_one_file_is_uploaded_as_a_map(
-    sceneprint: Run, service_url: str, room_mesh: bytes, tmp_path: Path
+    sceneprint: Run, service_url: str, room_mesh: bytes, rooms: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "room.ply"
     file.write_bytes(room_mesh)
@@ -428,6 +428,9 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     assert re.search(
         r"^Of \d+ test views of this file, \d+% are found in the map: ", done.stdout, re.M
     )
+    sceneprint("upload", "mesh", next(rooms.rglob("*.png")))
+    again = sceneprint("upload", "mesh", file, "--as-map", "--no-wait")
+    assert "the poses of map mesh are in 2 parent frames" in again.stdout
     with Client(service_url) as client:
         frames = list(client.frames("mesh"))
         client.delete_map("mesh")
