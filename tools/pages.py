@@ -43,8 +43,8 @@ def settings_page() -> str:
     names, starts = list(fields), [*(list(fields).index(name) for name in SECTIONS), len(fields)]
     parts = [
         "# Settings",
-        f"For operators: the {len(fields)} environment variables that service and workers read "
-        "when they start. All have defaults. An invalid value prevents the start, and a one-line "
+        f"Service and workers read these {len(fields)} environment variables when they start. "
+        "All have defaults. An invalid value prevents the start, and a one-line "
         "message is printed. The names in the tables follow `SCENEPRINT_`: `SCENEPRINT_PORT`.",
         "Secrets can come from files of one line. Append `_FILE` to the variable and set it to the "
         "path: `SCENEPRINT_DATABASE_URL_FILE`, `PGPASSWORD_FILE`, `AWS_ACCESS_KEY_ID_FILE`, "

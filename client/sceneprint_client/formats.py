@@ -44,7 +44,6 @@ class Format:
     reader : MODULE:FUNCTION that takes the bytes, or, for a capture, the path and a name; empty if
         one reader handles all formats of the kind
     size : MODULE:FUNCTION that returns width and height from the first bytes of a depth image
-    library : package that reads the format; empty if sceneprint itself does
     """
 
     name: str
@@ -56,7 +55,6 @@ class Format:
     media_type: str = BYTES
     reader: str = ""
     size: str = ""
-    library: str = ""
 
     def begins(self, head: bytes) -> bool:
         """Return whether the first bytes of a file show this format."""
@@ -91,7 +89,7 @@ FORMATS = (
         "png", "depth", "PNG", (".png",),
         "16 bits, one channel, in stored units; 0 and 65535 are missing",
         _PNG, "image/png", "sceneprint.formats.depth_file:decode_png",
-        "sceneprint.formats.depth_file:png_size", "isal, Pillow",
+        "sceneprint.formats.depth_file:png_size",
     ),
     Format(
         "npy", "depth", "NPY", (".npy",),
@@ -108,7 +106,7 @@ FORMATS = (
         "compresseddepth", "depth", "compressedDepth of ROS", (),
         "the data of a message: PNG after 12 bytes, of 16UC1 or 32FC1",
         r"[\s\S]{12}" + _PNG, BYTES, "sceneprint.formats.depth_file:decode_transported",
-        "sceneprint.formats.depth_file:transported_size", "isal, Pillow",
+        "sceneprint.formats.depth_file:transported_size",
     ),
     Format(
         "ply", "cloud", "PLY", (".ply",),
@@ -127,7 +125,7 @@ FORMATS = (
         "1.0 to 1.4, point formats 0 to 10; LAZ in chunks of one size or of several (COPC), with "
         "the extra `las`. Noise points are read as points; classes, returns, time, colour and "
         "waveforms are ignored",
-        "LASF", BYTES, "sceneprint.formats.points.las:read_las", "", "lazrs",
+        "LASF", BYTES, "sceneprint.formats.points.las:read_las",
     ),
     Format(
         "npy", "cloud", "NPY", (".npy",),
@@ -157,7 +155,6 @@ FORMATS = (
     Format(
         "las", "map", "LAS, LAZ", (".las", ".laz"),
         "points. Units are those of the file's coordinate system, else estimated; z is up", "LASF",
-        library="lazrs",
     ),
     Format(
         "npy", "map", "NPY", (".npy",), f"points, (N, 3) or (N, 4). {_ESTIMATED} (usually z)",
@@ -169,21 +166,19 @@ FORMATS = (
     ),
     Format(
         "stl", "map", "STL", (".stl",), f"a mesh, ascii or binary. {_ESTIMATED} (usually z)",
-        library="trimesh",
     ),
     Format(
         "obj", "map", "OBJ", (".obj",),
         "a mesh; points if it has no faces. Materials are ignored. "
-        f"{_ESTIMATED} (usually y)", library="trimesh",
+        f"{_ESTIMATED} (usually y)",
     ),
     Format(
         "glb", "map", "glTF", (".glb",),
         "all triangles of the scene; points if it has none. Textures are ignored. Units are "
         "metres, y is up", "glTF",
-        library="trimesh",
     ),
     Format(
-        "gltf", "map", "glTF", (".gltf",), "the same, with embedded buffers", library="trimesh",
+        "gltf", "map", "glTF", (".gltf",), "the same, with embedded buffers",
     ),
     Format(
         "zip", "archive", "zip", (".zip",), "folders of frames",
@@ -204,15 +199,14 @@ FORMATS = (
     ),
     Format(
         "mcap", "recording", "MCAP", (".mcap",), "messages of ROS 2 and ROS 1",
-        r"\x89MCAP0\r\n", library="rosbags",
+        r"\x89MCAP0\r\n",
     ),
     Format(
         "rosbag2", "recording", "rosbag2", (".db3",),
-        "the file, or the folder with its `metadata.yaml`", _SQLITE, library="rosbags",
+        "the file, or the folder with its `metadata.yaml`", _SQLITE,
     ),
     Format(
         "rosbag1", "recording", "ROS 1", (".bag",), "version 2.0", "#ROSBAG V2",
-        library="rosbags",
     ),
     Format(
         "rtabmap", "capture", "RTAB-Map", (".db",), "depth, laser scans and poses of a database",
@@ -225,7 +219,6 @@ FORMATS = (
     Format(
         "record3d", "capture", "Record3D", (".r3d",), "depth and poses of a capture",
         r"PK\x03\x04", reader="sceneprint.formats.exports.record3d:record3d_sequence",
-        library="lzfse",
     ),
 )  # fmt: skip
 

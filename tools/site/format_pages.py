@@ -24,7 +24,8 @@ def formats_page() -> str:
     """Return Markdown with a table of the formats of each kind."""
     return page(
         "# File formats",
-        "For anyone with files to read: every supported format, and the data that is read from it.",
+        "This page lists every supported format, and the data that is read from it. "
+        "Files are recognised by their first bytes, except where the table says *by name*.",
         *(f"## {title}\n\n{_rows(kind)}" for kind, title in _TITLES.items()),
         "See also [point clouds](clouds.md), [recordings](recordings.md), [captures](exports.md).",
     )
@@ -32,15 +33,13 @@ def formats_page() -> str:
 
 def _rows(kind: Kind) -> str:
     return table(
-        ("format", "names", "what is read", "recognised by", "media type", "library"),
+        ("format", "names", "what is read", "media type"),
         (
             (
                 one.title,
-                ", ".join(map(code, one.suffixes)),
+                ", ".join(map(code, one.suffixes)) + ("" if one.signature else ", by name"),
                 one.content,
-                "first bytes" if one.signature else "name",
                 code(one.media_type),
-                one.library or "our own",
             )
             for one in formats_of(kind)
         ),
