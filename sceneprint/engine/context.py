@@ -85,7 +85,7 @@ def _enter(stack: ExitStack, settings: Settings) -> Context:
             settings.decoder_timeout_s,
             current_tenant,
         )
-    with ExitStack() as opened:  # closed if a later step fails
+    with ExitStack() as opened:  # closes what was opened if a later step fails
         store = open_store(
             settings.database, settings.blobs, settings.geometry_cache_bytes, decoders
         )

@@ -207,7 +207,7 @@ class Events:
 
         def spent(connection: Connection, limit: int) -> list[int]:
             if not surplus_events(connection, kept, (), 1):
-                return []  # usually, without reading indexes
+                return []  # the usual case, in which no index is read
             return surplus_events(connection, kept, anchors(indexes), limit)
 
         return remove_in_blocks(self._store.database, spent, remove_events, AT_MOST)

@@ -458,7 +458,7 @@ class Imports:
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
         self._tidied = time.monotonic()
-        with self._store.database.read() as connection:  # usually there is none, so no lock
+        with self._store.database.read() as connection:  # there is usually none, so do not lock
             if not queue.finished_with_file(connection, ARCHIVE):
                 return 0
         with self._store.database.write() as connection:

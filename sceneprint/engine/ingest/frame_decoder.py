@@ -137,7 +137,7 @@ def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
         along_ray=row.depth_along_ray,
         name=row.id,
         samples_of=decoder.samples,
-        trust_depth=True,  # it was accepted before
+        trust_depth=True,  # the frame was accepted before
     )
 
 
@@ -250,7 +250,7 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Deco
         raise errors.UnreadableCloud(_failed(error)) from error
     except errors.MissingDependency as error:  # the file's type is not supported here
         raise errors.UnsupportedType(str(error)) from error
-    if scan.file_format != _packing(data):  # it could not be decoded again
+    if scan.file_format != _packing(data):  # the stored file could not be recognised later
         raise errors.UnreadableCloud(
             f"The file was sent as {scan.file_format.upper()}, but does not start like a file of "
             "that format. Write the file again, or correct the format."

@@ -431,7 +431,7 @@ class Uploads:
         outcomes : results of all uploads
         replayed : whether an earlier request stored them
         """
-        self._store.database.require_writable()  # before blobs are written
+        self._store.database.require_writable()  # check this before blobs are written
         todo = {i: one for i, one in ready.items() if results[i] is None}
         request = _Request(todo, results, once, fence)
         blobs = request.blobs
@@ -481,7 +481,7 @@ class Uploads:
         if request.fence is not None:
             request.fence(connection)
         if not all(map(self._store.blobs.holds, request.blobs)):
-            return None  # also before a replay, whose frame may need the blob
+            return None  # check this first, since the frame of a replay may need the blob
         if request.once is not None:
             now = find_map(connection, row.name)
             if now.number != row.number:

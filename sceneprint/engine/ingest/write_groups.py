@@ -69,7 +69,7 @@ class _Group(Generic[W]):
                 self._write()
         except BaseException:  # such as Ctrl-C
             with self._list:
-                mine.left = True  # the leading thread must not return it to the list
+                mine.left = True  # the leading thread must not return this write to the list
                 if mine in self._waiting:
                     self._waiting.remove(mine)
             raise

@@ -126,7 +126,7 @@ def run(
         if broke is not None and not isinstance(error, errors.SceneprintError):
             broke()
     if result is not None and state != JobState.SUCCEEDED:
-        unused = [result.signature.geometry]  # nothing refers to it
+        unused = [result.signature.geometry]  # nothing refers to the artifact
     if unused:
         collect_blobs(store, unused)
     if state is None:
@@ -316,7 +316,7 @@ def why_redundant(
     ------
     Stale : If the nearest frame was deleted, so the search must be repeated.
     """
-    novelty = frame_of(connection, frame.number).novelty  # another upload may have relaxed it
+    novelty = frame_of(connection, frame.number).novelty  # an upload may have relaxed it
     row = map_of_number(connection, frame.map_number)
     if novelty is None or seen is None or row.model_id != signature.model_id:
         return None

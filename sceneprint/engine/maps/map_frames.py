@@ -325,7 +325,7 @@ def _names_of(cursor: str) -> tuple[str, str]:
         if isinstance(session, str) and isinstance(robot, str):
             f"{session}{robot}".encode()  # raises for a lone surrogate
             return session, robot
-    except (ValueError, TypeError, RecursionError):  # a forged cursor, too
+    except (ValueError, TypeError, RecursionError):  # raised for a forged cursor too
         pass
     raise invalid_cursor(cursor)
 

@@ -111,7 +111,7 @@ def get_map(store: Store, name: str) -> Map:
 def delete_map(context: Context, name: str) -> None:
     """Delete a map with its content; raise UnknownMap if it does not exist."""
     store = context.store
-    context.query_log.remove_of_map(name)  # in blocks, between which others write
+    context.query_log.remove_of_map(name)  # removes blocks of rows, between which others write
     with store.database.write() as connection:
         blobs = remove_map(connection, find_map(connection, name))
     context.readers.forget(name)
@@ -401,7 +401,7 @@ def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
     """Queue jobs for all frames without the next model's signature; return their number."""
     after, queued = 0, 0
     while True:
-        with store.database.read() as connection:  # usually no frame lacks one, so no lock
+        with store.database.read() as connection:  # usually no frame lacks one, so do not lock
             if not stored.unqueued_frames(connection, row, after, again=again):
                 return queued
         with store.database.write() as connection:

@@ -450,7 +450,7 @@ class SurfaceUpkeep:
         if since == _DONE or (changed and time.monotonic() - since < LONGEST_S):
             return
         self._seen[row.number] = at, _DONE
-        with self._store.database.read() as connection:  # usually nothing is due, so no lock
+        with self._store.database.read() as connection:  # usually nothing is due, so do not lock
             if not self._is_due(connection, row, surface):
                 return
         with self._store.database.write(map_number=row.number) as connection:

@@ -161,7 +161,7 @@ class SurfaceHandler:
             progress |= {"done": 0, "after": 0, "checked": False}
             with self._store.database.read() as connection:
                 progress["total"] = stored.count_left(connection, surface)
-        if not progress["checked"]:  # all removals first, so that tiles are rebuilt once
+        if not progress["checked"]:  # remove all frames first, so that tiles are rebuilt once
             return self._remove_frames(surface, progress)
         with self._store.database.read() as connection:
             rebuilt = stored.tiles_to_rebuild(connection, row.number, _TILES)
@@ -176,7 +176,7 @@ class SurfaceHandler:
         if new:
             return self._add(row, surface, progress, new, is_over)
         if progress["after"]:
-            return SliceResult(False, progress | {"after": 0})  # for edited earlier frames
+            return SliceResult(False, progress | {"after": 0})  # repeat for edited frames
         return self._conclude(row, surface, progress)
 
     def _reset(self, row: MapRow, surface: SurfaceRow, task: LongJob) -> SliceResult:
@@ -291,7 +291,7 @@ class SurfaceHandler:
         for key, sums in self._sums_of(before, done).items():
             parts[key].append(sums)
         for key in done.damaged:
-            del parts[key]  # rebuilt from all frames that touch it
+            del parts[key]  # the tile is rebuilt from all frames that touch it
         changed = {key: fuse_cells(own) for key, own in parts.items()}
         self._publish(surface, changed, done)
         progress["after"] = added[-1].number

@@ -64,7 +64,7 @@ class JoinUpkeep:
 
     def _look(self, row: MapRow) -> bool:
         """Start an association of a map if one is due; return whether it needs no further check."""
-        with self._store.database.read() as connection:  # usually nothing is due, so no lock
+        with self._store.database.read() as connection:  # usually nothing is due, so do not lock
             if _is_busy(connection, row):
                 return False
             if _due(connection, row) is None:

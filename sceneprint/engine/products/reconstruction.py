@@ -187,7 +187,7 @@ def _read(store: Store, view: JobView, model_id: str, as_of: float) -> tuple[Dep
                 f"Frame {frame.id} of map {row.name!r} was deleted, and a new frame has its id."
             )
         blob = geometry_blobs(connection, [frame.number], model_id).get(frame.number)
-    if frame.kind == "cloud":  # before a large cloud is decoded
+    if frame.kind == "cloud":  # do not decode a large cloud first
         raise _no_image(view.frame_id)
     T = np.array(view.transform)
     try:

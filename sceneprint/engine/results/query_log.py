@@ -205,7 +205,7 @@ class QueryLog:
             loss_reason = "an unexpected error"
         self._written_at = time.monotonic()
         with self._changed:
-            for one in batch[: len(self._waiting)]:  # none if the log was closed in the meantime
+            for one in batch[: len(self._waiting)]:  # none remain if the log was closed
                 self._waiting.popleft()
                 self._bytes_waiting -= one.size
             self._settled += len(batch)

@@ -172,7 +172,7 @@ class IndexPlace:
         numbered = _numbered(listed)
         if self._store is None or not numbered:
             return
-        now = max(one.changed_at for one in listed)  # by the clock of the store
+        now = max(one.changed_at for one in listed)  # the time of the store's clock
         before = math.inf if clean else now - GRACE_S
         fetchable = [one for one, after in pairwise(numbered) if after.changed_at >= before]
         needed = set[str]()

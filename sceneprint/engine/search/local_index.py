@@ -152,7 +152,7 @@ class AppendBuffer:
             # double the capacity, but by at most IN_MEMORY bytes
             step = min(self._capacity, max(IN_MEMORY // length, 64))
             capacity = max(n + more, self._capacity + step)
-            rows = self._allocate(capacity, length)  # first, since it may fail
+            rows = self._allocate(capacity, length)  # this may fail, so it comes first
             rows[:n] = self._rows[:n]  # views still use the old arrays
             new = np.empty(capacity - n, np.int64)
             self._keys = np.concatenate([self._keys[:n], new])

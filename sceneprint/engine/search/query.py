@@ -289,7 +289,7 @@ class Queries:
 
         def ask(rows: list[MapRow]) -> Answer:
             self._check_models(rows)
-            self._signers(rows[0].model_id)  # before a connection is in use, as loading takes long
+            self._signers(rows[0].model_id)  # loading takes long, so no connection is in use yet
             ready = prepare_stored(self._store, self._signers, frame.map, frame.frame_id, query)
             return self.answer(rows[: len(maps)], ready, query, deadline, sent=sent)
 

@@ -388,7 +388,7 @@ def search_maps(
     keys = np.concatenate([one.keys for one in hits])
     all_distances = np.concatenate([one.distances for one in hits])
     owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
-    first = np.lexsort((keys, all_distances))[:size]  # equal distances in the order of uploads
+    first = np.lexsort((keys, all_distances))[:size]  # ties keep the order of uploads
     distances = all_distances[first]
     shares = similarity(distances, model.unrelated_distance)
     return Searched(parts, hits, Ranking(keys[first].astype(np.intp), distances, shares),

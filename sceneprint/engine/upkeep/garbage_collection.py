@@ -72,7 +72,7 @@ def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
 def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
     """Remove unreferenced blobs after a transaction that dooms them; see `_remove_in_turn`."""
     with suppress(StoreLocked):
-        store.blobs.wait_for_removal(seconds=_PATIENCE_S)  # else the blobs would only be doomed
+        store.blobs.wait_for_removal(seconds=_PATIENCE_S)  # otherwise blobs stay doomed
     with ExitStack() as removal:
         with store.database.write() as connection:
             if not removal.enter_context(store.blobs.removing()):

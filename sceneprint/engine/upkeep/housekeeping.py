@@ -53,7 +53,7 @@ class Housekeeping:
     def run(self) -> int:
         """Run all tasks that are due, and return the number of published indexes."""
         store = self._context.store
-        number_events(store.database)  # in case that no reader does
+        number_events(store.database)  # in case that no reader does this
         self.reencodings.run()
         self.retention.run()
         published = self.upkeep.run()

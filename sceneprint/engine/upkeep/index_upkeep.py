@@ -304,7 +304,7 @@ class Upkeep:
         done = True
         if stale and not empty:
             done = self._publish(row, force=True, clean=True) is not None
-        if done and older:  # including files that a killed builder left behind
+        if done and older:  # also remove files that a killed builder left behind
             head = None if empty else self._place.head(row)
             done = self._place.remove_all_but(row, head)
         if not done:
@@ -332,7 +332,7 @@ class Upkeep:
             times = (self._place.folder(row) / _PURGED).stat()
         except OSError:
             return True
-        return not times.st_atime <= time.time() < times.st_mtime  # or the clock was set back
+        return not times.st_atime <= time.time() < times.st_mtime  # the clock may be set back
 
     def _publish(
         self, row: MapRow, *, force: bool = False, rebuild: bool = False, clean: bool = False
@@ -367,7 +367,7 @@ class Upkeep:
         self, row: MapRow, share: Callable[[IndexManifest], bool], *, force: bool,
         rebuild: bool, clean: bool,
     ) -> IndexVersion | None:  # fmt: skip
-        model = self._signers(row.model_id).model  # outside of a transaction, as it opens one
+        model = self._signers(row.model_id).model  # no transaction may be open here
         after, damaged = self._place.last_number(row), list[int]()
         with self._store.database.read() as connection:
             allow(connection, 0)  # the connection is idle while the index is built

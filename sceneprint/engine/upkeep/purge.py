@@ -119,7 +119,7 @@ class Retention:
         """Delete a block of the oldest frames of a map, and return its size."""
         if row.retention_days is None:
             return 0
-        with self._store.database.read() as connection:  # usually none is due, so no lock
+        with self._store.database.read() as connection:  # usually none is due, so do not lock
             now = read_clock(connection) if at is None else at
             if not old_frames(connection, row.number, now - DAY_S * row.retention_days, 1):
                 return 0

@@ -74,7 +74,7 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
     if not numbers or store.database.read_only:
         return 0
     try:
-        with store.database.read() as connection:  # usually no repair is due, so no lock
+        with store.database.read() as connection:  # usually no repair is due, so do not lock
             # a random sample, so that irreparable frames do not prevent other repairs
             sample = random.sample(list(numbers), min(MOST, len(numbers)))
             due = _due(connection, sample, model_id)
