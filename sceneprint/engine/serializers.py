@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
@@ -17,6 +17,7 @@ from sceneprint.store.deletion import DAY_S, count_old_frames, without_content
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import model_names
 from sceneprint.store.parent_joins import count_poses
+from sceneprint.store.query_rows import count_statuses
 from sceneprint.store.queue import signing_jobs
 from sceneprint.store.reencoding_rows import switch_progress
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
@@ -113,8 +114,21 @@ def query_sensor(frame: FrameName | None, kind: Kind, maps: Sequence[str]) -> st
     return sensor_frame(frame.frame_id if frame is not None and alone else "query", kind)
 
 
-def map_record(connection: Connection, row: MapRow) -> Map:
-    """Return the API record of a map."""
+#: Time span of `recent_queries`, seconds.
+RECENT_S = 3600.0
+
+
+def map_records(connection: Connection, rows: Sequence[MapRow]) -> list[Map]:
+    """Return the API records of maps; the queries of all maps are counted together."""
+    counts = count_statuses(connection, time.time() - RECENT_S)
+    return [map_record(connection, row, counts.get(row.number, {})) for row in rows]
+
+
+def map_record(connection: Connection, row: MapRow, recent: Mapping[str, int] | None = None) -> Map:
+    """Return the API record of a map; without `recent`, count its recent queries."""
+    if recent is None:
+        since = time.time() - RECENT_S
+        recent = count_statuses(connection, since, row.number).get(row.number, {})
     names, reencoding, overdue = model_names(connection), None, None
     if row.retention_days is not None:
         overdue = count_old_frames(connection, row.number, time.time() - DAY_S * row.retention_days)
@@ -134,6 +148,7 @@ def map_record(connection: Connection, row: MapRow) -> Map:
         frames=count_states(connection, row.number),
         posed_frames=posed,
         parent_frames=parents,
+        recent_queries=dict(recent),
         used_frames=row.used_frames,
         used_bytes=row.used_bytes,
         quota_frames=row.quota_frames,

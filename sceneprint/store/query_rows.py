@@ -230,6 +230,20 @@ def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
         yield _c.at < wanted.until
 
 
+def count_statuses(
+    connection: Connection, since: float, map_number: int | None = None
+) -> dict[int, dict[str, int]]:
+    """Return the number of listed queries since a time by map and status; None counts all maps."""
+    statement = select(_c.map_number, _c.status, func.count().label("n"))
+    statement = statement.where(_c.listed, _c.at >= since).group_by(_c.map_number, _c.status)
+    if map_number is not None:
+        statement = statement.where(_c.map_number == map_number)
+    counts: dict[int, dict[str, int]] = {}
+    for row in connection.execute(statement):
+        counts.setdefault(row.map_number, {})[row.status] = row.n
+    return counts
+
+
 def find_query(connection: Connection, query_id: str) -> QueryRow | None:
     """Return the query with an id, or None."""
     row = connection.execute(_ROW.where(_c.id == query_id)).mappings().first()

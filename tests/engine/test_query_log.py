@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from sqlalchemy import event, func, select, update
 
+from sceneprint.engine.maps.map_lifecycle import get_maps
 from sceneprint.engine.results import query_log
 from sceneprint.engine.results.query_entry import (
     SentQuery,
@@ -34,7 +35,13 @@ from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.deletion import DAY_S
 from sceneprint.store.events import EventFilter, list_events
 from sceneprint.store.frame_queries import QueryOrigin
-from sceneprint.store.query_rows import NewQuery, WantedQueries, drop_answers, keep_answer
+from sceneprint.store.query_rows import (
+    NewQuery,
+    WantedQueries,
+    count_statuses,
+    drop_answers,
+    keep_answer,
+)
 from sceneprint.store.tables import queries
 from sceneprint_client.api import (
     Alternative,
@@ -208,6 +215,22 @@ def test_pages_are_read_by_index(engine):
         numbers(engine, names, **wanted)
         assert all(index in one and "TEMP B-TREE" not in one for one in plans), plans
         assert plans
+
+
+def test_recent_queries_are_counted_by_map_and_status(engine):
+    start = time.time()
+    for i, (home, status) in enumerate(
+        (("hall", "found"), ("hall", "found"), ("attic", "ambiguous"), ("hall", "failed"))
+    ):
+        engine.query_log.note(row(i, at=start + i, map=home, status=status))
+    engine.query_log.note(row(4, at=start + 4, status="found", listed=False), stored())
+    assert engine.query_log.flush(60)
+    counts = {"attic": {"ambiguous": 1}, "hall": {"found": 2, "failed": 1}}
+    assert {one.name: one.recent_queries for one in get_maps(engine.store)} == counts
+    assert engine.get_map("hall").recent_queries == counts["hall"]
+    with engine.store.database.read() as connection:
+        later = count_statuses(connection, start + 1)
+    assert sorted(later.values(), key=len) == [{"ambiguous": 1}, {"found": 1, "failed": 1}]
 
 
 def test_a_new_map_has_no_queries_of_the_deleted_one(engine):

@@ -116,6 +116,11 @@ class Map(ApiRecord):
         description="Number of parent frames of the poses. If there are several, answers use the "
         "parent frame of their matches until an association joins the parent frames.",
     )
+    recent_queries: dict[str, int] = Field(
+        default={},
+        description="Number of queries in the last hour by status, including `failed`. Queries "
+        "whose `record` is false do not count.",
+    )
     used_frames: int = Field(
         default=0,
         description="Number of frames that count towards the quota (all except deleted and "

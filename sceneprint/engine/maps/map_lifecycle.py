@@ -29,6 +29,7 @@ from sceneprint.engine.serializers import (
     frame_records,
     frame_tag,
     map_record,
+    map_records,
     map_tag,
     model_label,
     transform,
@@ -99,7 +100,7 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
 def get_maps(store: Store) -> list[Map]:
     """Return all maps, by name."""
     with store.database.read() as connection:
-        return [map_record(connection, row) for row in list_maps(connection)]
+        return map_records(connection, list_maps(connection))
 
 
 def get_map(store: Store, name: str) -> Map:
