@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
+
+from benchmarks.rooms import Shot, send, shots
 
 Settle = Callable[[Page], None]
 MARKUP = "<img src=x onerror=alert(1)> & co"
@@ -25,16 +28,12 @@ def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle
     assert told["frames"] == {"indexed": 16}
     expect(one.get_by_role("heading")).to_have_text("Two rooms")
     expect(one.locator(".map-number")).to_have_text("16")
-    expect(one).to_contain_text("Up to date")
     expect(one).to_contain_text(told["model"])
-    sizes = station.client.get("/v1/stats", params={"map": "building"}).json()["bytes"]
-    used = sum(sizes[part] for part in ("database", "blobs", "index"))
-    expect(one.locator("dd").last).to_have_text(f"{used / 1e6:.1f} MB")
-    expect(one).to_contain_text("none needed")  # a query compares all 16 frames
     expect(one.get_by_role("link", name="Upload frames")).to_have_count(0)
     empty = card(page, "marked-up")
     expect(empty.get_by_role("heading")).to_have_text(MARKUP)  # letter by letter
-    expect(empty).to_contain_text("empty")
+    expect(empty).to_contain_text("This map is empty")
+    expect(empty).to_contain_text("No queries in the last hour")
     expect(empty.get_by_role("link", name="Upload frames")).to_have_attribute(
         "href", "#/maps/marked-up/upload"
     )
@@ -150,8 +149,8 @@ def test_many_maps_are_few_requests(station: Any, page: Page, settle: Settle) ->
 
     def begun(request: Any) -> None:
         nonlocal most
-        if "/v1/stats" in request.url:
-            names.append(request.url.partition("map=")[2].partition("&")[0])
+        if request.url.endswith("/surface"):
+            names.append(request.url.split("/")[-2])
             at_once.add(request)
             most = max(most, len(at_once))
 
@@ -169,3 +168,169 @@ def test_many_maps_are_few_requests(station: Any, page: Page, settle: Settle) ->
     assert len(names) == len(set(names))
     page.get_by_label("Find a map").fill("nothing like it")
     expect(page.get_by_role("main")).to_contain_text("No map matches")
+
+
+@pytest.fixture(scope="module")
+def walk() -> list[Shot]:
+    """A recorded walk through a room, with up to 40 cm between two views."""
+    return shots((0,), 5, 8)
+
+
+@pytest.fixture(scope="module")
+def walked(station: Any, walk: list[Shot], until: Callable[..., Any]) -> dict[str, Any]:
+    """The surface of a map `walked`, which has the frames of the walk."""
+    path = station.make_map("walked")
+    send(station.client, "walked", walk)
+    until(lambda: station.client.get(path).json()["frames"].get("indexed") == len(walk))
+    station.client.post(f"{path}/surface")
+    until(lambda: station.client.get(f"{path}/surface").json()["state"] == "ready")
+    (parent,) = station.client.get(f"{path}/surface").json()["parents"]
+    return dict(parent)
+
+
+def ask(station: Any, robot: str, shot: Shot) -> dict[str, Any]:
+    """Query the map `walked` with a frame."""
+    meta = {"intrinsics": shot.meta["intrinsics"], "robot": robot}
+    form = {"data": {"meta": json.dumps(meta)}, "files": {"frame": (shot.name, shot.data)}}
+    answer = station.client.post("/v1/maps/walked/queries", **form)
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+@pytest.mark.thorough
+def test_robots_are_seen_moving_on_the_plan(
+    station: Any, page: Page, settle: Settle, axe: Callable[[Page], list[str]],
+    walk: list[Shot], walked: dict[str, Any],
+) -> None:  # fmt: skip
+    first = ask(station, "walker", walk[0])
+    ask(station, "idler", walk[0])
+    page.goto(f"{station.home}#/")
+    one = card(page, "walked")
+    one.scroll_into_view_if_needed()
+    robot = one.locator("[data-robot=walker]")
+    plan = walked["plan"]
+
+    def stands(answer: dict[str, Any]) -> None:
+        p = [answer["location"]["pose"]["translation"][axis] for axis in "xyz"]
+        u, v = (sum(a * b for a, b in zip(walked[name], p, strict=True)) for name in
+                ("x_axis", "y_axis"))  # fmt: skip
+        left = (u - plan["left"]) / (plan["width"] * plan["m_per_pixel"])
+        top = (plan["top"] - v) / (plan["height"] * plan["m_per_pixel"])
+        style = f"left: {round(100 * left, 2):g}%; top: {round(100 * top, 2):g}%"
+        expect(robot).to_have_attribute("style", re.compile(f"^{re.escape(style)};"))
+
+    stands(first)
+    settle(page)
+    assert axe(page) == []
+    page.mouse.move(0, 0)
+    asked: list[str] = []
+    page.on("request", lambda sent: asked.append(sent.url))
+    places = {tuple(first["location"]["pose"]["translation"].values())}
+    for shot in walk[1:]:
+        last = ask(station, "walker", shot)
+        stands(last)  # each answer is an event, which moves the robot
+        places.add(tuple(last["location"]["pose"]["translation"].values()))
+    assert len(places) == len(walk)
+    assert not [url for url in asked if "/queries" in url or "/surface" in url]
+    expect(one.locator(".map-answers li").first).to_contain_text("walker")
+    expect(one.locator(".map-answers a").first).to_have_attribute(
+        "href", f"#/queries/{last['query_id']}"
+    )
+    expect(one.locator(".map-share")).to_have_text("100 % of 6 queries found in the last hour")
+    # two robots at one place: each has its own colour, and no label covers another
+    ask(station, "idler", walk[-1])
+    boxes = """all => all.map((one) => {
+      const { left, top, right, bottom } = one.getBoundingClientRect();
+      const { backgroundColor: colour, visibility: shown } = getComputedStyle(one);
+      return { left, top, right, bottom, colour, shown }; })"""
+    names = one.locator(".map-robot-name")
+    expect(one.locator(".map-answers li").first).to_contain_text("idler")
+    one.evaluate(
+        "one => Promise.all(one.getAnimations({subtree: true}).map((each) => each.finished))"
+    )
+    a, b = names.evaluate_all(boxes)
+    assert a["colour"] != b["colour"]
+    assert a["shown"] == b["shown"] == "visible"
+    apart = (a["right"] <= b["left"], b["right"] <= a["left"],
+             a["bottom"] <= b["top"], b["bottom"] <= a["top"])  # fmt: skip
+    assert any(apart)
+    # what a person asks with the dashboard is no query of a robot
+    before = station.client.get("/v1/maps/walked").json()["recent_queries"]
+    page.goto(f"{station.home}#/maps/walked/query")
+    page.locator(".query-gallery .query-pick").first.click()
+    expect(page.locator(".query-verdict")).to_be_visible()
+    listed = ask(station, "walker", walk[1])["query_id"]
+    page.goto(f"{station.home}#/maps/walked/queries")
+    expect(page.locator(f"[data-query='{listed}']")).to_be_visible()
+    after = station.client.get("/v1/maps/walked").json()["recent_queries"]
+    assert after == {"found": before["found"] + 1}
+
+
+def test_the_health_is_one_sentence(station: Any, page: Page, settle: Settle) -> None:
+    page.goto(station.home)
+    settle(page)
+
+    def told(maps: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[Any]:
+        url = f"{station.url}/dashboard/maps/condition.js"
+        script = """async ([url, maps, jobs]) => {
+          const { kind, text, href } = (await import(url)).conditionOf(maps, jobs);
+          return [kind, text, href]; }"""
+        return list(page.evaluate(script, [url, maps, jobs]))
+
+    def of(name: str, **frames: int) -> dict[str, Any]:
+        return {"name": name, "frames": frames, "reencoding": None}
+
+    fine = "Everything is signed; no job failed."
+    assert told([], []) == told([of("hall", indexed=3, rejected=1)], []) == ["good", fine, None]
+    assert told([of("hall", failed=1), of("b", indexed=2)], []) == [
+        "bad", "One frame of `hall` failed permanently; nothing waits.", "#/maps/hall?state=failed"
+    ]  # fmt: skip
+    assert told([of("a", failed=2, received=1), of("b", failed=1)], []) == [
+        "bad", "3 frames of 2 maps failed permanently; one frame waits.",
+        "#/operations?tab=jobs&state=dead",
+    ]  # fmt: skip
+    job = {"kind": "associate", "map": "hall", "job_id": "7"}
+    assert told([of("a", received=2, signing=1)], [job]) == [
+        "bad", "The `associate` job of `hall` failed; 3 frames wait.", "#/operations/jobs/7"
+    ]  # fmt: skip
+    assert told([of("a", signing=1)], []) == [
+        "neutral", "One frame waits for a signature; no job failed.", None
+    ]  # fmt: skip
+
+
+@pytest.mark.thorough
+def test_the_first_page_of_a_hundred_maps_is_small_and_fast(
+    station: Any, page: Page, settle: Settle, walked: dict[str, Any]
+) -> None:
+    del walked
+    for number in range(100):
+        station.make_map(f"hundred-{number:03d}")
+    sizes: list[int] = []
+    page.on("requestfinished", lambda one: sizes.append(one.sizes()["responseBodySize"]))
+    page.goto(station.home)
+    expect(page.locator(".map")).not_to_have_count(0)
+    settle(page)
+    assert sum(sizes) <= 400_000
+
+
+def test_labels_and_colours_by_value(station: Any, page: Page, settle: Settle) -> None:
+    page.goto(station.home)
+    settle(page)
+
+    def run(module: str, expression: str, *given: object) -> Any:
+        script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
+        return page.evaluate(script, [f"{station.url}/dashboard/lib/{module}.js", list(given)])
+
+    label = {"x": 50, "y": 50, "width": 30, "height": 20}
+    spots = [[8, -26], [8, 6], [-38, -26], [-38, 6], [8, -48]]
+    assert run("labels", "m.spread(given[0])", [label] * 5) == spots
+    far = {**label, "x": 90}  # its first spot is free again, unless the picture ends before
+    assert run("labels", "m.spread(given[0])", [label, far]) == [[8, -26], [8, -26]]
+    room = {"width": 100, "height": 60}
+    within = run("labels", "m.spread(...given)", [label, far, far], room)
+    assert within == [[8, -26], [-38, -48], None]
+    # a hash modulo six, and the next that is free; the seventh name begins anew
+    names = ["a", "g", "b"]
+    assert run("palette", "[...m.paletteOf(given[0], 6)]", names) == [["a", 1], ["g", 2], ["b", 3]]
+    shown = run("palette", "[...m.robotTokens(given[0])]", ["b", "a", "b"])
+    assert shown == [["a", "--robot-1"], ["b", "--robot-2"]]

@@ -6,16 +6,11 @@ import { confidence, count, ms, shortId, time } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { empty, soon } from "../lib/states.js";
+import { LOST, STATUSES } from "../lib/statuses.js";
 import { rows } from "../operations/poll.js";
 
 export const styles = ["operations/operations.css", "history/queries.css"];
 
-/** What came of a query: the kind of its badge, and its words. */
-export const STATUSES = {
-  found: ["good", "Found"], ambiguous: ["warn", "Ambiguous"], not_found: ["warn", "Not found"],
-  failed: ["bad", "Failed"], unvalidated: ["neutral", "Not validated"],
-};
-export const LOST = ["ambiguous", "not_found", "failed"];
 const CHOICES = [["", "All outcomes"], ["lost", "Without a pose"], ...Object.entries(STATUSES).map(([name, [, text]]) => [name, text])];
 const PERIODS = [["", "Any time"], ["1", "Last hour"], ["24", "Last 24 hours"], ["168", "Last 7 days"]];
 const KEPT = [["", "All queries"], ["true", "Kept answers"]];
@@ -77,7 +72,7 @@ export async function render(root, { params, search, signal, go, title }) {
   const isFiltered = Object.values(asked).some((value) => value !== null);
   put(none, isFiltered
     ? empty({ title: "No queries match", text: "Choose other filters, or none.", actions: h("a", { class: "button", href: link("maps", map, "queries") }, "Show all queries") })
-    : empty({ title: "No queries yet", text: "Each query leaves a record here within a second: who asked, what came of it, and where.", actions: h("a", { class: "button", href: link("maps", map, "query") }, "Run a query") }));
+    : empty({ title: "No queries yet", text: "Each query of a robot leaves a record here within a second: who asked, what came of it, and where." }));
   put(root, h("div", { class: "toolbar spread" },
     h("div", { class: "toolbar", role: "group", "aria-label": "Filters" },
       select("queries-status", "Outcome", CHOICES, asked.status, (status) => to({ status })),

@@ -1,103 +1,121 @@
-// A map as a card: what is in it, what it is signed with, how far its index is.
+// A map as a card: its plan with the robots on it, its last answers, and what is in it.
 import { get } from "../lib/api.js";
 import { h, once, put, svg } from "../lib/dom.js";
-import { bytes, count } from "../lib/format.js";
+import { count, time } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
+import { LOST, STATUSES } from "../lib/statuses.js";
+import { waiting } from "./condition.js";
+import { thumbnail } from "./thumbnail.js";
 
 const PENCIL = "M4 20h4L19 9l-4-4L4 16zM13 7l4 4";
 const BIN = "M5 7h14M10 7V4h4v3M7 7l1 13h8l1-13M10 11v5M14 11v5";
-const REST_MS = 4000; // between two looks at figures that cost the service more than counts
+const ANSWERS = 3;
+/** Queries that the robots on the plan are known by, and how old they may be. */
+const QUERIES = 100, HOUR_MS = 3_600_000;
 
 /** The dialogs, when they are asked for: the first page does without them. */
 export const edit = () => import("./edit.js");
-
-/** Frames of a map that wait for a worker, or are being signed. */
-export function waiting(map) {
-  return (map.frames.received ?? 0) + (map.frames.signing ?? 0);
-}
 
 /**
  * The card of a map.
  * @param {Object<string, any>} map as the API tells it
  * @param {{signal: AbortSignal, changed: () => Promise<void>}} how changed: called after an edit
- * @returns {{element: HTMLElement, map: Object<string, any>, update: (map: any) => void, fill: () => Promise<void>}}
+ * @returns {{element: HTMLElement, map: Object<string, any>, update: (map: any) => void, fill: () => Promise<void>,
+ *   read: () => Promise<void>, draw: () => Promise<void>, answered: (event: Object<string, any>) => void}}
+ *   fill: fetch plan and queries, once; read, draw: fetch the queries or the plan again, if they were fetched;
+ *   answered: a query was answered
  */
 export function mapCard(map, { signal, changed }) {
-  const id = `map-${map.name}`;
+  const id = `map-${map.name}`, { name } = map;
   const parts = {
-    title: h("a", { href: link("maps", map.name, "place") }), name: h("p", { class: "muted mono map-name" }),
+    title: h("a", { href: link("maps", name, "place") }), name: h("p", { class: "muted mono map-name" }),
     number: h("strong", { class: "map-number" }), badges: h("div", { class: "toolbar badges" }),
-    first: h("div", { class: "map-first" }), model: h("dd", { class: "mono" }),
-    index: h("dd", {}, "…"), disk: h("dd", { class: "number" }, "…"),
+    share: h("p", { class: "map-share" }), answers: h("ul", { class: "map-answers", "aria-label": `Last answers of ${name}` }), model: h("p", { class: "map-model muted" }),
   };
-  const tools = may("admin", map.name) && h("div", { class: "map-tools" },
-    tool(PENCIL, `Rename ${map.name}`, async () => (await edit()).retitleMap(card.map, changed)),
-    tool(BIN, `Delete ${map.name}`, async () => (await edit()).deleteMap(card.map, changed)));
-  const element = h("article", { class: "card map", "aria-labelledby": id, dataset: { map: map.name } },
+  const plan = thumbnail(name, signal);
+  const tools = may("admin", name) && h("div", { class: "map-tools" },
+    tool(PENCIL, `Rename ${name}`, async () => (await edit()).retitleMap(card.map, changed)),
+    tool(BIN, `Delete ${name}`, async () => (await edit()).deleteMap(card.map, changed)));
+  const element = h("article", { class: "card map", "aria-labelledby": id, dataset: { map: name } }, plan.element,
     h("div", { class: "map-head" }, h("div", {}, h("h2", { id }, parts.title), parts.name), tools),
-    h("div", { class: "map-figures" },
-      h("a", { class: "map-count", href: link("maps", map.name) }, parts.number, h("span", { class: "muted" }, " indexed frames")), parts.first),
-    parts.badges,
-    h("dl", { class: "map-facts" },
-      h("div", {}, h("dt", {}, "Model"), parts.model),
-      h("div", {}, h("dt", {}, "Index"), parts.index),
-      h("div", {}, h("dt", {}, "Disk"), parts.disk)));
-  /** @type {number | null} */
-  let filled = null; // when the figures were asked for; null: never
-  /** @type {Timer} */
-  let timer = null;
-  let looks = 0;
-  const card = { element, map, update, fill };
+    h("div", { class: "map-figures" }, h("a", { class: "map-count", href: link("maps", name) }, parts.number, h("span", { class: "muted" }, " indexed frames")), parts.badges),
+    h("div", {}, parts.share, parts.answers), parts.model);
+  let isFilled = false;
+  /** @type {Object<string, any>[]} queries of the last hour in the order of time */
+  let records = [];
+  const card = { element, map, update, fill, answered,
+    read: async () => { if (isFilled) await read(); }, draw: async () => { if (isFilled) await plan.load().catch(passed); } };
 
   function update(next) {
-    const moved = next.revision !== card.map.revision;
     card.map = next;
-    draw();
-    if (moved && filled !== null && timer === null) {
-      timer = setTimeout(fill, Math.max(0, filled + REST_MS - Date.now()));
-    }
-  }
-
-  function draw() {
-    const { name, title, frames, model, reencoding, posed_frames, parent_frames } = card.map;
+    const { title, frames, model, reencoding, posed_frames: posed, parent_frames: parents } = next;
     put(parts.title, title ?? name); // the link itself stays, and with it the focus
     put(parts.name, title === null || title === name ? "" : name);
     put(parts.number, count(frames.indexed ?? 0));
     const badges = [
-      badge(name, "neutral", waiting(card.map), "waiting", "received"),
+      badge(name, "neutral", waiting(next), "waiting", "received"),
       badge(name, "bad", frames.failed, "failed", "failed"),
       badge(name, "warn", frames.rejected, "rejected", "rejected"),
       badge(name, "neutral", frames.redundant, "redundant", "redundant"),
-      Boolean(frames.indexed) && posed_frames === 0 && h("span", { class: "badge", dataset: { kind: "warn" }, title: "Queries find frames, and no coordinates. Send `pose` with frames." }, "no poses"),
+      Boolean(frames.indexed) && posed === 0 && h("span", { class: "badge", dataset: { kind: "warn" }, title: "Queries find frames, and no coordinates. Send `pose` with frames." }, "no poses"),
     ].filter(Boolean);
-    put(parts.badges, badges.length ? badges : healthy(frames.indexed), parent_frames > 1 && parted(name, parent_frames));
-    put(parts.model, model, reencoding && progress(reencoding));
+    put(parts.badges, badges, parents > 1 && parted(name, parents));
+    put(parts.model, h("span", { class: "mono" }, model), reencoding && progress(reencoding));
+    plan.say(frames.indexed ? (posed ? "The plan is not built yet" : "No poses, so no plan")
+      : [h("span", {}, "This map is empty"), may("write", name) && h("a", { class: "button", href: link("maps", name, "upload") }, "Upload frames")]);
+    share();
+  }
+
+  function share() {
+    const { recent_queries: counts } = card.map, of = (states) => states.reduce((n, one) => n + (counts[one] ?? 0), 0);
+    const all = of(["found", ...LOST]);
+    put(parts.share, all === 0 ? h("span", { class: "muted" }, "No queries in the last hour")
+      : [h("strong", { class: "number" }, `${Math.floor((100 * of(["found"])) / all)} %`), ` of ${count(all)} ${all === 1 ? "query" : "queries"} found in the last hour`]);
+  }
+
+  function show() {
+    put(parts.answers, records.slice(-ANSWERS).reverse().map((one) => {
+      const [kind, text] = STATUSES[one.status] ?? ["neutral", one.status];
+      return h("li", {}, h("a", { class: "badge", dataset: { kind }, href: one.stored ? link("queries", one.query_id) : link("maps", name, "queries") }, text),
+        h("span", { class: "map-who" }, one.robot ?? h("span", { class: "muted" }, one.key ? `key ${one.key}` : "not named")), h("span", { class: "muted" }, time(one.at)));
+    }));
+    plan.show(records);
   }
 
   async function fill() {
-    filled = Date.now();
-    timer = null;
-    const look = looks += 1;
-    const { name } = card.map;
-    try {
-      const stats = await get("stats", { params: { map: name, minutes: 1 }, signal });
-      if (look !== looks) return; // a newer one is under way, or was faster
-      put(parts.index, lag(stats.indexes.find((one) => one.map === name), stats.frames.indexed ?? 0));
-      const { database, blobs, index } = stats.bytes;
-      put(parts.disk, h("span", { title: `${bytes(database ?? 0)} signatures, ${bytes(blobs)} uploads and geometry, ${bytes(index)} index` },
-        bytes((database ?? 0) + blobs + index)));
-      put(parts.first, !stats.frames.indexed && first(name));
-    } catch (error) {
-      if (error.name === "AbortError" || error.status === 404) return; // left, or removed meanwhile
-      if (error.status === 401) throw error;
-      for (const one of [parts.index, parts.disk]) put(one, h("span", { title: error.message }, "not known"));
-    }
+    isFilled = true;
+    await Promise.all([read(), plan.load().catch(passed)]);
   }
 
-  signal.addEventListener("abort", () => clearTimeout(timer));
-  draw();
+  async function read() {
+    const since = new Date(Date.now() - HOUR_MS).toISOString();
+    const page = await get("queries", { params: { map: name, since, limit: QUERIES }, signal }).catch(passed);
+    if (!page) return;
+    const known = new Set(page.items.map((one) => one.query_id));
+    // an answer that came meanwhile may be in neither
+    records = [...page.items, ...records.filter((one) => !known.has(one.query_id))].sort((a, b) => Date.parse(a.at) - Date.parse(b.at)).slice(-QUERIES);
+    show();
+  }
+
+  /** @param {any} event */
+  function answered({ at, data }) {
+    if (records.some((one) => one.query_id === data.query_id)) return;
+    const { recent_queries: counts } = card.map;
+    counts[data.status] = (counts[data.status] ?? 0) + 1;
+    share();
+    records = [...records, { robot: null, pose: null, key: null, at, stored: data.status !== "failed", ...data }].slice(-QUERIES);
+    if (isFilled) show();
+  }
+
+  update(map);
   return card;
+}
+
+/** A map that was left or removed meanwhile has no plan and no queries. */
+function passed(error) {
+  if (error.status === 401) throw error;
+  return null;
 }
 
 function badge(map, kind, n, text, state) {
@@ -109,28 +127,11 @@ function parted(map, n) {
   return h("a", { class: "badge", dataset: { kind: "neutral" }, href: link("maps", map, "place"), title: "Each answer is in the frame of reference of its matches, until an association joins them." }, `${count(n)} frames of reference`);
 }
 
-function healthy(indexed) {
-  return indexed ? h("span", { class: "badge", dataset: { kind: "good" } }, "Up to date") : h("span", { class: "badge" }, "empty");
-}
-
 function progress({ model, done, left, failed, dead }) {
   const all = done + left + failed + dead;
   const text = `to ${model}: ${count(done)} of ${count(all)}`;
   return h("span", { class: "reencoding" }, text, dead > 0 && h("span", { class: "badge", dataset: { kind: "bad" } }, `${count(dead)} failed`),
     h("progress", { max: Math.max(all, 1), value: done, "aria-label": `Signing again ${text}` }));
-}
-
-/** How far the index is behind; a map may do without one. */
-function lag(index, indexed) {
-  if (!index || index.version === null) {
-    return indexed ? h("span", { title: "A query compares every frame of this map." }, "none needed") : "–";
-  }
-  return `version ${count(index.version)}, ${index.tail ? `${count(index.tail)} behind` : "up to date"}`;
-}
-
-/** How an empty map comes by its first frames. */
-function first(map) {
-  return may("write", map) && h("a", { class: "button", href: link("maps", map, "upload") }, "Upload frames");
 }
 
 function tool(path, label, act) {

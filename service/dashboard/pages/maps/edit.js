@@ -23,7 +23,7 @@ export async function createMap(go, signal) {
   await form({
     title: "New map", action: "Create map",
     children: [
-      field("Name", name, "Lower-case letters, digits, - and _. It is part of every address and cannot be changed."),
+      field("Name", name, "Up to 63 lower-case letters, digits, hyphens and underscores, the first a letter or digit. It is part of every address and cannot be changed."),
       field("Title", title, "Optional display name; you can change it later."),
       h("fieldset", { class: "models" }, h("legend", {}, "Model"), models,
         h("p", { class: "field-error", id: "new-model-error", role: "alert" })),

@@ -1,18 +1,23 @@
-// The maps: a card each, with what is in them; they are made here, and their counts move by events.
+// The fleet: whether all is well, and a card for each map, whose robots and counts move by events.
 import { at, get, watch } from "../lib/api.js";
 import { h, once, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
 import { may, me } from "../lib/session.js";
+import { coded } from "../lib/prose.js";
 import { empty } from "../lib/states.js";
-import { edit, mapCard, waiting } from "./card.js";
+import { edit, mapCard } from "./card.js";
+import { conditionOf } from "./condition.js";
 import { inView } from "./turns.js";
 
 export const styles = ["maps/maps.css"];
 
 const SOON_MS = 600; // events come in bursts: one look is enough for all of them
 const AGAIN_MS = 4000;
+const FAILURES = 50; // jobs that are looked through
 const MANY = 6; // from here on one list costs less than each map for itself
 const FILTER_FROM = 9;
+const RENEW_MS = 60_000; // the last hour moves on without an event
+const DAY_MS = 86_400_000; // a job that failed before is no news
 
 /** See lib/router.js. */
 export async function render(root, { signal, go, title, actions }) {
@@ -21,6 +26,9 @@ export async function render(root, { signal, go, title, actions }) {
   const dirty = new Set();
   const view = inView(signal);
   const summary = h("p", { class: "muted number", id: "summary" });
+  const health = h("p", { class: "fleet-health", role: "status" });
+  /** @type {Object<string, any>[]} */
+  let failures = [];
   const wanted = h("input", { id: "find", type: "search", placeholder: "Find a map", "aria-label": "Find a map", onInput: narrow });
   const grid = h("div", { class: "grid maps" });
   const nothing = h("p", { class: "muted", role: "status" });
@@ -42,7 +50,7 @@ export async function render(root, { signal, go, title, actions }) {
       if (grid.children[i] !== element) grid.insertBefore(element, grid.children[i] ?? null);
     });
     if (items.length === 0) { put(root, begin()); return; }
-    if (!grid.isConnected) put(root, h("div", { class: "toolbar spread" }, summary, wanted), nothing, grid);
+    if (!grid.isConnected) put(root, h("div", { class: "toolbar spread" }, health, summary, wanted), nothing, grid);
     wanted.hidden = items.length < FILTER_FROM;
     narrow();
     sum();
@@ -50,12 +58,12 @@ export async function render(root, { signal, go, title, actions }) {
 
   function sum() {
     const all = [...cards.values()].map((card) => card.map);
-    const of = (state) => all.reduce((n, one) => n + (one.frames[state] ?? 0), 0);
-    const parts = [`${count(all.length)} ${all.length === 1 ? "map" : "maps"}`, `${count(of("indexed"))} frames indexed`];
-    const rest = all.reduce((n, one) => n + waiting(one), 0);
-    if (rest) parts.push(`${count(rest)} waiting`);
-    if (of("failed")) parts.push(`${count(of("failed"))} failed`);
-    put(summary, parts.join(" · "));
+    const indexed = all.reduce((n, one) => n + (one.frames.indexed ?? 0), 0);
+    put(summary, `${count(all.length)} ${all.length === 1 ? "map" : "maps"} · ${count(indexed)} frames indexed`);
+    const { kind, text, href } = conditionOf(all, failures);
+    if (health.dataset.text === text) return; // it is told to screen readers
+    Object.assign(health.dataset, { kind, text });
+    put(health, href ? h("a", { href }, coded(text)) : coded(text));
   }
 
   function narrow() {
@@ -69,7 +77,10 @@ export async function render(root, { signal, go, title, actions }) {
   }
 
   async function reload() {
-    draw((await get(at("maps"), { signal })).items);
+    const [found, ...failed] = await Promise.all([get("maps", { signal }), ...["dead", "failed"].map((state) => get("jobs", { params: { state, limit: FAILURES }, signal }))]);
+    const news = (job) => !job.frame_id && !job.followed_by && Date.now() - Date.parse(job.finished_at) < DAY_MS;
+    failures = failed.flatMap((page) => page.items.filter(news));
+    draw(found.items);
   }
 
   // one look at a time: an older answer must not come after a newer one
@@ -103,8 +114,11 @@ export async function render(root, { signal, go, title, actions }) {
   }
 
   /** @param {any} event */
-  function heard({ kind, map }) {
+  function heard({ kind, map, ...event }) {
     if (signal.aborted) return;
+    if (kind === "query.answered") { cards.get(map)?.answered(event); return; }
+    if (kind === "surface.updated") { cards.get(map)?.draw(); return; }
+    if (kind === "events.missed") for (const one of cards.values()) one.read();
     // of no map, of another set of maps, or of what was missed: look at all
     dirty.add(kind.startsWith("map.") || kind === "events.missed" ? null : map);
     timer ??= setTimeout(look, SOON_MS);
@@ -128,6 +142,7 @@ export async function render(root, { signal, go, title, actions }) {
 
   await reload();
   if (mayMake) actions(button("new-map"));
-  watch({ kinds: ["map.", "frame."], onevent: heard, onstate: begun, signal });
-  signal.addEventListener("abort", () => clearTimeout(timer));
+  watch({ kinds: ["map.", "frame.", "query.answered", "surface.updated"], onevent: heard, onstate: begun, signal });
+  const renewal = setInterval(() => { dirty.add(null); timer ??= setTimeout(look, 0); }, RENEW_MS);
+  signal.addEventListener("abort", () => { clearTimeout(timer); clearInterval(renewal); });
 }

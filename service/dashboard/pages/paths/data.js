@@ -1,6 +1,7 @@
 // What the API knows of the paths of a map, a part of it at a time: never a full list of frames.
 
 import { at, get } from "../lib/api.js";
+import { paletteOf } from "../lib/palette.js";
 import { ofQuaternion } from "../viewer/matrix.js";
 
 /** Runs that are told of at most, and drawn in one picture; poses of all of them together. */
@@ -52,21 +53,12 @@ export function runsOf(sessions) {
   return { runs, without };
 }
 
-/**
- * Give each run a colour that stays when other sessions come: by its name, and where that is taken the next; those
- * that began first choose first. @param {Run[]} runs changed in place
- */
+/** Give each run a colour; those that began first choose first. @param {Run[]} runs changed in place */
 function colourRuns(runs) {
-  const taken = new Set(), name = (one) => JSON.stringify([one.session, one.robot, one.parent]);
+  const name = (one) => JSON.stringify([one.session, one.robot, one.parent]);
   const order = (a, b) => (a.first ?? "~").localeCompare(b.first ?? "~") || name(a).localeCompare(name(b));
-  for (const one of runs.toSorted(order)) {
-    let hash = 0;
-    for (const letter of name(one)) hash = (31 * hash + letter.charCodeAt(0)) % 65521;
-    one.colour = hash % COLOURS;
-    while (taken.has(one.colour)) one.colour = (one.colour + 1) % COLOURS;
-    taken.add(one.colour);
-    if (taken.size === COLOURS) taken.clear();
-  }
+  const colours = paletteOf(runs.toSorted(order).map(name), COLOURS);
+  for (const one of runs) one.colour = colours.get(name(one)) ?? 0;
 }
 
 /** All sessions, up to MOST_RUNS. @returns {Promise<{items: Object<string, any>[], more: boolean}>} */

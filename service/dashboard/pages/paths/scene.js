@@ -2,6 +2,7 @@
 
 import { h, put } from "../lib/dom.js";
 import { metres } from "../lib/format.js";
+import { spread } from "../lib/labels.js";
 import { letterOf } from "../query/alternatives.js";
 import { Orbit, VIEW } from "../viewer/camera.js";
 import { around } from "../viewer/layers.js";
@@ -32,7 +33,10 @@ export const tokenOf = (colour) => `--path-${colour}`;
 export const runToken = (run) => tokenOf(run.colour);
 
 /** The same as the theme has it now: red, green, blue. @param {import("./data.js").Run} run */
-export const tintOf = (run) => rgb(getComputedStyle(document.documentElement).getPropertyValue(runToken(run)));
+export const tintOf = (run) => colourOf(runToken(run));
+
+/** A token's colour as the theme has it now. @param {string} token @returns {number[]} red, green, blue */
+const colourOf = (token) => rgb(getComputedStyle(document.documentElement).getPropertyValue(token));
 
 /**
  * @param {HTMLElement} place where the canvas goes
@@ -163,17 +167,17 @@ export class Scene {
   /**
    * Sensors at poses of the picture's frame, such as of robots.
    * @param {string} id of the layer
-   * @param {{pose: number[], camera: any, trail?: number[][]}[]} ones camera: null of a cloud's
-   *   sensor; trail: poses before it
-   * @param {string} tint
+   * @param {{pose: number[], camera: any, token: string, trail?: number[][]}[]} ones camera: null of a
+   *   cloud's sensor; token: of its colour; trail: poses before it
    */
-  sensors(id, ones, tint) {
+  sensors(id, ones) {
     const size = 2 * this.#size;
     const shapes = ones.map(({ pose, camera }) => copies(sensor(camera, size), [this.moveOrigin(pose)]));
     const trails = ones.map(({ trail = [] }) => polyline(trail.map((pose) => this.near(placeOf(pose)))));
-    const joined = (parts) => Float32Array.from(parts.flatMap((one) => [...one]));
-    this.#viewer.lines(id, { positions: joined(shapes), tint, width: 3 });
-    this.#viewer.lines(`${id} trails`, { positions: joined(trails), tint, width: 1.5 });
+    const joined = (parts) => ({ positions: Float32Array.from(parts.flatMap((one) => [...one])),
+      colours: parts.flatMap((one, i) => { const tint = colourOf(ones[i].token); return Array.from(one, (_, k) => tint[k % 3]); }) });
+    this.#viewer.lines(id, { ...joined(shapes), width: 3 });
+    this.#viewer.lines(`${id} trails`, { ...joined(trails), width: 1.5 });
   }
 
   /** Which runs are not drawn, by their place. @param {Set<number>} hidden */
@@ -327,8 +331,10 @@ export class Scene {
       const { path, place } = this.#selected;
       made.push({ at: this.near(placeOf(this.#drawn[path].world[place])), node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Chosen") });
     }
-    this.#labels = [...made, ...[...this.#marks.values()].flat()];
+    this.#labels = [...[...this.#marks.values()].flat(), ...made]; // the first have the first choice of a place
     put(this.#parts.labels, this.#labels.map((one) => one.node));
+    for (const { node } of this.#labels) node.hidden = false; // what is hidden has no size
+    for (const one of this.#labels) one.size = { width: one.node.offsetWidth, height: one.node.offsetHeight };
     this.#moved();
   }
 
@@ -341,11 +347,20 @@ export class Scene {
     const length = nice(60 / perMetre);
     this.#parts.bar.style.setProperty("width", `${length * perMetre}px`);
     put(this.#parts.scaleText, metres(length));
-    for (const { path, at, node } of this.#labels) {
-      const seen = this.#hidden.has(path) ? null : this.#viewer.project(at);
-      node.hidden = seen === null || seen[0] < 0 || seen[1] < 0 || seen[0] > this.canvas.clientWidth || seen[1] > height;
-      if (!node.hidden) node.style.setProperty("transform", `translate(${seen[0].toFixed(1)}px, ${seen[1].toFixed(1)}px)`);
-    }
+    const seen = this.#labels.map(({ path, at }) => {
+      const place = this.#hidden.has(path) ? null : this.#viewer.project(at);
+      return place === null || place[0] < 0 || place[1] < 0 || place[0] > this.canvas.clientWidth || place[1] > height ? null : place;
+    });
+    const shown = this.#labels.flatMap((one, i) => (seen[i] ? [{ node: one.node, ...one.size, x: seen[i][0], y: seen[i][1] }] : []));
+    for (const { node } of this.#labels) node.hidden = true;
+    spread(shown).forEach((spot, i) => {
+      const { node, x, y } = shown[i];
+      node.hidden = spot === null;
+      if (spot === null) return;
+      node.style.setProperty("transform", `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`);
+      node.style.setProperty("left", `${spot[0]}px`);
+      node.style.setProperty("top", `${spot[1]}px`);
+    });
   }
 }
 

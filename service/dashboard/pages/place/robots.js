@@ -5,8 +5,9 @@ import { get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, time } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
+import { robotTokens } from "../lib/palette.js";
 import { link } from "../lib/router.js";
-import { LOST, STATUSES } from "../history/queries.js";
+import { LOST, STATUSES } from "../lib/statuses.js";
 import { placeOf } from "../paths/shapes.js";
 import { multiply, ofQuaternion } from "../viewer/matrix.js";
 
@@ -95,6 +96,7 @@ export class Robots {
     /** @type {string | null} the time that is shown; null: the latest */
     this.at = when("at");
     this.#build();
+    window.addEventListener("sceneprint:theme", () => this.draw(), { signal });
     signal.addEventListener("abort", () => { clearTimeout(this.#player); clearTimeout(this.#waiting); }, { once: true });
   }
 
@@ -156,11 +158,14 @@ export class Robots {
   /** Draw it as the picture is now. */
   draw() {
     const shown = this.#shown, all = this.#records.length;
+    /** @type {any[]} */
     const robots = robotsOf(this.#records.slice(0, shown)).slice(0, MOST_ROBOTS);
     this.#controls(shown, all);
     this.none.hidden = robots.length > 0;
     put(this.none, this.since || this.until ? "No queries in this period." : "No robot has queried this map yet: the position of each will show here.");
     const held = this.list.contains(document.activeElement) ? document.activeElement?.getAttribute("aria-label") : null;
+    const tokens = robotTokens(robotsOf(this.#records).map((one) => one.name)); // those of all times: none changes its colour
+    for (const one of robots) one.token = tokens.get(one.name);
     put(this.list, robots.map((one) => this.#row(one)));
     if (held) [...this.list.querySelectorAll("[aria-label]")].find((one) => one.getAttribute("aria-label") === held)?.focus();
     this.#marks(robots);
@@ -184,12 +189,12 @@ export class Robots {
       .map(([value, name]) => h("option", { value, selected: value === (chosen ? "chosen" : "") }, name)));
   }
 
-  #row({ name, last, found, lost }) {
+  #row({ name, token, last, found, lost }) {
     const [kind, word] = STATUSES[last.status] ?? ["neutral", last.status];
     const pose = found && this.#pose(found);
     const failures = lost.slice(-MOST_FAILURES).reverse();
     return h("li", { dataset: { robot: name } },
-      h("div", { class: "paths-row" }, h("strong", { class: "paths-name" }, name), h("span", { class: "badge", dataset: { kind } }, word)),
+      h("div", { class: "paths-row" }, h("span", { class: "place-robot", style: { "--robot": `var(${token})` } }), h("strong", { class: "paths-name" }, name), h("span", { class: "badge", dataset: { kind } }, word)),
       h("span", { class: "muted" }, time(last.at), found && found !== last && [", found ", time(found.at)]),
       h("span", { class: "muted number" }, where(found)),
       LOST.includes(last.status) && h("p", {}, coded(sentence(last.reason))),
@@ -216,22 +221,19 @@ export class Robots {
       const pose = one.found && this.#pose(one.found);
       if (pose) {
         const trail = [...one.trail.slice(-TRAIL), one.found].map((record) => this.#pose(record)).filter((p) => p !== null);
-        drawn.push({ pose, camera: one.found.kind === "cloud" ? null : camera, trail });
-        marks.push({ at: placeOf(pose), node: h("a", { class: "paths-label", tabindex: -1, dataset: { kind: "robot" }, href: linkOf(one.found, this.map) }, one.name) });
+        drawn.push({ pose, token: one.token, camera: one.found.kind === "cloud" ? null : camera, trail });
+        marks.push({ at: placeOf(pose), node: h("a", { class: "paths-label", tabindex: -1, dataset: { kind: "robot" }, style: { "--robot": `var(${one.token})` }, href: linkOf(one.found, this.map) }, one.name) });
       }
     }
     const lost = robots.flatMap((one) => one.lost.map((each) => ({ ...each, name: one.name }))).filter((one) => one.near && this.#pose(one.near));
-    const perSpot = new Map(); // one robot's failures are at one spot: side by side
     for (const { record, near, name } of lost.slice(-MOST_MARKS)) {
-      const turn = perSpot.get(near) ?? 0;
-      perSpot.set(near, turn + 1);
       const [kind, word] = STATUSES[record.status];
       marks.push({ at: placeOf(/** @type {number[]} */ (this.#pose(near))), node: h("a", {
-        class: "paths-label", tabindex: -1, dataset: { kind: "lost", status: kind, turn: String(Math.min(turn, 7)) }, href: linkOf(record, this.map),
+        class: "paths-label", tabindex: -1, dataset: { kind: "lost", status: kind }, href: linkOf(record, this.map),
         title: `${name}: ${word.toLowerCase()}, ${exact(record.at)}`,
       }, record.status === "ambiguous" ? "?" : "!") });
     }
-    this.scene.sensors("robots", drawn, "query");
+    this.scene.sensors("robots", drawn);
     this.scene.mark("robots", marks);
   }
 

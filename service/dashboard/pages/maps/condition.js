@@ -1,0 +1,40 @@
+// The state of all maps in one sentence, and where to see what is wrong.
+import { count } from "../lib/format.js";
+import { link } from "../lib/router.js";
+
+/** Frames of a map that wait for a worker, or are being signed. @param {Object<string, any>} map */
+export function waiting(map) {
+  return (map.frames.received ?? 0) + (map.frames.signing ?? 0) + (map.reencoding?.left ?? 0);
+}
+
+/**
+ * @param {Object<string, any>[]} maps
+ * @param {Object<string, any>[]} jobs that failed, other than those that sign frames
+ * @returns {{kind: "good" | "bad" | "neutral", text: string, href: string | null}} href: of what failed
+ */
+export function conditionOf(maps, jobs) {
+  const failed = maps.filter((one) => lost(one) > 0), frames = failed.reduce((n, one) => n + lost(one), 0);
+  const left = maps.reduce((n, one) => n + waiting(one), 0);
+  const queue = left === 0 ? "nothing waits" : `${things(left, "frame").toLowerCase()} ${left === 1 ? "waits" : "wait"}`;
+  if (frames > 0) {
+    const [{ name }] = failed, many = failed.length > 1;
+    return { kind: "bad", text: `${things(frames, "frame")} of ${many ? `${failed.length} maps` : `\`${name}\``} failed permanently; ${queue}.`,
+      href: many ? link("operations", { tab: "jobs", state: "dead" }) : link("maps", name, { state: "failed" }) };
+  }
+  if (jobs.length > 0) {
+    const [{ kind, map, job_id: id }] = jobs, many = jobs.length > 1;
+    return { kind: "bad", text: many ? `${things(jobs.length, "job")} failed; ${queue}.` : `The \`${kind}\` job of \`${map}\` failed; ${queue}.`,
+      href: many ? link("operations", { tab: "jobs", state: "dead" }) : link("operations", "jobs", id) };
+  }
+  if (left > 0) return { kind: "neutral", text: `${things(left, "frame")} ${left === 1 ? "waits" : "wait"} for a signature; no job failed.`, href: null };
+  return { kind: "good", text: "Everything is signed; no job failed.", href: null };
+}
+
+/** Frames of a map that have no signature for good. @param {Object<string, any>} map */
+function lost(map) {
+  return (map.frames.failed ?? 0) + (map.reencoding?.dead ?? 0);
+}
+
+function things(n, name) {
+  return n === 1 ? `One ${name}` : `${count(n)} ${name}s`;
+}
