@@ -195,12 +195,32 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
         assert item["place"].endswith(" from A") == (i > 0)
         support = told["support"]
         supported = f"{support} match{'es' if support > 1 else ''}" if support else "the map alone"
-        sure = told["confidence"]
-        assert item["figures"] == [f"{math.floor(1000 * sure) / 10:.1f} %", supported]
+        sure, score = told["confidence"], told["evidence"]["score"]
+        assert item["figures"] == [
+            f"{math.floor(1000 * sure) / 10:.1f} %", f"{100 * score:.0f} %", supported
+        ]  # fmt: skip
         assert [float(one.removesuffix("%")) for one in item["bars"]] == [
-            pytest.approx(100 * sure, abs=0.1)
-        ]
+            pytest.approx(100 * sure, abs=0.1), pytest.approx(100 * score, abs=0.1)
+        ]  # fmt: skip
         assert " of the map agree, " in item["why"]
+    # beside each pose is the frame that was taken nearest to it, as the plan has its letter
+    poses = station.client.get("/v1/maps/four-sides/frames", params={"limit": 100}).json()["items"]
+    views = page.locator(".alternatives-view a").evaluate_all(
+        "all => all.map(one => one.getAttribute('href').split('/').at(-1))"
+    )
+    for view, told in zip(views, several, strict=True):
+        own = np.array(told["pose"]["matrix"])
+
+        def apart(frame, own=own):
+            pose = np.array(frame["pose"]["matrix"])
+            turn = np.arccos(np.clip((np.trace(pose[:3, :3].T @ own[:3, :3]) - 1) / 2, -1, 1))
+            return np.linalg.norm(pose[:3, 3] - own[:3, 3]) + np.degrees(turn) / 45
+
+        assert view == min(poses, key=apart)["frame_id"]
+    told = page.locator(".plan .query-spot-sure").all_text_contents()
+    assert told == [item["figures"][0] for item in items]
+    fit = several[1]["evidence"]["score"] / several[0]["evidence"]["score"]
+    assert f"from A, fits {100 * fit:.0f} % as well" in said
     # each match stands with the pose that it votes for
     votes = page.locator("[data-row=VDR] .query-vote").all_inner_texts()
     support = {f"for pose {'ABCDE'[i]}": one["support"] for i, one in enumerate(several)}
@@ -347,6 +367,7 @@ def test_a_control_asks_again(station, page, ask, settle):
     first = ask()
     sent = []
     page.on("request", lambda one: one.method == "POST" and sent.append(one))
+    page.locator(".query-panel > summary").click()
     page.locator(".query-group > summary", has_text="Validation").click()
     field = page.locator("#ask-residual_m")
     assert field.input_value() == "0.08"  # the default of the map's model
@@ -462,6 +483,7 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
     first = shown(station, page)
     assert first["frame"] is None
     assert first["matches"][0]["frame_id"] == frame.frame_id  # it finds itself in the map
+    page.locator(".query-panel > summary").click()
     page.locator("#ask-k").fill("1")
     page.locator("#ask-k").press("Enter")
     page.wait_for_timeout(400)

@@ -6,7 +6,7 @@ import { keepPresses } from "./lib/press.js";
 import { go, parse } from "./lib/router.js";
 import { doubt, identify, may } from "./lib/session.js";
 import { empty, failed, gone, soon, toast } from "./lib/states.js";
-import { drawHead, drawRail, setTitle } from "./lib/shell.js";
+import { drawCrumbs, drawHead, drawRail, setTitle } from "./lib/shell.js";
 
 const PAGES = new URL("./", import.meta.url);
 const LATE_MS = 2500;
@@ -42,8 +42,8 @@ async function show() {
   const came = soon(root);
   try {
     if (route === null) {
-      const home = h("a", { class: "button", href: "#/" }, "To the maps");
-      put(root, empty({ title: "Page not found", text: "There is no page at this address.", actions: home }));
+      const back = h("a", { class: "button", href: "#/" }, "To the maps");
+      put(root, empty({ title: "Page not found", text: "There is no page at this address.", actions: back }));
       return;
     }
     const [page] = await Promise.all([import(new URL(route.page, PAGES).href).catch(unloaded), identify(get)]);
@@ -54,7 +54,8 @@ async function show() {
     for (const link of sheets.values()) if (link.sheet) link.sheet.disabled = !styles.includes(link);
     const actions = (...nodes) => { if (!signal.aborted) put(document.getElementById("actions"), nodes); };
     const title = (text) => { if (!signal.aborted) setTitle(text); };
-    await page.render(root, { params, search, signal, go, title, actions });
+    const home = (map) => { if (!signal.aborted) drawCrumbs(route, { ...params, map }); };
+    await page.render(root, { params, search, signal, go, title, actions, home });
   } catch (error) {
     if (!signal.aborted && error.name !== "AbortError") await fault(root, error, signal);
   } finally {

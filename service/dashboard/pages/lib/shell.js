@@ -20,19 +20,29 @@ export function setTitle(text) {
   put(document.getElementById("title"), text);
 }
 
-/** Title, breadcrumbs and tabs of a route. */
-export function drawHead(route, params) {
-  const { map, query, frame } = params;
-  setTitle(route?.title ?? "Not found");
-  put(document.getElementById("actions"));
+/**
+ * What leads to a page.
+ * @param {any} route
+ * @param {Object<string, string>} params `map` of an answer is known once that has come
+ */
+export function drawCrumbs(route, { map, query, frame }) {
   const crumbs = [];
   if (route?.area === "maps" && route.path !== "") crumbs.push(["Maps", "#/"]);
   if (map && route.section !== "place") crumbs.push([map, link("maps", map, "place")]);
+  if (query && map) crumbs.push(["Queries", link("maps", map, "queries")]);
   if (query && frame) crumbs.push(["Answer", link("queries", query)]);
   if (route?.path === "operations/jobs/:job") crumbs.push(["Operations", "#/operations"]);
   const items = crumbs.map(([text, href]) => h("li", {}, h("a", { href }, text)));
   if (crumbs.length) items.push(h("li", { "aria-current": "page" }, map && route.section === "place" ? map : route.title));
   put(document.getElementById("crumbs"), h("ol", {}, items));
+}
+
+/** Title, breadcrumbs and tabs of a route. */
+export function drawHead(route, params) {
+  const { map } = params;
+  setTitle(route?.title ?? "Not found");
+  put(document.getElementById("actions"));
+  drawCrumbs(route, params);
   const tabs = document.getElementById("tabs");
   tabs.hidden = !route?.section;
   put(tabs, route?.section && TABS.map(([section, text]) => {

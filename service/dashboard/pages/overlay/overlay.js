@@ -12,7 +12,7 @@ export const styles = ["overlay/overlay.css"];
 
 /** @param {HTMLElement} root @param {Object<string, any>} context of the router */
 export async function render(root, context) {
-  const { params, search, signal, title } = context;
+  const { params, search, signal, title, home } = context;
   const query = at("queries", params.query), map = search.get("map") ?? undefined;
   title(`Overlay of ${shortId(params.frame)}`);
   const { match, details: detailsOf, points: load, frame } = overlayParts(params.query, params.frame, map, signal);
@@ -34,6 +34,7 @@ export async function render(root, context) {
     put(root, why);
     return;
   }
+  home(map ?? told.answer.maps[0]);
   title(`Overlay of ${frameLabel(told.details)}`);
   if (!signal.aborted) told.show(root, context, { ...told, query, match, map, load });
 }

@@ -1,6 +1,6 @@
 // The poses of an ambiguous answer: of one rank, each with what speaks for it; none is the answer.
 import { h } from "../lib/dom.js";
-import { confidence, count, degrees, metres } from "../lib/format.js";
+import { confidence, count, degrees, metres, percent } from "../lib/format.js";
 import { apart } from "../overlay/words.js";
 import { evidenceOf, number } from "./words.js";
 
@@ -29,25 +29,27 @@ export function voteOf({ location, alternatives }, { pose_in_map: own, validatio
 /**
  * The list, for a wide card and a narrow one.
  * @param {Object<string, any>[]} alternatives of an answer
+ * @param {(i: number) => any} [view] of the map near an alternative
  * @returns {HTMLElement}
  */
-export function alternativesList(alternatives) {
+export function alternativesList(alternatives, view = () => null) {
   const [first] = alternatives;
   return h("div", { class: "alternatives" },
     h("p", { class: "muted" }, "In ", h("span", { class: "mono" }, first.pose.parent_frame), ", metres. At most one is right."),
-    h("ol", { "aria-label": "Alternatives" }, alternatives.map((one, i) => alternative(one, i, first))));
+    h("ol", { "aria-label": "Alternatives" }, alternatives.map((one, i) => alternative(one, i, first, view(i)))));
 }
 
-/** @param {Object<string, any>} one @param {number} i @param {Object<string, any>} first */
-function alternative(one, i, first) {
-  const { pose, confidence: sure, support } = one;
+/** @param {Object<string, any>} one @param {number} i @param {Object<string, any>} first @param {any} view */
+function alternative(one, i, first, view) {
+  const { pose, confidence: sure, support, evidence } = one;
   const { x, y, z } = pose.translation, away = apart(pose, first.pose);
-  return h("li", {},
+  return h("li", {}, view,
     h("span", { class: "alternatives-letter" }, letterOf(i)),
     h("span", { class: "alternatives-place number" }, `x ${number(x)}, y ${number(y)}, z ${number(z)}`,
       i > 0 && h("span", { class: "muted" }, ` · ${metres(away.metres)}, ${degrees(away.degrees)} from A`)),
     h("dl", {},
       figure("Confidence", confidence(sure), sure),
+      evidence && figure("Score", percent(evidence.score), evidence.score),
       figure("Support", support === 0 ? "the map alone" : `${count(support)} ${support === 1 ? "match" : "matches"}`)),
     h("p", { class: "alternatives-why muted" }, evidenceOf(one)));
 }

@@ -10,11 +10,12 @@ import { pickFrame } from "./picker.js";
 import { recall } from "./recent.js";
 import { again, showAnswer } from "./result.js";
 import { thumbs } from "./thumbs.js";
+import { mapOf } from "./words.js";
 
 export const styles = ["query/query.css", "query/alternatives.css", "plan/plan.css"];
 
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
-export async function render(root, { params, search, signal, go, title, actions }) {
+export async function render(root, { params, search, signal, go, title, actions, home }) {
   title(`Answer ${shortId(params.query)}`);
   const come = soon(root, "Loading the answer");
   let answer;
@@ -29,6 +30,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     return;
   }
   come();
+  home(mapOf(answer));
   const other = again(answer, "Query with other options");
   other.className = "button primary";
   actions(other);

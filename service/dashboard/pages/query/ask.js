@@ -88,7 +88,7 @@ class Page {
     several.value = this.maps === "*" ? "*" : this.maps.join();
     const more = Object.keys(this.rest);
     put(this.root, h("div", { class: "query-page" },
-      h("details", { class: "card query-panel", open: innerWidth >= 1000 }, h("summary", {}, h("h2", {}, "Options")),
+      h("details", { class: "card query-panel", open: Object.values(this.said).some((value) => value !== null) }, h("summary", {}, h("h2", {}, "Options")),
         h("div", { class: "field query-field" }, h("label", { for: "ask-maps" }, "Maps"), several,
           h("small", { class: "muted" }, "Several maps give one ranking; they must use the same model.")),
         more.length > 0 && h("p", { class: "muted" }, `The filter also contains ${more.join(", ")}, from the original query.`),
@@ -96,8 +96,7 @@ class Page {
       this.state, h("div", { class: "query-main" }, this.chooser, this.result)));
     if (this.lost !== null) this.say(`Answer ${shortId(this.lost)} has expired. Pick a frame, or drop the file again.`);
     this.chooser.tell(this.source);
-    // what an address asks was asked before: to look at it once more is no query of anybody's
-    if (this.source) this.run({ record: false }); else this.nothing();
+    if (this.source) this.run(); else this.nothing();
   }
 
   nothing() {
@@ -133,7 +132,7 @@ class Page {
   }
 
   /** Ask as things are now; an answer that has not come by then is not waited for. */
-  async run({ record = true } = {}) {
+  async run() {
     clearTimeout(this.timer);
     this.running?.abort();
     if (this.signal.aborted) return;
@@ -145,7 +144,7 @@ class Page {
     if (this.answer === null) put(this.result, loading("Asking"));
     const source = /** @type {import("./asking.js").Source} */ (this.source);
     try {
-      const options = { ...toOptions(this.said, this.rest), explain: true, explain_frame: this.why, record: record ? null : false };
+      const options = { ...toOptions(this.said, this.rest), explain: true, explain_frame: this.why, record: false }; // no robot asks
       const answer = await this.answered(source, options, signal);
       remember(answer.query_id, this.follow(answer));
       this.panel.refuse([]);
@@ -168,12 +167,12 @@ class Page {
       if (error.status === 401) throw error;
       this.say("");
       if (error.status === 0) {
-        put(this.result, gone(() => this.run({ record }), signal));
+        put(this.result, gone(() => this.run(), signal));
         return;
       }
       this.panel.refuse(error.errors ?? []);
       this.answer = null;
-      put(this.result, failed(error, () => this.run({ record })));
+      put(this.result, failed(error, () => this.run()));
     } finally {
       if (this.running === own) this.result.setAttribute("aria-busy", "false");
     }

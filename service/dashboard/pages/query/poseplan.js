@@ -1,17 +1,19 @@
 // Where the answer lies: its pose with heading and uncertainty, alternatives and voting matches,
 // on a plan of the map.
 import { h, put, svg } from "../lib/dom.js";
-import { count, degrees, metres } from "../lib/format.js";
+import { confidence, count, degrees, metres } from "../lib/format.js";
+import { spread } from "../lib/labels.js";
 import { coded } from "../lib/prose.js";
 import { axesFor, ellipseOf, flat, nameOf, uprightOf } from "../plan/axes.js";
 import { cornersOf, drawBackdrop } from "../plan/backdrop.js";
 import { Plan } from "../plan/plan.js";
 import { inverseRigid, multiply, ofRows } from "../viewer/matrix.js";
-import { alternativesList, letterOf } from "./alternatives.js";
-import { keyOf, mapOf } from "./words.js";
+import { letterOf } from "./alternatives.js";
+import { keyOf, mapOf, parentOf } from "./words.js";
 
 const ARROW = "M0 -10L7 8L0 4L-7 8Z", SMALL = "M0 -7L5 6L0 3L-5 6Z";
 const REACH_PX = 14; // of a click, about a match
+const SURE_PX = { width: 44, height: 12 }; // of a confidence on the plan
 const LEVEL = 0.2; // of a direction that lies in the plan: less is no heading
 
 /**
@@ -27,7 +29,7 @@ const LEVEL = 0.2; // of a direction that lies in the plan: less is no heading
 export function posePlan(answer, { backdrops, choice, signal }) {
   const body = h("div", { class: "query-plan-body" });
   const element = h("section", { class: "card query-plan", "aria-labelledby": "query-plan-title" },
-    h("h2", { id: "query-plan-title" }, "On the plan"), body, answer.alternatives.length > 0 && alternativesList(answer.alternatives));
+    h("h2", { id: "query-plan-title" }, "On the plan"), body);
   const ready = backdrops(mapOf(answer), parentOf(answer)).then((backdrop) => {
     if (!signal.aborted) draw(body, answer, backdrop, choice, signal);
   }, (error) => {
@@ -36,11 +38,6 @@ export function posePlan(answer, { backdrops, choice, signal }) {
     put(body, h("p", { class: "muted" }, coded(`The plan could not be loaded: ${error.message}`)));
   });
   return Object.assign(element, { ready });
-}
-
-/** The parent frame that the poses of an answer lie in; null without any. @param {Object<string, any>} answer */
-function parentOf({ location, alternatives, matches }) {
-  return (location ?? alternatives[0])?.pose.parent_frame ?? matches.find((one) => one.pose_in_map)?.pose_in_map.parent_frame ?? null;
 }
 
 function draw(body, answer, backdrop, choice, signal) {
@@ -87,7 +84,7 @@ function spotsOf(answer, axes, backdrop, parent) {
     return [{ key: keyOf(match), votes: Boolean(votes), voted, ...spotOf(pose, axes, isCloud) }];
   });
   const taken = answer.frame?.map === map ? known.get(answer.frame.frame_id) : undefined; // by a stored frame's own pose
-  return { frames, taken: taken ? spotOf(taken, axes, isCloud) : null, poses: own.map((one) => spotOf(ofRows(one.pose.matrix), axes, isCloud)) };
+  return { frames, taken: taken ? spotOf(taken, axes, isCloud) : null, poses: own.map((one) => ({ sure: one.confidence, ...spotOf(ofRows(one.pose.matrix), axes, isCloud) })) };
 }
 
 /** @param {number[]} m a pose, 16 column-major @param {import("../plan/axes.js").Axes} axes @param {boolean} isCloud @returns {Spot} */
@@ -122,6 +119,10 @@ function marks(plan, answer, axes, { frames, poses, taken }, choice) {
       one.heading !== null && svg("path", { d: "M0 -11V-19", transform: turned(px, py, one.heading) }),
       svg("circle", { cx: px, cy: py, r: 11 }), svg("text", { x: px, y: py + 4, "text-anchor": "middle" }, letterOf(i)));
   }));
+  plan.mark("confidence", ({ x, y }) => {
+    const told = poses.filter((one) => one.sure !== null).map((one) => ({ text: confidence(one.sure), x: x(one.at[0]), y: y(one.at[1]) }));
+    return spread(told.map((one) => ({ ...one, ...SURE_PX }))).map((spot, i) => spot && svg("text", { class: "query-spot-sure", x: told[i].x + spot[0], y: told[i].y + spot[1] + SURE_PX.height }, told[i].text));
+  });
   choice.hear((key) => { looked = key; plan.redraw(); });
 }
 

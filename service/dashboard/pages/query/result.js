@@ -9,6 +9,7 @@ import { failed, loading } from "../lib/states.js";
 import { choice } from "./choice.js";
 import { funnel } from "./funnel.js";
 import { overlayInset } from "./inset.js";
+import { placesPanel } from "./places.js";
 import { posePlan } from "./poseplan.js";
 import { keepPanel } from "./keep.js";
 import { reconstructionPanel } from "./reconstruction.js";
@@ -47,6 +48,7 @@ export async function showAnswer(root, answer, how) {
   const inset = overlayInset(answer, { pictures, choice: looked, signal, wanted: seen.match, onshow: (key) => { seen.match = key; onseen(seen); } });
   const why = reasons(answer, { ...how, seen, onseen, signal }, looked);
   put(root, lead(answer, before, isOwnPage), keepPanel(answer, signal), h("div", { class: "query-views" }, plan, inset),
+    placesPanel(answer, { backdrops: how.backdrops, pictures, signal }),
     reconstructionPanel(answer, signal), why);
   if (chosen !== null) looked.choose(chosen);
   await why.ready;

@@ -45,6 +45,11 @@ export function mapOf({ location, alternatives, maps }) {
   return location?.map ?? alternatives[0]?.map ?? maps[0];
 }
 
+/** The parent frame that the poses of an answer lie in; null without any. @param {Object<string, any>} answer */
+export function parentOf({ location, alternatives, matches }) {
+  return (location ?? alternatives[0])?.pose.parent_frame ?? matches.find((one) => one.pose_in_map)?.pose_in_map.parent_frame ?? null;
+}
+
 /**
  * The verdict of an answer.
  * @param {Object<string, any>} answer
@@ -60,10 +65,17 @@ export function verdict(answer) {
     const these = length === 0 ? "" : length === 1 ? "Do not act on this pose. " : "Do not act on any of these poses. ";
     return { ...told, kind: "warn", title: titled("Ambiguous", best, length > 1 ? "best pose " : ""), text: why,
       next: `${these}Move on and query again, or query with a prior.`,
-      details: [`${count(answer.counts.accepted)} of ${count(answer.counts.validated)} validated frames accepted`] };
+      details: [...rivalry(answer.alternatives), `${count(answer.counts.accepted)} of ${count(answer.counts.validated)} validated frames accepted`] };
   }
   if (answer.status === "unvalidated") return { ...told, ...unvalidated(answer), kind: "neutral", title: "Not validated" };
   return { ...told, kind: "bad", title: "Not found", cause: CAUSES[answer.cause] ?? null, text: why, details: reasons(answer.matches) };
+}
+
+/** How well the second place of an ambiguous answer fits. @param {Object<string, any>[]} alternatives @returns {string[]} */
+function rivalry([a, b]) {
+  if (!a?.evidence || !b?.evidence || a.evidence.score <= 0) return [];
+  const [p, q] = [a, b].map((one) => one.pose.translation);
+  return [`pose B, ${metres(Math.hypot(p.x - q.x, p.y - q.y, p.z - q.z))} from A, fits ${percent(b.evidence.score / a.evidence.score)} as well`];
 }
 
 /** A verdict with the confidence of a pose. @param {string} word @param {Object<string, any> | null | undefined} place */
