@@ -122,8 +122,8 @@ async def get_patches(map_name: str, frame_id: str, request: Request, here: Here
     ),
 )
 async def get_signature(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
-    """Return the signature of a frame. The distance between two signatures of the same model is the
-    sum of the absolute differences of their bytes.
+    """Return the signature of a frame. The distance between two signatures of a model is the
+    squared Euclidean distance of their bytes, or the L1 distance for models that store psi.
     """
     outputs, kind = here.outputs, preferred_media_type(request, (JSON, BYTES, NPY))
     if kind == JSON:
