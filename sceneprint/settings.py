@@ -172,11 +172,6 @@ class Settings(BaseSettings):
         "According to your recordings.",
         default=4 << 30, ge=1024,
     )  # fmt: skip
-    body_timeout_s: float = _setting(
-        "Maximum time in which a small body must arrive, seconds; each MiB adds 4 s.",
-        "Longer for very slow connections.",
-        default=30.0, ge=1, le=3600,
-    )  # fmt: skip
     tenant_requests_per_s: float = _setting(
         "Maximum rate of a tenant's requests per service process, averaged over five seconds; 0 "
         "sets no limit. A query counts as 5 requests, a page as 1 plus 1 per 50 rows.",

@@ -13,6 +13,7 @@ from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.concurrency import contextmanager_in_threadpool
 from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from sceneprint import __version__
@@ -70,6 +71,12 @@ from service.running_service import Service
 
 # The OpenAPI document: that of FastAPI, with the records that routes parse themselves.
 
+PARSED: tuple[type[BaseModel], ...] = (
+    FrameMeta, FrameEdit, SessionEdit, FrameSelection, FramesEdit, KeepOptions, MapEdit, Filter,
+    NamedFrame, Diversity, ValidationOptions, Prior, NewMap, NewKey, NewAssociation, CopyRequest,
+    NewMapCoverage, NewDifference, NewModel, NewReconstruction,
+)  # fmt: skip
+
 
 def openapi_of(app: FastAPI) -> dict[str, Any]:
     """Return the OpenAPI document of an application, which is built once."""
@@ -79,29 +86,7 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
         )
         template = "#/components/schemas/{model}"
         _, own = models_json_schema(
-            [
-                (FrameMeta, "validation"),
-                (FrameEdit, "validation"),
-                (SessionEdit, "validation"),
-                (FrameSelection, "validation"),
-                (FramesEdit, "validation"),
-                (KeepOptions, "validation"),
-                (MapEdit, "validation"),
-                (Filter, "validation"),
-                (NamedFrame, "validation"),
-                (Diversity, "validation"),
-                (ValidationOptions, "validation"),
-                (Prior, "validation"),
-                (NewMap, "validation"),
-                (NewKey, "validation"),
-                (NewAssociation, "validation"),
-                (CopyRequest, "validation"),
-                (NewMapCoverage, "validation"),
-                (NewDifference, "validation"),
-                (NewModel, "validation"),
-                (NewReconstruction, "validation"),
-                (Problem, "serialization"),
-            ],
+            [*((one, "validation") for one in PARSED), (Problem, "serialization")],
             ref_template=template,
         )
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
@@ -121,14 +106,10 @@ log = logging.getLogger(__name__)
 #: Routers in the order of the OpenAPI document.
 ROUTERS = (
     maps.router, frames.router, selections.router, frame_data.router, frame_data.points_router,
-    maps.edits_router, copies.router,
-    sessions.router, frames.imports_router, queries.router,
-    results.history_router,
-    results.router,
-    queries.similarity_router, products.associations_router, products.coverage_router,
-    products.differences_router, surface.router,
-    reconstructions.router, jobs.router,
-    jobs.events_router, admin.operations_router, admin.keys_router,
+    maps.edits_router, copies.router, sessions.router, frames.imports_router, queries.router,
+    results.history_router, results.router, queries.similarity_router, products.associations_router,
+    products.coverage_router, products.differences_router, surface.router, reconstructions.router,
+    jobs.router, jobs.events_router, admin.operations_router, admin.keys_router,
 )  # fmt: skip
 
 DESCRIPTION = """\

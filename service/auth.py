@@ -14,7 +14,7 @@ import logging
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial, wraps
@@ -61,7 +61,11 @@ def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> 
     return any(SCOPES.index(one) >= least for one in held)
 
 
-#: Map of a match, in requests for one match.
+# Query parameters of several routes.
+
+Cursor = Annotated[str | None, Query(description="`next_cursor` of the previous page.")]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+OnlyMap = Annotated[str | None, Query(alias="map", description="Only this map.")]
 MatchMap = Annotated[
     str | None,
     Query(
@@ -133,10 +137,6 @@ class Caller:
             raise _forbidden(self, scope, f"job {job.job_id}")
         return job
 
-    def readable(self, names: Iterable[str]) -> list[str]:
-        """Return the names of maps that the caller may read."""
-        return [name for name in names if self.may("read", name)]
-
     @property
     def reads_every(self) -> bool:
         """Whether the caller may read all maps."""
@@ -154,14 +154,9 @@ def require_readable(query_id: str, here: Service, caller: Caller) -> QueryRow:
     """
     row = here.context.query_log.find_row(query_id)
     maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
-    if len(caller.readable(maps)) < len(maps):
+    if not all(caller.may("read", name) for name in maps):
         raise unknown_query(query_id)
     return row
-
-
-def anonymous_caller() -> Caller:
-    """Return the caller if no key is required. Only processes of this machine reach the service."""
-    return Caller("", {EVERY: "admin"})
 
 
 async def authenticate(
@@ -174,12 +169,24 @@ async def authenticate(
     """
     if credentials is None:
         if requires_key(request, here):
-            raise KeyRequired(_key_required_text(request, here))
+            header = request.state.forwarded
+            reason = (
+                "This service requires a key."
+                if here.keys
+                else (
+                    f"The request came through a proxy (it has the header {header}), so anyone may "
+                    "have sent it, and a key is required."
+                )
+            )
+            raise KeyRequired(
+                f"{reason} Send the header Authorization: Bearer KEY; create one with `sceneprint "
+                "keys --create NAME`."
+            )
         set_actor(Actor("", address_of(request) or None))
-        return anonymous_caller()
+        return Caller("", {EVERY: "admin"})  # only processes of this machine reach the service
     key = await to_thread.run_sync(here.find_key, credentials.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
-        enforce_rate_limit(request, here.limits.failed_keys, network_of(address_of(request)))
+        enforce_rate_limit(request, here.wrong_keys, network_of(address_of(request)))
         raise KeyRequired(_REFUSED_KEY)
     request.state.caller, request.state.tenant = key.name, key.tenant
     set_actor(Actor(key.name, address_of(request) or None))
@@ -192,7 +199,7 @@ async def authenticate(
 async def _admit(request: Request, here: Service, tenant: str) -> None:
     """Count a request for its tenant until the response ends; the body is read afterwards."""
     set_tenant(tenant)
-    enforce_rate_limit(request, here.limits.requests, tenant, request_cost(request))
+    enforce_rate_limit(request, here.request_rate, tenant, request_cost(request))
     if not here.requests.take(tenant, 1, here.places):
         raise too_many_requests(share(here.places))
     request.state.place = partial(here.requests.give, tenant, 1)
@@ -305,19 +312,6 @@ _REFUSED_KEY = (
 )
 
 
-def _key_required_text(request: Request, here: Here) -> str:
-    reason = "This service requires a key."
-    if not here.keys:
-        reason = (
-            f"The request came through a proxy (it has the header {request.state.forwarded}), so "
-            "anyone may have sent it, and a key is required."
-        )
-    return (
-        f"{reason} Send the header Authorization: Bearer KEY; create one with `sceneprint keys "
-        "--create NAME`."
-    )
-
-
 async def may_read(map_name: str, caller: Sender) -> None:
     """Raise UnknownMap if the caller may not read the map."""
     caller.require(map_name, "read")
@@ -375,8 +369,7 @@ class RefusalFilter:
         """Return the number of skipped similar refusals before this one; None to skip this one."""
         whose = f"{network_of(address)} {caller}"
         for bucket, of in ((self._each, whose), (self._all, "")):
-            state = bucket.take(of)
-            if state is not None and not state.allowed:
+            if bucket.take(of):
                 self._skipped[whose] = self._skipped.pop(whose, 0) + 1
                 if len(self._skipped) > self._most:
                     self._skipped.popitem(last=False)

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Annotated, Any, BinaryIO, TypeVar, cast, get_args
+from typing import Annotated, Any, BinaryIO, TypeVar, cast
 
 from fastapi import Header, Request, Response
 from pydantic import BaseModel, ValidationError
@@ -33,16 +33,9 @@ from sceneprint.errors import (
 from sceneprint.formats.depth_file import size_of
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.api.base import invalid_record, novelty_of, record_of
+from sceneprint_client.api.base import CameraIntrinsics, invalid_record, novelty_of, record_of
 from sceneprint_client.api.frames import MOST_OF_BATCH, MOST_PRIORITY, Batch
-from sceneprint_client.formats import (
-    HEAD,
-    CloudFormat,
-    format_of,
-    formats_of,
-    media_types_of,
-    titles_of,
-)
+from sceneprint_client.formats import HEAD, format_of, formats_of, media_types_of, titles_of
 from service.auth import Caller
 from service.limits import IN_MEMORY
 
@@ -53,6 +46,9 @@ _Record = TypeVar("_Record", bound=BaseModel)
 # curl --data-binary @frame.png -H 'Content-Type: image/png' '...?fx=585&fy=585&cx=320&cy=240'
 # curl --data-binary @scan.ply -H 'Content-Type: application/ply' '...?robot=spot'
 
+FORM, JSON = "multipart/form-data", "application/json"
+FILE: dict[str, Any] = {"type": "string", "format": "binary"}
+META: dict[str, Any] = {"$ref": "#/components/schemas/FrameMeta"}
 #: Media types of frames. The first bytes of the body decide the format.
 TYPES = media_types_of("depth", "cloud")
 
@@ -69,59 +65,69 @@ _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 def content(types: Sequence[str] = TYPES) -> dict[str, Any]:
     """Return `requestBody.content` of these media types for the OpenAPI document."""
-    return {one: {"schema": {"type": "string", "format": "binary"}} for one in types}
+    return {one: {"schema": FILE} for one in types}
 
 
 def parameters() -> list[dict[str, Any]]:
     """Return the query parameters of a frame that is the body, for the OpenAPI document."""
-    number, text = {"type": "number"}, {"type": "string"}
-    whole = {"type": "integer", "minimum": 1, "maximum": 65535}
-    texts: dict[str, tuple[dict[str, Any], str]] = {
-        "meta": (text, "FrameMeta as JSON, instead of the parameters below."),
-        **dict.fromkeys(("fx", "fy", "cx", "cy"), (number, "Camera intrinsics, pixels.")),
-        "width": (
-            whole,
-            "Width of the camera's image, pixels; default: the width of the uploaded image.",
-        ),
-        "height": (
-            whole,
-            "Height of the camera's image, pixels; default: the height of the uploaded image.",
-        ),
-        "distortion": (text, "OpenCV distortion coefficients k1,k2,p1,p2[,k3[,k4,k5,k6]]."),
-        "depth_scale": (number, "Stored units per metre; default: 1000."),
-        "depth_along_ray": (
-            {"type": "boolean"},
-            "Whether samples are distances along the ray of the pixel instead of the optical axis.",
-        ),
-        "trust_depth": (
-            {"type": "boolean"},
-            "Whether to accept a depth image that fails the sanity check.",
-        ),
-        "viewpoint": (
-            text,
-            "Viewpoint of a point cloud as x,y,z in metres, or `none` if it has no single "
-            "viewpoint.",
-        ),
-        "units_per_metre": (number, "Units per metre of a point cloud; default: 1."),
-        "format": (
-            {"type": "string", "enum": list(get_args(CloudFormat))},
-            "Format of a point cloud; required only for `kitti`.",
-        ),
-        "robot": (text, "Name of the robot."),
-        "session": (text, "Name of the session."),
-        "captured_at": ({"type": "string", "format": "date-time"}, "Capture time, with time zone."),
-        "name": (text, "Name of the original file or message."),
-        "sequence": ({"type": "integer", "minimum": 0}, "Index within the session."),
-        "tags": (text, "Tags, separated by commas."),
-        "pose": (text, f"T_parent_sensor as {','.join(_SEVEN)}, in metres with a unit quaternion."),
-        "parent_frame": (text, "Parent frame of `pose`; default: ROBOT/SESSION."),
-        "base": (text, "T_base_sensor, the mounting pose of the sensor, in the format of `pose`."),
-        "base_frame": (text, "Name of the robot's base frame; default: base_link."),
-        "up": (text, "Unit vector x,y,z that points up, in the axes of the sensor."),
+    seven, size = ",".join(_SEVEN), "of the camera's image, pixels; default: that of the upload."
+    own = CameraIntrinsics.model_json_schema()["properties"]
+    own |= {"meta": {}, **FrameMeta.model_json_schema()["properties"]}
+    texts = {
+        "meta": "FrameMeta as JSON, instead of the parameters below.",
+        **dict.fromkeys(("fx", "fy", "cx", "cy"), "Camera intrinsics, pixels."),
+        "width": f"Width {size}",
+        "height": f"Height {size}",
+        "distortion": "OpenCV distortion coefficients k1,k2,p1,p2[,k3[,k4,k5,k6]].",
+        **{name: own[name]["description"] for name in _PLAIN},
+        "viewpoint": "Viewpoint of a point cloud as x,y,z in metres, or `none` if it has no single "
+        "viewpoint.",
+        "tags": "Tags, separated by commas.",
+        "pose": f"T_parent_sensor as {seven}, in metres with a unit quaternion.",
+        "parent_frame": "Parent frame of `pose`; default: ROBOT/SESSION.",
+        "base": "T_base_sensor, the mounting pose of the sensor, in the format of `pose`.",
+        "base_frame": "Name of the robot's base frame; default: base_link.",
+        "up": "Unit vector x,y,z that points up, in the axes of the sensor.",
     }
+    plain = (*_CAMERA[:6], *_PLAIN)
     return [
-        query_parameter(name, schema, f"{what} {BARE}") for name, (schema, what) in texts.items()
-    ]
+        option_parameter(name, {**own[name], "description": text} if name in plain
+                         else {"type": "string", "description": text})
+        for name, text in texts.items()
+    ]  # fmt: skip
+
+
+def option_parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the query parameter of an option, for requests whose body is the frame."""
+    schema = as_text(option)
+    text = schema.pop("description", "The same as the field in JSON.")
+    schema.pop("title", None)
+    return query_parameter(name, schema, f"{text} {BARE}")
+
+
+def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the schema of an option in a form: objects as JSON text, lists with commas."""
+    kinds = option.get("anyOf", [])
+    reference = next((one for one in kinds if "$ref" in one), None)
+    texts = {name: option[name] for name in ("description", "title") if name in option}
+    if reference is not None:
+        content = {"contentMediaType": JSON, "contentSchema": reference}
+        return {"type": "string", **content, **texts}
+    if any(one.get("type") == "array" for one in kinds):
+        values = option.get("default")
+        default = {} if values is None else {"default": ",".join(values)}
+        return {"type": "string", **default, **texts}
+    one = next((one for one in kinds if one.get("type") != "null"), None)
+    return dict(option) if one is None else {**one, **texts}
+
+
+def form_body(
+    properties: Mapping[str, Any], required: Sequence[str], *metas: str
+) -> dict[str, Any]:
+    """Return `requestBody` of a form, for the OpenAPI document; `metas` are its parts with JSON."""
+    schema = {"type": "object", "required": [*required], "properties": {**properties}}
+    encoding = {name: {"contentType": JSON} for name in metas}
+    return {"required": True, "content": {FORM: {"schema": schema, "encoding": encoding}}}
 
 
 def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> dict[str, Any]:
@@ -135,7 +141,7 @@ def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> d
 async def read_frame_body(
     request: Request, fields: Sequence[str]
 ) -> tuple[UploadFile, FrameMeta, dict[str, str]]:
-    """Read a request whose body is the frame.
+    """Read a request whose body is the frame; errors are those of `read_upload`.
 
     Parameters
     ----------
@@ -147,12 +153,6 @@ async def read_frame_body(
     file : spooled body, which the caller closes
     meta : metadata of the frame
     others : parameters of `fields` that are present
-
-    Raises
-    ------
-    InvalidRequest : If a parameter is missing, unknown, repeated or invalid.
-    MalformedBody : If `meta` is not JSON.
-    StoreFull, UnusableStore : If the body cannot be written to the temporary folder.
     """
     values = query_parameters(request, ("meta", *_CAMERA, *_PLAIN, *_OTHERS, *fields))
     spooled = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY)  # noqa: SIM115  (the caller's)
@@ -169,7 +169,12 @@ async def read_frame_body(
         except OSError as error:
             raise spool_error(error) from error
         others = {name: values.pop(name) for name in fields if name in values}
-        meta = _query_meta(values, head)
+        text = take_alone(values, "meta")
+        if text is not None:
+            meta = read_meta(text, "The parameter `meta`")
+        else:
+            what = "The frame metadata in the query string"
+            meta = record_of(FrameMeta, _fields(values, head), what)
     except BaseException:
         await file.close()
         raise
@@ -203,13 +208,6 @@ def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
             )
         values[name] = value
     return values
-
-
-def _query_meta(values: dict[str, str], head: bytes) -> FrameMeta:
-    text = take_alone(values, "meta")
-    if text is not None:
-        return read_meta(text, "The parameter `meta`")
-    return record_of(FrameMeta, _fields(values, head), "The frame metadata in the query string")
 
 
 def take_alone(values: dict[str, str], name: str) -> str | None:
@@ -282,58 +280,37 @@ def add_transform(
 def _viewpoint(text: str) -> dict[str, Any] | str | None:
     if text in ("none", "file"):
         return None if text == "none" else text
-    parts = text.split(",")
-    if len(parts) != 3:
-        raise InvalidRequest(
-            f"`viewpoint` has {len(parts)} numbers. Send x,y,z in metres, comma-separated, or "
-            "`none` if the cloud has no single viewpoint.",
-            (("viewpoint", "not three numbers"),),
-        )
-    return dict(zip("xyz", parts, strict=True))
+    what = "x,y,z in metres, or `none` if the cloud has no single viewpoint"
+    return dict(zip("xyz", _numbers("viewpoint", text, 3, what), strict=True))
 
 
 def _transform(name: str, text: str) -> dict[str, Any]:
-    parts = text.split(",")
-    if len(parts) != len(_SEVEN):
-        raise InvalidRequest(
-            f"`{name}` has {len(parts)} numbers. Send {','.join(_SEVEN)}: metres and a unit "
-            "quaternion, comma-separated.",
-            ((name, "not seven numbers"),),
-        )
+    parts = _numbers(name, text, 7, f"{','.join(_SEVEN)}: metres and a unit quaternion")
     return {
         "translation": dict(zip("xyz", parts[:3], strict=True)),
         "rotation": dict(zip("xyzw", parts[3:], strict=True)),
     }
 
 
+def _numbers(name: str, text: str, count: int, what: str) -> list[str]:
+    """Return the parts of a parameter; raise InvalidRequest if their number is not `count`."""
+    parts = text.split(",")
+    if len(parts) != count:
+        raise InvalidRequest(
+            f"`{name}` has {len(parts)} numbers. Send {what}, comma-separated.",
+            ((name, f"not {count} numbers"),),
+        )
+    return parts
+
+
 #: Maximum size of a form field other than a file, and of a JSON body, bytes.
 FIELD_BYTES = 1 << 18
-FORM = "multipart/form-data"
 #: Charsets that a form may declare; their text is also valid UTF-8.
 _CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii")
 
-FRAME_BODY: dict[str, Any] = {
-    "required": True,
-    "content": {
-        FORM: {
-            "schema": {
-                "type": "object",
-                "required": ["frame", "meta"],
-                "properties": {
-                    "frame": {
-                        "type": "string",
-                        "format": "binary",
-                        "description": "A depth image as "
-                        + ", ".join(f"{one.title} ({one.content})" for one in formats_of("depth"))
-                        + f". Or a point cloud as {titles_of('cloud', last='or')}.",
-                    },
-                    "meta": {"$ref": "#/components/schemas/FrameMeta"},
-                },
-            },
-            "encoding": {"meta": {"contentType": "application/json"}},
-        }
-    },
-}
+_FORMATS = ", ".join(f"{one.title} ({one.content})" for one in formats_of("depth"))
+_FRAME = f"A depth image as {_FORMATS}. Or a point cloud as {titles_of('cloud', last='or')}."
+FRAME_PARTS: dict[str, Any] = {"frame": {**FILE, "description": _FRAME}, "meta": META}
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,12 +344,6 @@ def _has_no_body(request: Request) -> bool:
 def media_type(request: Request) -> str:
     """Return the media type of the body without its parameters."""
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
-
-
-def _charset(request: Request) -> str:
-    """Return the charset of a form in lower case; default: UTF-8."""
-    _, parameters = parse_options_header(request.headers["content-type"])
-    return parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
 
 
 @asynccontextmanager
@@ -423,7 +394,9 @@ async def read_form(request: Request, most_files: int) -> AsyncIterator[FormData
             f"the whole body, with one of the types {', '.join(TYPES)}."
         )
     # Some versions of Python decode other charsets in quadratic time.
-    if (charset := _charset(request)) not in _CHARSETS:
+    _, parameters = parse_options_header(request.headers["content-type"])
+    charset = parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
+    if charset not in _CHARSETS:
         raise MalformedBody(
             f"The form's charset is {charset!r:.80}. Send the form in UTF-8, without `charset`."
         )
@@ -476,7 +449,7 @@ def priority_of(fields: Mapping[str, str]) -> int:
 def json_body(record: str, *, required: bool = True) -> dict[str, Any]:
     """Return `openapi_extra` of an operation that reads a record as JSON by hand."""
     schema = {"$ref": f"#/components/schemas/{record}"}
-    content = {"application/json": {"schema": schema}}
+    content = {JSON: {"schema": schema}}
     return {"requestBody": {"required": required, "content": content}}
 
 
@@ -537,8 +510,8 @@ async def read_record(
     """
     if optional and _has_no_body(request):
         return kind()
-    types = ("application/json",)
-    document = await read_json_object(request, what, types, ", or no body" if optional else "")
+    otherwise = ", or no body" if optional else ""
+    document = await read_json_object(request, what, (JSON,), otherwise)
     return record_of(kind, document, what)
 
 

@@ -51,11 +51,8 @@ _PAGES = re.compile(r"/|/docs/?|/dashboard(/[^.]*)?")
 _HOST = re.compile(r"(?:\[(?P<v6>[^\[\]]*)\]|(?P<name>[^:\[\]]*))(?::\d*)?")
 
 
-#: Headers that proxies add.
-_FORWARDING = frozenset(
-    (b"forwarded", b"via", b"x-real-ip", b"x-client-ip", b"x-cluster-client-ip",
-     b"true-client-ip", b"cf-connecting-ip")
-)  # fmt: skip
+#: Beginnings of the headers that most proxies add. Behind others, REQUIRE_KEYS must be set.
+_FORWARDING = (b"forwarded", b"x-forwarded", b"x-real-ip", b"via")
 
 
 def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
@@ -63,10 +60,8 @@ def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
 
     Its value is not used, because any client can send it.
     """
-    for name in headers:
-        if name in _FORWARDING or name.startswith(b"x-forwarded"):
-            return name.decode("latin-1").title()
-    return None
+    found = (name for name in headers if name.startswith(_FORWARDING))
+    return next((name.decode("latin-1").title() for name in found), None)
 
 
 def foreign_request_error(
@@ -121,15 +116,18 @@ def _is_here(authority: str) -> bool:
 #: Response headers that pages may read.
 _EXPOSED = (
     "Accept-Ranges, Content-Disposition, Content-Range, ETag, Idempotent-Replayed, Location, "
-    "Preference-Applied, RateLimit, RateLimit-Policy, Retry-After, X-Request-Id"
+    "Preference-Applied, Retry-After, X-Request-Id"
 )
-_CORS_METHODS = "GET, POST, PUT, PATCH, DELETE"
 _SENT = (
     "Accept, Authorization, Content-Type, Idempotency-Key, If-Match, If-None-Match, If-Range, "
     "Last-Event-ID, Prefer, Range, X-Request-Id"
 )
-#: Seconds for which a browser may cache the result of a preflight request.
-_MAX_AGE_S = 600
+#: Headers of the response to a preflight, which a browser may cache for ten minutes.
+PREFLIGHT_HEADERS = {
+    "Access-Control-Allow-Methods": "GET, POST, PUT, PATCH, DELETE",
+    "Access-Control-Allow-Headers": _SENT,
+    "Access-Control-Max-Age": "600",
+}
 
 
 class Origins:
@@ -175,17 +173,3 @@ def origins_of(settings: Settings) -> Origins:
             (("cors_origins", "all origins, but no key required"),),
         )
     return Origins(settings.cors_origins)
-
-
-def is_preflight(method: str, headers: dict[bytes, bytes]) -> bool:
-    """Return whether a request is a CORS preflight."""
-    return method == "OPTIONS" and b"access-control-request-method" in headers
-
-
-def preflight_headers() -> dict[str, str]:
-    """Return the headers of a response to a preflight."""
-    return {
-        "Access-Control-Allow-Methods": _CORS_METHODS,
-        "Access-Control-Allow-Headers": _SENT,
-        "Access-Control-Max-Age": str(_MAX_AGE_S),
-    }

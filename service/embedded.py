@@ -1,25 +1,21 @@
 """The service inside a Python process, without a port, for `sceneprint_client.Client.embedded`.
 
-httpx.Request  --LocalService-->  the application in its own thread  -->  httpx.Response
+httpx.Request  --LocalService-->  a socket in a private folder  -->  the application in its thread
 """
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 import os
+import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import suppress
-from enum import Enum, auto
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any
+from tempfile import TemporaryDirectory
 
 import httpx
-from starlette.types import Message, Scope
+import uvicorn
 from threadpoolctl import threadpool_limits
 
 from sceneprint.engine.context import Context
@@ -30,10 +26,11 @@ from service.app import create_app
 
 #: Number of jobs after which housekeeping runs.
 _UPKEEP = 256
-#: Interval of checks whether the main thread has ended without closing the client, seconds.
-_LOOK_S = 0.5
 #: Limits of an embedded service; only memory limits its own process.
 _MOST_WAITING, _LONGEST_WAIT_S, _MOST_BYTES, _MOST_STREAMS = 10_000, 3600.0, 2 << 30, 10_000
+#: Time after which an idle connection is closed, and time for requests in progress at the end,
+#: seconds.
+_KEEP_ALIVE_S, _GRACE_S = 86_400, 5
 
 
 def embedded_settings(path: Path) -> Settings:
@@ -67,20 +64,17 @@ class LocalService(httpx.BaseTransport):
     """
 
     def __init__(self, path: Path) -> None:
-        settings = embedded_settings(path)
-        self._app = create_app(settings, warm=False)
-        self._loop = asyncio.new_event_loop()
-        self._stop = asyncio.Event()
-        self._exchanges: dict[asyncio.Task[None], LocalExchange] = {}
-        self._name = f"embedded-{os.getpid()}"
-        self._jobs = itertools.count(1)
+        self._name, self._jobs = f"embedded-{os.getpid()}", itertools.count(1)
+        self._folder = TemporaryDirectory(prefix="sceneprint-")  # only this user may enter it
+        address = str(Path(self._folder.name, "socket"))
+        self._transport = httpx.HTTPTransport(uds=address, limits=httpx.Limits())
+        self._server = _Server(embedded_settings(path), address)
         # The calling thread also computes; one BLAS thread keeps the order of sums the same.
         self._limits = threadpool_limits(1)
-        opened: Future[Context] = Future()
-        self._thread = threading.Thread(target=self._serve, args=(opened,), name=self._name)
+        self._thread = threading.Thread(target=self._server.run, name=self._name)
         self._thread.start()
         try:
-            context = opened.result()
+            context = self._server.opened.result()
             self._runner, self._housekeeping = JobRunner(context), Housekeeping(context)
         except BaseException:
             self.close()
@@ -88,23 +82,9 @@ class LocalService(httpx.BaseTransport):
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send a request to the application, and return a streaming response."""
-        exchange = LocalExchange(self._loop, iter(request.stream))  # type: ignore[arg-type]
-        answering = self._answer(_scope_of(request), exchange)
-        try:
-            asyncio.run_coroutine_threadsafe(answering, self._loop)
-        except RuntimeError as error:  # the loop is closed
-            answering.close()
-            raise httpx.ConnectError("this client is closed", request=request) from error
-        try:
-            start = exchange.start()
-        except BaseException:
-            exchange.close()
-            raise
-        if start is None:
-            raise httpx.RemoteProtocolError(
-                "this client was closed in the meantime", request=request
-            )
-        return httpx.Response(start["status"], headers=start["headers"], stream=exchange)
+        request.headers["Host"] = "localhost"  # in place of the host name that the client uses
+        request.extensions = {}  # without timeouts, because this process computes the response
+        return self._transport.handle_request(request)
 
     def work(self, pause_s: float) -> None:
         """Run one job, or wait for `pause_s` seconds if there is none."""
@@ -122,156 +102,46 @@ class LocalService(httpx.BaseTransport):
 
     def close(self) -> None:
         """End all requests and release all resources."""
-        with suppress(RuntimeError):  # the loop has already stopped
-            self._loop.call_soon_threadsafe(self._stop.set)
+        self._server.should_exit = True
         self._thread.join()
+        self._transport.close()
         self._limits.restore_original_limits()
+        self._folder.cleanup()
 
-    def _serve(self, opened: Future[Context]) -> None:
-        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(self._live(opened))
 
-    async def _live(self, opened: Future[Context]) -> None:
+class _Server(uvicorn.Server):
+    """A server that ends with the program, and with `opened` has the context or the error."""
+
+    def __init__(self, settings: Settings, address: str) -> None:
+        self._app, self.opened = create_app(settings, warm=False), Future[Context]()
+        super().__init__(
+            uvicorn.Config(
+                self._app, uds=address, http="h11", ws="none", lifespan="off", log_config=None,
+                access_log=False, h11_max_incomplete_event_size=1 << 20,
+                timeout_keep_alive=_KEEP_ALIVE_S, timeout_graceful_shutdown=_GRACE_S,
+            )
+        )  # fmt: skip
+
+    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
+        """Serve until `should_exit` is true."""
         try:
             async with self._app.router.lifespan_context(self._app):
-                opened.set_result(self._app.state.service.context)
-                while not self._stop.is_set() and threading.main_thread().is_alive():
-                    with suppress(TimeoutError):
-                        await asyncio.wait_for(self._stop.wait(), _LOOK_S)
-                for exchange in self._exchanges.values():
-                    exchange.leave()
-                if self._exchanges:
-                    await asyncio.wait(self._exchanges)
+                await super().serve(sockets)
         except BaseException as error:
-            if opened.done():
+            if self.opened.done():
                 raise
-            opened.set_exception(error)
+            self.opened.set_exception(error)
 
-    async def _answer(self, scope: Scope, exchange: LocalExchange) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._exchanges[task] = exchange
-        try:
-            await self._app(scope, exchange.receive, exchange.send)
-        except Exception:
-            pass
-        finally:
-            exchange.end()
-            del self._exchanges[task]
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and set `opened`."""
+        await super().startup(sockets)
+        self.opened.set_result(self._app.state.service.context)
 
+    async def on_tick(self, counter: int) -> bool:
+        """Return whether to stop, also if the main thread has ended without closing the client."""
+        return await super().on_tick(counter) or not threading.main_thread().is_alive()
 
-class _Step(Enum):
-    """Messages from the application to the calling thread."""
-
-    WANTS_BODY = auto()
-    START = auto()
-    PART = auto()
-    END = auto()
-
-
-class LocalExchange(httpx.SyncByteStream):
-    """One request and its response, between the application and the calling thread.
-
-    Each side waits for the other, so neither holds more than one part of a body.
-
-    Parameters
-    ----------
-    loop : event loop of the application
-    body : body of the request, read in the calling thread
-    """
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, body: Iterator[bytes]) -> None:
-        self._loop, self._body = loop, body
-        self._steps: SimpleQueue[tuple[_Step, Any]] = SimpleQueue()
-        self._parts: asyncio.Queue[bytes | None] = asyncio.Queue()  # None: the body's end
-        self._consumed, self._gone = asyncio.Event(), asyncio.Event()
-        self._whole = False
-
-    # Methods for the event loop of the application.
-
-    async def receive(self) -> Message:
-        """Return the next part of the request's body; after the last, wait for the disconnect."""
-        if not (self._whole or self._gone.is_set()):
-            self._steps.put((_Step.WANTS_BODY, None))
-            part = await self._parts.get()
-            if not self._gone.is_set():
-                self._whole = part is None
-                return {"type": "http.request", "body": part or b"", "more_body": not self._whole}
-        await self._gone.wait()
-        return {"type": "http.disconnect"}
-
-    async def send(self, message: Message) -> None:
-        """Pass a part of the response to the caller, and wait until the caller has read it."""
-        if self._gone.is_set():
-            return
-        if message["type"] == "http.response.start":
-            self._steps.put((_Step.START, message))
-            return
-        if message.get("body"):
-            self._consumed.clear()
-            self._steps.put((_Step.PART, bytes(message["body"])))
-            await self._consumed.wait()
-        if not message.get("more_body", False):
-            self.end()
-
-    def end(self) -> None:
-        """Mark the end of the response."""
-        self._steps.put((_Step.END, None))
-
-    def leave(self) -> None:
-        """Disconnect the caller."""
-        self._gone.set()
-        self._consumed.set()
-        self._parts.put_nowait(None)
-
-    # Methods for the calling thread.
-
-    def start(self) -> Message | None:
-        """Return the status and headers of the response; None if there is no response."""
-        step, message = self._next()
-        return message if step is _Step.START else None
-
-    def __iter__(self) -> Iterator[bytes]:
-        while True:
-            step, part = self._next()
-            if step is _Step.END:
-                return
-            self._call(self._consumed.set)
-            yield part
-
-    def close(self) -> None:
-        """Stop reading the response."""
-        self._call(self.leave)
-
-    def _next(self) -> tuple[_Step, Any]:
-        while True:
-            step, value = self._steps.get()
-            if step is not _Step.WANTS_BODY:
-                return step, value
-            self._call(self._parts.put_nowait, next((part for part in self._body if part), None))
-
-    def _call(self, do: Callable[..., object], *arguments: object) -> None:
-        with suppress(RuntimeError):  # the loop has stopped
-            self._loop.call_soon_threadsafe(do, *arguments)
-
-
-def _scope_of(request: httpx.Request) -> Scope:
-    """Return the ASGI scope of a request."""
-    headers = [(b"host", b"localhost")]  # in place of the host name that the client uses
-    headers += [
-        (name.lower(), value) for name, value in request.headers.raw if name.lower() != b"host"
-    ]
-    return {
-        "type": "http",
-        "asgi": {"version": "3.0", "spec_version": "2.3"},
-        "http_version": "1.1",
-        "method": request.method,
-        "scheme": "http",
-        "path": request.url.path,
-        "raw_path": request.url.raw_path.partition(b"?")[0],
-        "query_string": request.url.query,
-        "root_path": "",
-        "headers": headers,
-        "client": ("127.0.0.1", 0),
-        "server": ("localhost", 80),
-    }
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Close event streams, which would otherwise delay the shutdown, and stop."""
+        self._app.state.service.feed.close()
+        await super().shutdown(sockets)

@@ -15,25 +15,17 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing, suppress
 from itertools import islice
 
-import anyio
 from anyio import to_thread
-from starlette.requests import ClientDisconnect
-from starlette.responses import Response
+from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from sceneprint.engine.admin.operations import begin, missed, next_events
 from sceneprint.errors import Busy, RateLimited, SceneprintError
 from sceneprint.process import NOBODY
 from sceneprint.store import Database
-from sceneprint.store.events import (
-    EventFilter,
-    EventRow,
-    list_events,
-    newest_number,
-    number_events,
-)
+from sceneprint.store.events import EventFilter, EventRow, list_events, newest_number, number_events
 from sceneprint_client.api.admin import Event
-from service.limits import Broken, Holdings, share
+from service.limits import Holdings, share
 
 log = logging.getLogger(__name__)
 
@@ -178,13 +170,6 @@ class Feed:
         found = list(islice(self._held, start, start + MOST))
         return found, found[-1].number if found else self._newest
 
-    def _read_newest(self) -> EventRow | None:
-        number_events(self._database)
-        with self._database.read() as connection:
-            newest = newest_number(connection)
-            found = list_events(connection, EventFilter(), after=newest - 1, limit=1)
-        return found[0] if found else None
-
     def _is_behind(self) -> bool:
         """Return whether the last known event is missing from the database or differs there."""
         if self._last is None:
@@ -195,15 +180,18 @@ class Feed:
 
     async def _begin(self) -> None:
         """Continue from the newest event of the database."""
-        self._last = await to_thread.run_sync(self._read_newest)
+        newest = await to_thread.run_sync(self._read, None)
+        self._last = newest[0] if newest else None
         self._history = self._database.history
         self._held.clear()
         self._newest = self._since = 0 if self._last is None else self._last.number
 
-    def _read_after(self, place: int) -> list[EventRow]:
+    def _read(self, after: int | None) -> list[EventRow]:
+        """Return the events after a number; None returns the newest one."""
         number_events(self._database)
         with self._database.read() as connection:
-            return list_events(connection, EventFilter(), after=place, limit=MOST)
+            after = newest_number(connection) - 1 if after is None else after
+            return list_events(connection, EventFilter(), after=after, limit=MOST)
 
     async def _poll(self) -> None:
         """Poll the database while streams are open."""
@@ -214,7 +202,7 @@ class Feed:
                 if self._since is None:
                     await self._begin()
                     self._wake()
-                found = await to_thread.run_sync(self._read_after, self._newest)
+                found = await to_thread.run_sync(self._read, self._newest)
                 if self._history != self._database.history:
                     history = self._database.history
                     if await to_thread.run_sync(self._is_behind):
@@ -262,47 +250,18 @@ def alive(place: str) -> bytes:
     return f": alive\nid: {place}\n\n".encode()
 
 
-class EventStream(Response):
+class EventStream(StreamingResponse):
     """A response that lasts until its source ends or the client leaves; then it calls `left`."""
 
-    media_type = MEDIA_TYPE
-
     def __init__(self, source: AsyncGenerator[bytes, None], left: Callable[[], None]) -> None:
-        super().__init__(
-            headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"}, media_type=MEDIA_TYPE
-        )
-        del self.headers["content-length"]
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        super().__init__(source, 200, headers, MEDIA_TYPE)
         self._source, self._left = source, left
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the response."""
-        del scope
         try:
-            await send(
-                {
-                    "type": "http.response.start",
-                    "status": self.status_code,
-                    "headers": self.raw_headers,
-                }
-            )
-            async with anyio.create_task_group() as group:
-                group.start_soon(_until_gone, receive, group.cancel_scope)
-                await self._send_all(send)
-                group.cancel_scope.cancel()
+            async with aclosing(self._source):
+                await super().__call__(scope, receive, send)
         finally:
             self._left()
-
-    async def _send_all(self, send: Send) -> None:
-        async with aclosing(self._source) as parts:
-            async for part in parts:
-                await send({"type": "http.response.body", "body": part, "more_body": True})
-        await send({"type": "http.response.body", "body": b"", "more_body": False})
-
-
-async def _until_gone(receive: Receive, scope: anyio.CancelScope) -> None:
-    try:
-        while (await receive())["type"] != "http.disconnect":
-            pass  # a body without meaning
-    except (ClientDisconnect, Broken):
-        pass
-    scope.cancel()

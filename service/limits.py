@@ -21,7 +21,6 @@ import time
 from collections import Counter, OrderedDict, defaultdict
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
 import anyio
@@ -237,40 +236,12 @@ _USUAL_ROWS = 100
 _QUERIES = re.compile(r"/(queries|queries/records|localize|localize/sequence|similarity)$")
 
 
-@dataclass(frozen=True)
-class RateState:
-    """Rate limit of a caller after a request, as in the RateLimit headers of the IETF draft.
-
-    Parameters
-    ----------
-    quota : number of requests that a full bucket allows at once
-    window_s : time in seconds until an empty bucket is full
-    left : number of requests that are allowed now
-    wait_s : time in seconds until one more request is allowed
-    allowed : whether this request was within the limit
-    """
-
-    name: str
-    quota: int
-    window_s: int
-    left: int
-    wait_s: int
-    allowed: bool
-
-    def headers(self) -> list[tuple[bytes, bytes]]:
-        """Return the headers of draft-ietf-httpapi-ratelimit-headers-10."""
-        return [
-            (b"ratelimit-policy", f'"{self.name}";q={self.quota};w={self.window_s}'.encode()),
-            (b"ratelimit", f'"{self.name}";r={self.left};t={self.wait_s}'.encode()),
-        ]
-
-
 class TokenBucket:
     """A token bucket for each caller; thread-safe.
 
     Parameters
     ----------
-    name : name of the limit in responses
+    what : what is limited, as words in a sentence
     per_s : number of tokens that return per second; 0 for no limit
     burst : number of tokens in a full bucket
     most : number of callers in memory; the one that was not seen for the longest time is dropped
@@ -278,62 +249,30 @@ class TokenBucket:
     """
 
     def __init__(
-        self, name: str, per_s: float, burst: float, most: int = 10_000,
+        self, what: str, per_s: float, burst: float, most: int = 10_000,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        self._name, self._per_s, self._burst = name, per_s, max(burst, 1.0)
+        self.what, self._per_s, self._burst = what, per_s, max(burst, 1.0)
         self._most, self._clock = most, clock
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def take(self, caller: str, cost: float = 1.0) -> RateState | None:
-        """Take tokens if there are enough; return None if there is no limit."""
+    def take(self, caller: str, cost: float = 1.0) -> int:
+        """Take tokens and return 0 if there are enough or there is no limit; otherwise return the
+        number of seconds until there are.
+        """
         if self._per_s <= 0:
-            return None
+            return 0
         with self._lock:
             now = self._clock()
             tokens, seen = self._buckets.pop(caller, (self._burst, now))
             tokens = min(tokens + (now - seen) * self._per_s, self._burst)
             cost = min(cost, self._burst)
-            allowed = tokens >= cost
-            tokens -= cost * allowed
-            self._keep(caller, tokens, now)
-        return RateState(
-            self._name,
-            int(self._burst),
-            math.ceil(self._burst / self._per_s),
-            max(int(tokens), 0),
-            math.ceil(((1 - tokens % 1) if allowed else (cost - tokens)) / self._per_s),
-            allowed,
-        )
-
-    def _keep(self, caller: str, tokens: float, now: float) -> None:
-        self._buckets[caller] = (tokens, now)
-        if len(self._buckets) > self._most:
-            self._buckets.popitem(last=False)
-
-    @property
-    def name(self) -> str:
-        """Name of the limit in responses."""
-        return self._name
-
-    @property
-    def what(self) -> str:
-        """What is limited, as words in a sentence."""
-        return self._name.replace("-", " ")
-
-    def __len__(self) -> int:
-        return len(self._buckets)
-
-
-class RateLimits:
-    """Rate limits of a service: of requests by tenant, with bursts of five seconds, and of wrong
-    keys by address.
-    """
-
-    def __init__(self, requests_per_s: float, failed_per_minute: float) -> None:
-        self.requests = TokenBucket("requests", requests_per_s, requests_per_s * 5)
-        self.failed_keys = TokenBucket("wrong-keys", failed_per_minute / 60, failed_per_minute)
+            lacking = max(cost - tokens, 0.0)
+            self._buckets[caller] = (tokens if lacking else tokens - cost, now)
+            if len(self._buckets) > self._most:
+                self._buckets.popitem(last=False)
+        return math.ceil(lacking / self._per_s)
 
 
 #: Refusals without a delay: at once, and per second; and the delay of all others, seconds.
@@ -353,8 +292,7 @@ class RefusalDelays:
 
     async def wait(self, whose: str) -> None:
         """Wait before a refusal is sent to a tenant or an address."""
-        state = self._bucket.take(whose)
-        if state is None or state.allowed or self._held_back >= _MOST_HELD_BACK:
+        if self._bucket.take(whose) == 0 or self._held_back >= _MOST_HELD_BACK:
             return
         self._held_back += 1
         try:
@@ -383,13 +321,10 @@ def enforce_rate_limit(
     request: Request, bucket: TokenBucket, whose: str, cost: float = 1.0
 ) -> None:
     """Count a request before its body is read; raise RateLimited if there are too many."""
-    state = bucket.take(whose, cost)
-    request.state.rate = state
-    if state is not None and not state.allowed:
-        raise RateLimited(
-            f"Too many {bucket.what}: the limit is {state.quota} at once, and then "
-            f"{state.quota / state.window_s:g} per second. Retry in {state.wait_s} s."
-        )
+    wait_s = bucket.take(whose, cost)
+    if wait_s:
+        request.state.wait_s = wait_s
+        raise RateLimited(f"Too many {bucket.what}. Retry in {wait_s} s.")
 
 
 def network_of(address: str) -> str:
@@ -407,10 +342,6 @@ def network_of(address: str) -> str:
 
 #: Maximum pause within a body, seconds.
 IDLE_S = 10.0
-#: Seconds that each MiB adds to the time limit of a body: 2 Mbit/s, as on a poor radio link.
-S_PER_MIB = 4.0
-
-
 _IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
 #: Number of bytes of a body that stay in memory until they are read; the rest is spooled to disk.
 #: Tenants are charged for disk space in steps of this size.
@@ -461,21 +392,16 @@ class BodySpool:
 
 
 class RequestBody:
-    """The body of one request, read within limits of size and time.
-
-    The time limit grows with the received bytes, not with the announced length. Only time spent
-    waiting for the client counts.
+    """The body of one request, read within a limit of size, without long pauses.
 
     Parameters
     ----------
     receive : function that returns the next part
     most : maximum size, bytes
-    body_s : time limit for an empty body, seconds
     """
 
-    def __init__(self, receive: Receive, most: int, body_s: float) -> None:
-        self._receive, self._most, self._body_s = receive, most, body_s
-        self._waited_s, self._bytes, self._whole = 0.0, 0, False
+    def __init__(self, receive: Receive, most: int) -> None:
+        self._receive, self._most, self._bytes, self._whole = receive, most, 0, False
         #: Why the body is not read further.
         self.fault: SceneprintError | None = None
         self._spool: BodySpool | None = None
@@ -502,44 +428,29 @@ class RequestBody:
         """
         if self._whole:
             return await self._receive()
-        start = time.monotonic()
-        left = self._body_s + S_PER_MIB * self._bytes / (1 << 20) - self._waited_s
         try:
-            async with asyncio.timeout(min(IDLE_S, max(left, 0.0))):
+            async with asyncio.timeout(IDLE_S):
                 message = await self._receive()
         except TimeoutError:
-            self.fault = self._slow(left)
+            self.fault = SlowBody(
+                f"The body arrived too slowly: no data for {IDLE_S:g} s, after {self._bytes} "
+                "bytes. Send smaller bodies, or use a faster link."
+            )
             raise Broken from None
-        self._waited_s += time.monotonic() - start
         self._bytes += len(message.get("body", b""))
         self._whole = not message.get("more_body", False)
         if self._bytes > self._most:
             self.fault = too_large(self._most)
             raise Broken
-        if self._spool is not None:
-            self._pay(self._spool)
-        return message
-
-    def _pay(self, spool: BodySpool) -> None:
         more = IN_MEMORY * math.ceil(self._bytes / IN_MEMORY - 1) - self._charged
-        if more <= 0:
-            return
-        try:
-            spool.take(self._tenant, more)
-        except RateLimited as error:
-            self.fault = error
-            raise Broken from None
-        self._charged += more
-
-    def _slow(self, left: float) -> SlowBody:
-        why = (
-            f"no data arrived for {IDLE_S:g} s" if left >= IDLE_S else "the transfer took too long"
-        )
-        return SlowBody(
-            f"The body arrived too slowly: {why}, after {self._bytes} bytes. The limit is "
-            f"{self._body_s:g} s plus {S_PER_MIB:g} s for each MiB. Send smaller bodies, or use a "
-            "faster link."
-        )
+        if self._spool is not None and more > 0:
+            try:
+                self._spool.take(self._tenant, more)
+            except RateLimited as error:
+                self.fault = error
+                raise Broken from None
+            self._charged += more
+        return message
 
 
 def is_import(scope: Scope) -> bool:

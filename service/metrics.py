@@ -249,14 +249,8 @@ class Metrics:
         self, figures: Figures, streams: int, lost: int, held: Mapping[str, int],
         spool: Mapping[str, int],
     ) -> bytes:  # fmt: skip
-        """Return all metrics in the text format of Prometheus.
-
-        Parameters
-        ----------
-        figures : statistics of the store
-        streams : number of open event streams
-        lost : number of queries lost since the start of the process
-        held, spool : requests in progress, and bytes of bodies on disk, by tenant
+        """Return all metrics in the text format of Prometheus. `lost` counts queries since the
+        start of the process; `held` and `spool` are requests and bytes on disk by tenant.
         """
         self.tenants.update(
             requests_in_progress=held, spool_bytes=spool, waiting_jobs=figures.waiting

@@ -17,17 +17,15 @@ from sceneprint.process import NOBODY, name_request, set_actor, set_tenant
 from sceneprint.settings import Settings
 from service.auth import REFUSED, address_of, record_refusal
 from service.browser_security import (
+    PREFLIGHT_HEADERS,
     Headers,
     Origins,
     foreign_request_error,
     forwarded,
-    is_preflight,
-    preflight_headers,
     security_headers,
 )
 from service.limits import (
     Broken,
-    RateState,
     RefusalDelays,
     RequestBody,
     is_import,
@@ -68,8 +66,7 @@ class RequestMiddleware:
         self, app: ASGIApp, settings: Settings, origins: Origins, metrics: Metrics
     ) -> None:
         self._app, self._origins, self._metrics = app, origins, metrics
-        self._most, self._body_s = settings.max_upload_bytes, settings.body_timeout_s
-        self._most_of_import = settings.max_import_bytes
+        self._most, self._most_of_import = settings.max_upload_bytes, settings.max_import_bytes
         self._alone = not settings.asks_for_keys
         self._delays = RefusalDelays()
         self._at_once = 0
@@ -79,9 +76,6 @@ class RequestMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        await self._answer(scope, receive, send)
-
-    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers: dict[bytes, bytes] = dict(scope["headers"])
         sent_id = headers.get(b"x-request-id", b"")
         request_id = sent_id.decode() if _ID.fullmatch(sent_id) else uuid.uuid4().hex
@@ -91,7 +85,7 @@ class RequestMiddleware:
         own: Headers = [(b"x-request-id", request_id.encode())]
         own += self._origins.headers(headers.get(b"origin"))
         state = scope.setdefault("state", {})
-        body = RequestBody(receive, self._limit(scope), self._body_s)
+        body = RequestBody(receive, self._limit(scope))
         at_answer: list[Callable[[], None]] = []
         at_end: list[Callable[[], None]] = [body.close]
         state.update(request_id=request_id, headers=own, forwarded=forwarded(headers))
@@ -104,9 +98,7 @@ class RequestMiddleware:
                 return  # the application's response to the broken body; ours follows
             if message["type"] == "http.response.start":
                 status = message["status"]
-                rate: RateState | None = state.get("rate")
                 complete = [*message["headers"], *own]
-                complete += [] if rate is None else rate.headers()
                 message["headers"] = complete + security_headers(complete)
                 _call(at_answer)  # the audit line below takes a turn of its own
                 if status in _HELD_BACK and not self._alone:
@@ -150,8 +142,9 @@ class RequestMiddleware:
             refusal = foreign_request_error(scope["headers"], self._origins.allows, scope["path"])
             if refusal is not None:
                 return refusal
-        if known and is_preflight(scope["method"], headers):
-            return Response(status_code=204, headers=preflight_headers())
+        preflight = scope["method"] == "OPTIONS" and b"access-control-request-method" in headers
+        if known and preflight:
+            return Response(status_code=204, headers=PREFLIGHT_HEADERS)
         if self._at_once > _MOST_AT_ONCE:
             return Busy(
                 "The service has reached its limit of concurrent requests. Retry in a second."
@@ -186,36 +179,16 @@ class RequestMiddleware:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         tenant = scope["state"].get("tenant", NOBODY)
         self._metrics.request(method, route, status, seconds, received, tenant)
-        if status in REFUSED:
-            self._note_refusal(scope, request_id, status)
+        extra = {
+            "request_id": request_id, "method": scope["method"], "path": scope["path"],
+            "status": status, "milliseconds": round(1e3 * seconds, 1),
+        }  # fmt: skip
         level = logging.DEBUG if route in _PROBES else logging.INFO
-        log.log(
-            level,
-            "request",
-            extra={
-                "request_id": request_id,
-                "method": scope["method"],
-                "path": scope["path"],
-                "status": status,
-                "milliseconds": round(1e3 * seconds, 1),
-            },
-        )
-
-    @staticmethod
-    def _note_refusal(scope: Scope, request_id: str, status: int) -> None:
-        """Log a refusal with its caller and address, for the operator."""
-        client = scope.get("client")
-        log.warning(
-            "refused",
-            extra={
-                "request_id": request_id,
-                "key": scope["state"].get("caller", ""),
-                "address": None if client is None else client[0],
-                "method": scope["method"],
-                "path": scope["path"],
-                "status": status,
-            },
-        )
+        if status in REFUSED:
+            level = logging.WARNING
+            extra["key"] = scope["state"].get("caller", "")
+            extra["address"] = address_of(Request(scope)) or None
+        log.log(level, "request", extra=extra)
 
 
 def _call(callbacks: list[Callable[[], None]]) -> None:

@@ -30,7 +30,6 @@ _LOG = "Its log has the details under the id of the request."
 #: Problem types by the name of the error's class; other classes have that of their nearest base
 #: class. Names without a class are problems that the framework finds.
 PROBLEM_TYPES = {
-    "BadRequest": ProblemType(400, "Use an HTTP client.", "The request is not HTTP."),
     "MalformedBody": ProblemType(
         400, "Send valid JSON, or a form, with the right `Content-Type`."
     ),
@@ -54,7 +53,7 @@ PROBLEM_TYPES = {
         406, "Omit `Accept`.", "`Accept` names no type that the operation returns."
     ),
     "SlowBody": ProblemType(
-        408, "Send the body faster: within 30 s plus 4 s for each MiB, without 10 s of silence."
+        408, "Send the body without pauses of 10 s or more."
     ),
     "Conflict": ProblemType(409, "Compare the request with the stored object."),
     "MapExists": ProblemType(409, "Use the map as it is, or another name."),
@@ -87,7 +86,7 @@ PROBLEM_TYPES = {
     "IdempotencyConflict": ProblemType(422, "Use a new key for each different request."),
     "FrameError": ProblemType(422, "Follow `detail`; do not repeat the request unchanged."),
     "RateLimited": ProblemType(
-        429, "Wait as long as `Retry-After` says; `RateLimit` shows what is left.", retry_after_s=1
+        429, "Wait as long as `Retry-After` says, and repeat.", retry_after_s=1
     ),
     "SceneprintError": ProblemType(500, "Find the request's id in the log, and report it."),
     "DamagedBlob": ProblemType(500, "The operator runs `sceneprint fsck --repair`."),

@@ -14,7 +14,6 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from sceneprint import errors
-from sceneprint_client.api import Problem
 from sceneprint_client.api.base import invalid_request
 from service.browser_security import security_headers
 from service.problem_types import problem_type
@@ -83,9 +82,9 @@ def install(app: FastAPI) -> None:
         answer = error_problem(_id(request), error)
         if answer.status_code >= 500 and not isinstance(error, errors.Busy):
             log.error("request failed", extra={"request_id": _id(request), "error": str(error)})
-        rate = getattr(request.state, "rate", None)
-        if rate is not None and isinstance(error, errors.RateLimited):
-            answer.headers["Retry-After"] = str(rate.wait_s)
+        wait_s = getattr(request.state, "wait_s", None)
+        if wait_s is not None:
+            answer.headers["Retry-After"] = str(wait_s)
         return answer
 
     @app.exception_handler(RequestValidationError)
@@ -131,6 +130,3 @@ def _allowed(app: FastAPI, path: str) -> list[str]:
 
 def _id(request: Request) -> str:
     return str(getattr(request.state, "request_id", ""))
-
-
-__all__ = ["Problem", "error_problem", "install", "problem", "refusals"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
@@ -49,46 +49,51 @@ def is_known(request: Request, tag: str) -> bool:
 
 def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
     """Return the media type that Accept prefers; the first one if Accept prefers none of them."""
-    ranges = []
+    ranges: dict[str, float] = {}
     for kind, parameters in _TYPE.findall(", ".join(request.headers.getlist("accept"))[:1000]):
-        quality = _QUALITY.search(parameters)
-        ranges.append((kind.lower(), min(float(quality[1]), 1.0) if quality else 1.0))
-    rated = [max((_rated(offer, one) for one in ranges), default=(0, 0.0)) for offer in offers]
-    best = max(quality for _, quality in rated)
-    return offers[[quality for _, quality in rated].index(best)]
+        found = _QUALITY.search(parameters)
+        quality = min(float(found[1]), 1.0) if found else 1.0
+        ranges[kind.lower()] = max(quality, ranges.get(kind.lower(), 0.0))
+
+    def quality_of(offer: str) -> float:
+        specific = (offer, f"{offer.partition('/')[0]}/*", "*/*")
+        return next((ranges[one] for one in specific if one in ranges), 0.0)
+
+    return max(offers, key=quality_of)
 
 
-def _rated(offer: str, one: tuple[str, float]) -> tuple[int, float]:
-    """Return how specific a range of Accept is for a media type, and its quality."""
-    kind, quality = one
-    if kind == offer:
-        return 3, quality
-    if kind == f"{offer.partition('/')[0]}/*":
-        return 2, quality
-    return (1, quality) if kind == "*/*" else (0, 0.0)
-
-
-T = TypeVar("T")
+_STRING = {"type": "string"}
+_BINARY = {"type": "string", "format": "binary"}
+_TAG_HEADER = {"description": "Entity tag of the bytes, for If-None-Match.", "schema": _STRING}
+_UNCHANGED = {"description": "Not modified: If-None-Match names this ETag."}
 
 
 def file_responses(
-    *kinds: str, model: Any = None, description: str, statuses: tuple[int, ...] = (404, 409)
-) -> dict[int | str, dict[str, Any]]:
-    """Responses of a route that sends files, for the OpenAPI document."""
-    headers = {
-        "ETag": {
-            "description": "Entity tag of the bytes. Send it in If-None-Match to avoid downloading "
-            "the same bytes again.",
-            "schema": {"type": "string"},
-        }
-    }
-    schema = {"schema": {"type": "string", "format": "binary"}}
-    content = dict.fromkeys(kinds, schema)
-    done: dict[str, Any] = {"description": description, "headers": headers, "content": content}
-    if model is not None:
-        done["model"] = model
-    unchanged = {"description": "Not modified: If-None-Match names this ETag."}
-    return {200: done, 304: unchanged, **refusals(*statuses)}
+    *kinds: str, description: str, model: Any = None, statuses: tuple[int, ...] = (404, 409),
+    tagged: bool = True, ranges: bool = False,
+) -> dict[int | str, dict[str, Any]]:  # fmt: skip
+    """Return the responses of a route that sends files, for the OpenAPI document.
+
+    Parameters
+    ----------
+    kinds : media types of the file; text types have text as their schema
+    description : description of a successful response
+    model : class of the response if it is JSON
+    statuses : status codes of errors
+    tagged : whether the file has an entity tag
+    ranges : whether a request may ask for a range; see `send_file`
+    """
+    content = {one: {"schema": _STRING if one.startswith("text/") else _BINARY} for one in kinds}
+    done: dict[str, Any] = {"description": description, "content": content}
+    if tagged:
+        done["headers"] = {"ETag": _TAG_HEADER}
+    found: dict[int | str, dict[str, Any]] = {304: _UNCHANGED} if tagged else {}
+    if ranges:
+        done["headers"]["Accept-Ranges"] = {"schema": _STRING}
+        found[206] = {**done, "description": "The requested range."}
+        statuses += (416,)
+    found[200] = done if model is None else {**done, "model": model}
+    return found | refusals(*statuses)
 
 
 def tag_headers(output: Output[Any]) -> dict[str, str]:
@@ -121,28 +126,6 @@ def safe(name: str) -> str:
 #: Number of bytes in one read.
 _CHUNK = 1 << 18
 _RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", re.IGNORECASE | re.ASCII)
-
-
-def files(
-    media_types: Sequence[str], description: str, *statuses: int
-) -> dict[int | str, dict[str, Any]]:
-    """Return the responses of a route that uses `send_file`, for the OpenAPI document.
-
-    Parameters
-    ----------
-    media_types : possible media types of the file
-    description : description of a successful response
-    statuses : status codes of errors other than 404 and 416
-    """
-    binary = {one: {"schema": {"type": "string", "format": "binary"}} for one in media_types}
-    tag = {"description": "Entity tag of the bytes.", "schema": {"type": "string"}}
-    headers = {"ETag": tag, "Accept-Ranges": {"schema": {"type": "string"}}}
-    return {
-        200: {"description": description, "headers": headers, "content": binary},
-        206: {"description": "The requested range.", "headers": headers, "content": binary},
-        304: {"description": "Not modified: If-None-Match names this ETag."},
-        **refusals(404, 416, *statuses),
-    }  # fmt: skip
 
 
 def send_file(

@@ -28,7 +28,7 @@ from sceneprint.engine.search.query import Queries
 from sceneprint.process import NOBODY, current_tenant
 from sceneprint.store.keys import KeyRow, KeyUses, find_key
 from service.event_stream import Feed
-from service.limits import BodySpool, Gate, Holdings, RateLimits, SharedChecks, Turns, take_turn
+from service.limits import BodySpool, Gate, Holdings, SharedChecks, TokenBucket, Turns, take_turn
 from service.metrics import Metrics
 
 T = TypeVar("T")
@@ -59,7 +59,7 @@ class Service:
         for other writers, so queries have a gate of their own
     keys : whether requests need a key
     feed : stream of events
-    limits : rate limits of requests
+    request_rate, wrong_keys : rate limits of requests by tenant, and of wrong keys by address
     places : maximum number of requests in progress; a tenant may have three quarters of them
     wait_s : maximum wait for a turn, seconds
     requests : number of requests in progress of each tenant
@@ -95,7 +95,9 @@ class Service:
         )  # fmt: skip
         self.keys = settings.asks_for_keys
         self.feed = Feed(store.database, settings.max_event_streams, settings.events_per_map)
-        self.limits = RateLimits(settings.tenant_requests_per_s, settings.wrong_keys_per_minute)
+        rate, wrong = settings.tenant_requests_per_s, settings.wrong_keys_per_minute
+        self.request_rate = TokenBucket("requests", rate, 5 * rate)
+        self.wrong_keys = TokenBucket("wrong keys", wrong / 60, wrong)
         self.places = settings.concurrent_requests + settings.queued_requests
         self.requests, self.spool = Holdings(), BodySpool()
         self.reads = Turns(READS, READS_BESIDE, rests=True)

@@ -6,6 +6,7 @@ import asyncio
 import fcntl
 import gc
 import logging
+import math
 import resource
 import signal
 import socket
@@ -14,12 +15,10 @@ import struct
 import sys
 import termios
 import time
-import uuid
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
-import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -37,14 +36,14 @@ if TYPE_CHECKING:
 
 # Connections, closed if the client neither sends nor reads.
 #
-# uvicorn has no time limit for the head of a request and for a client that reads its response, and
-# counts silent connections as busy. A few clients could therefore lock all others out.
+# uvicorn has no time limit for the head of a request and for a client that reads its response. A
+# proxy enforces stricter limits; these bound the connections and the memory of a service without
+# one.
 
-#: Time limit for the head of a request, seconds, from its first byte or the start of the
-#: connection.
-HEAD_S = 10.0
-#: Interval of checks whether the client reads, seconds, and the minimum of bytes per interval.
+#: Interval of checks, seconds, and the minimum of bytes that a client reads in it.
 READING_S, READING_BYTES = 30.0, 30 << 10
+#: Time limit for a connection without a complete request, and for a TLS handshake, seconds.
+SILENT_S, HANDSHAKE_S = 60.0, 10.0
 #: Maximum number of connections. Beyond it, the one that has been silent for longest is closed.
 MOST_CONNECTIONS = 1000
 #: Number of other open files, such as the database, uploads, blobs and indexes.
@@ -56,9 +55,8 @@ class Connection(H11Protocol):
     count.
     """
 
-    _head: asyncio.TimerHandle | None = None
-    _reading: asyncio.TimerHandle | None = None
-    _unread_before = 0
+    _checking: asyncio.TimerHandle | None = None
+    _unread_before = math.inf
     silent_since = 0.0
     #: Transport below TLS; None without TLS.
     wire: asyncio.Transport | None = None
@@ -78,103 +76,43 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self.silent_since = time.monotonic()
         close_oldest(self.connections, self)
-        self._time_head()
-
-    def data_received(self, data: bytes) -> None:
-        """Read data and restart the timer of the head."""
-        super().data_received(data)
-        self._time_head()
+        self._checking = self.loop.call_later(READING_S, self._check)
 
     def on_response_complete(self) -> None:
         """Wait for the next request."""
         self.silent_since = time.monotonic()
         super().on_response_complete()
-        # The TLS layer does not report its buffers, and waits for the client's close message.
-        if self.wire is not None and (self._unread() > 0 or self.transport.is_closing()):
-            self._time_reading()
+
+    def resume_writing(self) -> None:
+        """Note that the client has read enough."""
+        super().resume_writing()
+        self._unread_before = math.inf
 
     def shutdown(self) -> None:
         """Finish the response in progress, or close an idle connection."""
-        if self.wire is not None and self.idle:
-            self.loop.call_later(FAREWELL_S, self.transport.abort)
+        if self.idle and self._unread() == 0:
+            self.transport.abort()  # TLS would wait for the client's close message
         super().shutdown()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop all timers."""
-        for timer in (self._head, self._reading):
-            if timer is not None:
-                timer.cancel()
+        """Stop the checks."""
+        if self._checking is not None:
+            self._checking.cancel()
         super().connection_lost(exc)
 
-    def pause_writing(self) -> None:
-        """Start the timer for reading, because the buffer is full."""
-        super().pause_writing()
-        self._time_reading()
-
-    def resume_writing(self) -> None:
-        """Stop the timer for reading, because the client has read enough."""
-        if self._reading is not None:
-            self._reading.cancel()
-            self._reading = None
-        super().resume_writing()
-
-    def timeout_keep_alive_handler(self) -> None:
-        """Close an idle connection; a response in progress keeps its own time limit."""
-        carried = 0 if self.wire is None else self.wire.get_write_buffer_size()
-        if self.transport.get_write_buffer_size() + carried == 0:
-            self.transport.abort()
-        elif self._reading is None:
-            self._time_reading()
-
-    def send_400_response(self, msg: str) -> None:
-        """Refuse a request that is not HTTP with a problem document."""
-        from service.problems import problem
-
-        if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
-            self.transport.abort()  # a response is in progress
-            return
-        request_id = uuid.uuid4().hex
-        detail = f"{msg} Its head is not HTTP/1.1, or longer than 16 KiB. Check the client."
-        response = problem(request_id, "BadRequest", 400, detail)
-        headers = [*response.raw_headers, (b"x-request-id", request_id.encode())]
-        headers += [(b"connection", b"close"), (b"cache-control", b"no-store")]
-        for event in (
-            h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
-            h11.Data(data=bytes(response.body)),
-            h11.EndOfMessage(),
-        ):
-            self.transport.write(self.conn.send(event) or b"")
-        self.transport.close()
-        if self.wire is not None:
-            self._time_reading()
-
-    def _time_head(self) -> None:
-        """Start the timer of the next head, unless it runs or a response is in progress."""
-        if not self.silent:
-            if self._head is not None:
-                self._head.cancel()
-                self._head = None
-        elif self._head is None:
-            self._head = self.loop.call_later(HEAD_S, self.transport.abort)
-
-    def _time_reading(self) -> None:
-        if self._reading is not None:
-            self._reading.cancel()
-        self._unread_before = self._unread()
-        self._reading = self.loop.call_later(READING_S, self._check_reading)
-
-    def _check_reading(self) -> None:
-        """Abort the connection if the client has read too little since the last check."""
-        self._reading = None
-        if not (self.silent or self.flow.write_paused):
-            return  # the response was read, and the next request has arrived
-        unread, silent_s = self._unread(), time.monotonic() - self.silent_since
-        if unread == 0 and not self.transport.is_closing() and silent_s < self.timeout_keep_alive:
-            return  # everything was read; `timeout_keep_alive_handler` closes the connection
-        if unread > self._unread_before - READING_BYTES:
-            self.transport.abort()
+    def _check(self) -> None:
+        """Abort the connection if the client is silent, or reads too little of its response."""
+        unread = self._unread()
+        if unread == 0:
+            is_over = self.silent and time.monotonic() - self.silent_since > SILENT_S
         else:
-            self._time_reading()
+            is_slow = unread > self._unread_before - READING_BYTES
+            is_over = is_slow and (self.silent or self.flow.write_paused)
+        if is_over:
+            self.transport.abort()
+            return
+        self._unread_before = unread or math.inf
+        self._checking = self.loop.call_later(READING_S, self._check)
 
     def _unread(self) -> int:
         """Return the number of unread bytes in our buffers and in those of the kernel."""
@@ -200,13 +138,9 @@ def close_oldest(connections: Iterable[object], new: object) -> None:
 # TLS. asyncio creates a connection only after the handshake, which may take a minute, so
 # unfinished handshakes would not be counted.
 
-#: Time for the client to confirm the end of an idle connection, seconds.
-FAREWELL_S = 2.0
 #: Shutdown timeout of asyncio, which must not end a connection whose last response is still being
 #: read: `Connection` has its own time limit.
 NEVER_S = 86_400.0
-#: Number of bytes that wait for encryption before writing pauses, as without TLS.
-UNENCRYPTED_BYTES = 64 << 10
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:
@@ -282,7 +216,7 @@ class Handshake(asyncio.Protocol):
         try:
             secured = await asyncio.get_running_loop().start_tls(
                 self.transport, self, self._context, server_side=True,
-                ssl_handshake_timeout=HEAD_S, ssl_shutdown_timeout=NEVER_S,
+                ssl_handshake_timeout=HANDSHAKE_S, ssl_shutdown_timeout=NEVER_S,
             )  # fmt: skip
         except OSError:  # no TLS, no common protocol, timeout or disconnect
             self.transport.abort()
@@ -292,7 +226,6 @@ class Handshake(asyncio.Protocol):
         if secured is None or self._lost:
             self.transport.abort()
             return
-        secured.set_write_buffer_limits(high=UNENCRYPTED_BYTES)
         connection = Connection(server_state=self._state, **self._more)
         connection.wire = self.transport
         secured.set_protocol(connection)
@@ -307,15 +240,6 @@ def connection_limit() -> int:
     if soft == resource.RLIM_INFINITY:
         return MOST_CONNECTIONS
     return min(MOST_CONNECTIONS, max(soft - OTHER_FILES, 16))
-
-
-def raise_file_limit() -> None:
-    """Raise this process's limit of open files to that of all connections, if permitted."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = MOST_CONNECTIONS + OTHER_FILES
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
 
 
 log = logging.getLogger(__name__)
@@ -384,16 +308,14 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         timeout_keep_alive=30,
-        # our classes have the time limits that uvicorn lacks
-        http=Connection if context is None else tls_protocol(context),
+        http=Connection if context is None else cast(Any, partial(Handshake, context)),
         ws="none",
         h11_max_incomplete_event_size=16 << 10,
         proxy_headers=False,  # uvicorn would trust X-Forwarded-For from any local process
     )
     raise_descriptors()
     sys.setswitchinterval(SWITCH_S)
-    raise_file_limit()
-    server = _Server(config, lambda: ready(url, read_only), lambda: _close_feed(app))
+    server = _Server(config, app, lambda: ready(url, read_only))
     try:
         server.run(sockets=[listening])
     except KeyboardInterrupt:  # uvicorn repeats the signal with which `Front` stopped it
@@ -417,11 +339,6 @@ def _require_store(settings: Settings) -> bool:
         store.close()
 
 
-def tls_protocol(context: ssl.SSLContext) -> type[asyncio.Protocol]:
-    """Return the factory of TLS connections for uvicorn."""
-    return cast("type[asyncio.Protocol]", partial(Handshake, context))
-
-
 def _load(settings: Settings) -> FastAPI:
     """Return the application. Imported objects are excluded from garbage collection."""
     from service.app import create_app
@@ -432,19 +349,12 @@ def _load(settings: Settings) -> FastAPI:
     return app
 
 
-def _close_feed(front: Front) -> None:
-    if front.app is not None:
-        front.app.state.service.feed.close()
-
-
 class _Server(uvicorn.Server):
     """A server that reports its start and the beginning of its shutdown."""
 
-    def __init__(
-        self, config: uvicorn.Config, started: Callable[[], None], stopping: Callable[[], None]
-    ) -> None:
+    def __init__(self, config: uvicorn.Config, front: Front, started: Callable[[], None]) -> None:
         super().__init__(config)
-        self._started, self._stopping = started, stopping
+        self._front, self._started = front, started
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, and report it."""
@@ -454,5 +364,6 @@ class _Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Close event streams, which would otherwise delay the shutdown, and stop."""
-        self._stopping()
+        if self._front.app is not None:
+            self._front.app.state.service.feed.close()
         await super().shutdown(sockets)

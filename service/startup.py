@@ -8,14 +8,15 @@ All other requests wait until the application is loaded, approximately one secon
 from __future__ import annotations
 
 import asyncio
-import json
 import uuid
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from starlette.responses import JSONResponse
+
 from sceneprint import __version__
 from sceneprint.settings import Settings
-from service.browser_security import Headers, foreign_request_error, security_headers
+from service.browser_security import foreign_request_error, security_headers
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -44,7 +45,10 @@ class Front:
             return
         if self.app is None:
             if self._is_harmless(scope):
-                await _answer(scope, send)
+                content = {"status": "ok", "version": __version__}  # as the application answers
+                response = JSONResponse(content, headers={"X-Request-Id": uuid.uuid4().hex})
+                response.raw_headers += security_headers(response.raw_headers)
+                await response(scope, receive, send)
                 return
             await self._loaded.wait()
         if self.app is None:
@@ -81,16 +85,3 @@ class Front:
             self._failed()
         finally:
             self._loaded.set()
-
-
-async def _answer(scope: Scope, send: Send) -> None:
-    """Send the application's response to `/healthz`."""
-    body = json.dumps({"status": "ok", "version": __version__}, separators=(",", ":")).encode()
-    headers: Headers = [
-        (b"content-length", str(len(body)).encode()),
-        (b"content-type", b"application/json"),
-        (b"x-request-id", uuid.uuid4().hex.encode()),
-    ]
-    headers += security_headers(headers)
-    await send({"type": "http.response.start", "status": 200, "headers": headers})
-    await send({"type": "http.response.body", "body": body if scope["method"] == "GET" else b""})

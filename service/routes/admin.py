@@ -28,7 +28,17 @@ from sceneprint_client.api.admin import (
     NewModel,
     Stats,
 )
-from service.auth import Guest, Sender, administers, may_admin, reads_every, v1_router
+from service.auth import (
+    Cursor,
+    Guest,
+    Limit,
+    OnlyMap,
+    Sender,
+    administers,
+    may_admin,
+    reads_every,
+    v1_router,
+)
 from service.bodies import json_body, read_record
 from service.problems import refusals
 from service.running_service import Here
@@ -115,9 +125,6 @@ def metrics(here: Here) -> Response:
 
 keys_router = v1_router(tag="keys")
 
-Cursor = Annotated[str | None, Query(description="`next_cursor` of the previous page.")]
-Limit = Annotated[int, Query(ge=1, le=1000)]
-
 
 @keys_router.post(
     "/keys",
@@ -197,9 +204,7 @@ def list_changes(
     actor: Annotated[
         str | None, Query(max_length=128, description="Only changes by the key with this name.")
     ] = None,
-    map_name: Annotated[
-        str | None, Query(alias="map", max_length=63, description="Only changes of this map.")
-    ] = None,
+    map_name: OnlyMap = None,
     action: Annotated[
         str | None,
         Query(max_length=32, description="Prefix of the action, such as `key.` or `refused`."),

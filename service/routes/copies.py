@@ -9,18 +9,20 @@ from fastapi import Path, Request, Response
 from sceneprint_client.api.copies import CopyRequest
 from service.auth import may_read, v1_router
 from service.bodies import json_body, read_record
-from service.problems import refusals
+from service.responses import file_responses
 from service.running_service import Here
 
 router = v1_router("/maps/{map_name}/copy", "maps", may_read)
 
-_BYTES: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/octet-stream": {"schema": {"type": "string"}}}}
-}
+_BYTES = "application/octet-stream"
+
+
+def _responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    return file_responses(_BYTES, description="The bytes.", statuses=statuses, tagged=False)
 
 
 @router.post(
-    "", response_class=Response, responses={**_BYTES, **refusals(400, 404, 413, 415, 422)},
+    "", response_class=Response, responses=_responses(400, 404, 413, 415, 422),
     openapi_extra=json_body("CopyRequest"),
 )  # fmt: skip
 async def copy_map(map_name: str, request: Request, here: Here) -> Response:
@@ -32,9 +34,7 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
     return _response(await here.run(here.copies.bundle, map_name, frozenset(known.have)))
 
 
-@router.get(
-    "/artifacts/{digest}", response_class=Response, responses={**_BYTES, **refusals(404, 422)}
-)
+@router.get("/artifacts/{digest}", response_class=Response, responses=_responses(404, 422))
 def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
@@ -42,11 +42,11 @@ def get_artifact(
     return _response(here.copies.artifact(map_name, digest))
 
 
-@router.get("/model", response_class=Response, responses={**_BYTES, **refusals(404)})
+@router.get("/model", response_class=Response, responses=_responses(404))
 def get_map_model(map_name: str, here: Here) -> Response:
     """Return the model file of a map."""
     return _response(here.copies.model(map_name))
 
 
 def _response(data: bytes) -> Response:
-    return Response(data, media_type="application/octet-stream")
+    return Response(data, media_type=_BYTES)

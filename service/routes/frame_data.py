@@ -24,7 +24,6 @@ from sceneprint_client.formats import BYTES, HEAD, media_types_of
 from service.auth import MatchMap, Sender, may_read, require_readable, v1_router
 from service.responses import (
     file_responses,
-    files,
     is_known,
     preferred_media_type,
     safe,
@@ -137,7 +136,9 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 @router.get(
     "/upload",
     response_class=Response,
-    responses=files(media_types_of("depth", "cloud"), "The uploaded bytes, unchanged.", 409),
+    responses=file_responses(
+        *media_types_of("depth", "cloud"), description="The uploaded bytes, unchanged.", ranges=True
+    ),
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """Return the uploaded file of a frame."""
@@ -164,11 +165,16 @@ def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str
 
 points_router = v1_router()
 
-Limit = Annotated[
+_MostPoints = Annotated[
     int,
     Query(ge=1, le=MOST, description="Maximum number of points; the selection is deterministic."),
 ]
-_BYTES = "A header of 48 bytes, then 12 bytes per point; see docs/reference.md, Points. "
+_POINTS = file_responses(
+    MEDIA_TYPE,
+    description="A header of 48 bytes, then 12 bytes per point; see docs/reference.md, Points. "
+    "Normals, validation patches and, in a comparison, residuals are included.",
+    statuses=(404, 409, 422),
+)
 
 
 @points_router.get(
@@ -176,11 +182,7 @@ _BYTES = "A header of 48 bytes, then 12 bytes per point; see docs/reference.md, 
     tags=["frames"],
     dependencies=[Depends(may_read)],
     response_class=Response,
-    responses=file_responses(
-        MEDIA_TYPE,
-        description=f"{_BYTES}Normals and validation patches are included.",
-        statuses=(404, 409, 422),
-    ),
+    responses=_POINTS,
 )
 async def get_frame_points(
     map_name: str,
@@ -190,7 +192,7 @@ async def get_frame_points(
     frame: Annotated[
         CloudFrame, Query(description="Coordinate frame, as for `cloud.ply`.")
     ] = "optical",
-    limit: Limit = LIMIT,
+    limit: _MostPoints = LIMIT,
 ) -> Response:
     """Return the points of `cloud.ply` in a third of its bytes, for display on a web page."""
     found = await here.run(lambda: here.points.frame(map_name, frame_id, frame, limit))
@@ -198,17 +200,10 @@ async def get_frame_points(
 
 
 @points_router.get(
-    "/queries/{query_id}/points",
-    tags=["queries"],
-    response_class=Response,
-    responses=file_responses(
-        MEDIA_TYPE,
-        description=f"{_BYTES}Normals and validation patches are included.",
-        statuses=(404, 409, 422),
-    ),
+    "/queries/{query_id}/points", tags=["queries"], response_class=Response, responses=_POINTS
 )
 async def get_query_points(
-    query_id: str, request: Request, here: Here, caller: Sender, limit: Limit = LIMIT
+    query_id: str, request: Request, here: Here, caller: Sender, limit: _MostPoints = LIMIT
 ) -> Response:
     """Return the surface of a query in the frame of its sensor, for display on a web page."""
     await here.run(require_readable, query_id, here, caller)
@@ -220,12 +215,7 @@ async def get_query_points(
     "/queries/{query_id}/matches/{frame_id}/points",
     tags=["queries"],
     response_class=Response,
-    responses=file_responses(
-        MEDIA_TYPE,
-        description=f"{_BYTES}Normals, validation patches and, if there is a transform, "
-        "residuals are included.",
-        statuses=(404, 409, 422),
-    ),
+    responses=_POINTS,
 )
 async def get_match_points(
     query_id: str,
@@ -242,7 +232,7 @@ async def get_match_points(
             "`rival`: the best alternative transform. `none`: the identity."
         ),
     ] = "aligned",
-    limit: Limit = LIMIT,
+    limit: _MostPoints = LIMIT,
 ) -> Response:
     """Return the query or one of its matches in the frame of its own sensor, for display on a web
     page. Every point has its distance from the surface of the other frame.

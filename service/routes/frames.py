@@ -33,19 +33,7 @@ from sceneprint_client.api.frames import (
 from sceneprint_client.api.listing import FramePage
 from sceneprint_client.formats import media_types_of
 from service import bodies
-from service.auth import Caller, Sender, may_read, may_write, v1_router
-from service.bodies import (
-    FORM,
-    FRAME_BODY,
-    IdempotencyKey,
-    idempotent_request,
-    mark_replayed,
-    media_type,
-    priority_of,
-    read_frames,
-    read_upload,
-    upload_responses,
-)
+from service.auth import Caller, Cursor, Limit, Sender, may_read, may_write, v1_router
 from service.problems import refusals
 from service.running_service import Here, Service
 
@@ -89,12 +77,9 @@ LONGEST_WAIT_S = 200.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.03, 0.5, 1.5
 
 _PRIORITY = {
-    "type": "integer",
-    "minimum": -MOST_PRIORITY,
-    "maximum": MOST_PRIORITY,
-    "default": 0,
+    "type": "integer", "minimum": -MOST_PRIORITY, "maximum": MOST_PRIORITY, "default": 0,
     "description": "Workers sign frames of higher priority first.",
-}
+}  # fmt: skip
 _IF_NOVEL = {
     "anyOf": [{"type": "number", "exclusiveMinimum": 0, "maximum": 1}, {"type": "boolean"}],
     "default": False,
@@ -116,69 +101,37 @@ Prefer = Annotated[
 ]
 
 
-def query_options(options: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the query parameters of upload options, for the OpenAPI document."""
-    text = f"The same as the field of the form. {bodies.BARE}"
-    return [bodies.query_parameter(name, schema, text) for name, schema in options.items()]
-
-
-def _described_upload() -> dict[str, Any]:
-    """Return the body and the parameters of an upload, for the OpenAPI document."""
-    form = FRAME_BODY["content"][FORM]
-    properties = {**form["schema"]["properties"], **OPTIONS}
-    schema = {**form["schema"], "properties": properties}
-    return {
-        "parameters": [*bodies.parameters(), *query_options(OPTIONS)],
-        "requestBody": {
-            **FRAME_BODY, "content": {FORM: {**form, "schema": schema}, **bodies.content()},
-        },
-    }  # fmt: skip
-
-
-_BATCH = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            FORM: {
-                "schema": {
-                    "type": "object",
-                    "required": ["frame", "metas"],
-                    "properties": {
-                        "frame": {
-                            "type": "array",
-                            "minItems": 1,
-                            "maxItems": MOST_OF_BATCH,
-                            "items": {"type": "string", "format": "binary"},
-                            "description": "One `frame` part for each frame.",
-                        },
-                        "metas": {
-                            "anyOf": [
-                                {"$ref": "#/components/schemas/FrameMeta"},
-                                {
-                                    "type": "array",
-                                    "items": {"$ref": "#/components/schemas/FrameMeta"},
-                                },
-                            ],
-                            "description": "One object for all frames, or a list with one object "
-                            "for each frame, in the same order.",
-                        },
-                        **OPTIONS,
-                    },
-                },
-                "encoding": {"metas": {"contentType": "application/json"}},
-            }
-        },
-    }
+_PARAMETERS_OF_OPTIONS = [
+    bodies.query_parameter(name, schema, f"The same as the field of the form. {bodies.BARE}")
+    for name, schema in OPTIONS.items()
+]
+_UPLOAD = bodies.form_body(bodies.FRAME_PARTS | OPTIONS, ["frame", "meta"], "meta")
+_UPLOAD["content"] |= bodies.content()
+_DESCRIBED = {
+    "parameters": [*bodies.parameters(), *_PARAMETERS_OF_OPTIONS], "requestBody": _UPLOAD,
+}  # fmt: skip
+_METAS = {
+    "anyOf": [bodies.META, {"type": "array", "items": bodies.META}],
+    "description": "One object for all frames, or a list with one object for each frame, in the "
+    "same order.",
 }
+_BATCH_PARTS = {
+    "frame": {
+        "type": "array", "minItems": 1, "maxItems": MOST_OF_BATCH, "items": bodies.FILE,
+        "description": "One `frame` part for each frame.",
+    },
+    "metas": _METAS,
+}  # fmt: skip
+_BATCH = {"requestBody": bodies.form_body(_BATCH_PARTS | OPTIONS, ["frame", "metas"], "metas")}
 
 
 @router.post(
-    "", status_code=202, responses=_RESPONSES, openapi_extra=_described_upload(),
+    "", status_code=202, responses=_RESPONSES, openapi_extra=_DESCRIBED,
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def add_frame(
     map_name: str, request: Request, here: Here, caller: Sender, response: Response,
-    prefer: Prefer = None, key: IdempotencyKey = None,
+    prefer: Prefer = None, key: bodies.IdempotencyKey = None,
 ) -> Added:  # fmt: skip
     """Add a frame to a map. The frame is stored durably before the response; a worker then signs
     it.
@@ -189,7 +142,7 @@ async def add_frame(
 
 
 @router.put(
-    "/{frame_id}", status_code=202, responses=_RESPONSES, openapi_extra=_described_upload(),
+    "/{frame_id}", status_code=202, responses=_RESPONSES, openapi_extra=_DESCRIBED,
     dependencies=[Depends(may_write)],
 )  # fmt: skip
 async def put_frame(
@@ -211,24 +164,27 @@ async def put_frame(
 )  # fmt: skip
 async def add_batch(
     map_name: str, request: Request, here: Here, caller: Sender, response: Response,
-    key: IdempotencyKey = None,
+    key: bodies.IdempotencyKey = None,
 ) -> Batch:  # fmt: skip
     """Add up to 64 frames to a map at once. An invalid frame does not affect the others.
 
     All valid frames are added in one transaction. If the request fails, no frame is added.
     """
-    async with here.upload_gate.place(), read_frames(request, "priority", "if_novel") as batch:
+    async with (
+        here.upload_gate.place(),
+        bodies.read_frames(request, "priority", "if_novel") as batch,
+    ):
 
         def add() -> tuple[Batch, bool]:
             uploads = batch.read()
             contents = [(one.data, one.meta) for one in uploads]
             parts = ("batch", map_name, contents, batch.priority, batch.if_novel, batch.faults())
-            once = idempotent_request(caller, key, *parts)
+            once = bodies.idempotent_request(caller, key, *parts)
             outcomes, replayed = here.uploads.add_all(map_name, uploads, once)
-            return upload_responses(batch, outcomes), replayed
+            return bodies.upload_responses(batch, outcomes), replayed
 
         answer, replayed = await here.upload_gate.run(add)
-    mark_replayed(response, replayed=replayed)
+    bodies.mark_replayed(response, replayed=replayed)
     return answer
 
 
@@ -237,19 +193,19 @@ async def _add_frame(
     response: Response, prefer: str | None, key: str | None,
 ) -> Added:  # fmt: skip
     options = ("priority", "if_novel")
-    async with here.upload_gate.place(), read_upload(request, *options) as form:
-        priority = priority_of(form.fields)
+    async with here.upload_gate.place(), bodies.read_upload(request, *options) as form:
+        priority = bodies.priority_of(form.fields)
         if_novel = novelty_of(form.fields.get("if_novel"))
 
         def add() -> tuple[Added, bool, bool]:
             upload = Upload(form.file.read(), form.meta, priority, if_novel, frame_id)
             parts = ("frame", map_name, upload.data, form.meta, priority, if_novel)
-            once = idempotent_request(caller, key, *parts)
+            once = bodies.idempotent_request(caller, key, *parts)
             outcome, replayed = here.uploads.add(map_name, upload, once)
             return outcome.accepted, outcome.new, replayed
 
         added, is_new, replayed = await here.upload_gate.run(add)
-    mark_replayed(response, replayed=replayed)
+    bodies.mark_replayed(response, replayed=replayed)
     response.headers["Location"] = f"/v1/jobs/{added.job_id}"
     wait_s = _wait(prefer)
     if wait_s > 0:
@@ -339,7 +295,7 @@ def _described_import() -> dict[str, Any]:
 )  # fmt: skip
 async def add_import(
     map_name: str, request: Request, here: Here, caller: Sender, response: Response,
-    key: IdempotencyKey = None,
+    key: bodies.IdempotencyKey = None,
 ) -> Job:  # fmt: skip
     """Import an archive of sequences, a map in one file, or a recording. The body is the file.
 
@@ -358,20 +314,20 @@ async def add_import(
     the job (RecordingOutline) lists the topics and findings as soon as the file is read, even if no
     frame can be used.
     """
-    if media_type(request) not in TYPES:
+    if (kind := bodies.media_type(request)) not in TYPES:
         raise UnsupportedType(
-            f"The body is {media_type(request) or 'of no type'!r:.80}. Send an archive with one of "
-            f"the types {', '.join(TYPES)}."
+            f"The body is {kind or 'of no type'!r:.80}. Send an archive with one of the types "
+            f"{', '.join(TYPES)}."
         )
     options = _options(request)
     receiving = contextmanager_in_threadpool(here.imports.receive(map_name, options))
     async with here.upload_gate.place(), receiving as receiver:
         archive = await _store_archive(receiver, request, here)
-        once = idempotent_request(caller, key, "import", map_name, archive.blob, options)
+        once = bodies.idempotent_request(caller, key, "import", map_name, archive.blob, options)
         job, replayed = await here.upload_gate.run(
             lambda: here.imports.begin(map_name, archive, options, once), patient=True
         )
-    mark_replayed(response, replayed=replayed)
+    bodies.mark_replayed(response, replayed=replayed)
     response.headers["Location"] = f"/v1/jobs/{job.job_id}"
     return job
 
@@ -380,11 +336,7 @@ async def add_import(
     "/{job_id}/items", responses=refusals(404, 422), dependencies=[Depends(may_read)]
 )
 def list_import_items(
-    map_name: str,
-    job_id: str,
-    here: Here,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    map_name: str, job_id: str, here: Here, cursor: Cursor = None, limit: Limit = 100
 ) -> Page[ImportItem]:
     """List the results of an import so far, with one item for each frame and each skipped file of
     an archive, or for each view of a map.

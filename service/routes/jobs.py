@@ -19,7 +19,17 @@ from sceneprint.store.events import EventFilter
 from sceneprint.store.opaque_ids import OpaqueIds
 from sceneprint_client.api import Job, JobState, Page
 from sceneprint_client.api.admin import EventPage, RetriedJobs
-from service.auth import Caller, Sender, hold_read, page_response, release_place, v1_router
+from service.auth import (
+    Caller,
+    Cursor,
+    Limit,
+    OnlyMap,
+    Sender,
+    hold_read,
+    page_response,
+    release_place,
+    v1_router,
+)
 from service.event_stream import BEGIN, MEDIA_TYPE, EventStream, Feed, alive, message
 from service.problems import refusals
 from service.running_service import Here, Service
@@ -38,11 +48,9 @@ def list_jobs(
     kind: Annotated[
         str | None, Query(max_length=16, description="Only jobs of this kind, such as `associate`.")
     ] = None,
-    map_name: Annotated[
-        str | None, Query(alias="map", description="Only jobs of this map.")
-    ] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    map_name: OnlyMap = None,
+    cursor: Cursor = None,
+    limit: Limit = 100,
 ) -> Page[Job]:
     """List the jobs of all maps that the key may read, newest first.
 
@@ -62,10 +70,8 @@ def list_jobs(
 def retry_dead_jobs(
     here: Here,
     caller: Sender,
-    map_name: Annotated[
-        str | None, Query(alias="map", description="Only jobs of this map.")
-    ] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
+    map_name: OnlyMap = None,
+    cursor: Cursor = None,
     limit: Annotated[
         int, Query(ge=1, le=MOST_RETRIED, description="Number of jobs in one page.")
     ] = 100,
@@ -136,9 +142,7 @@ async def events(
     request: Request,
     here: Here,
     caller: Sender,
-    map_name: Annotated[
-        str | None, Query(alias="map", description="Only events of this map.")
-    ] = None,
+    map_name: OnlyMap = None,
     kind: Annotated[
         list[str],
         Query(
@@ -159,7 +163,7 @@ async def events(
         Literal["newest", "oldest"] | None,
         Query(description="Order of a page; default: `oldest` with `after`, otherwise `newest`."),
     ] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
+    cursor: Cursor = None,
     limit: Annotated[int, Query(ge=1, le=1000, description="Number of events in a page.")] = 100,
     last_event_id: Annotated[
         str | None,

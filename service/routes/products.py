@@ -21,14 +21,11 @@ from sceneprint_client.api.coverage import (
     MapCoverage,
 )
 from sceneprint_client.api.sessions import Association, Difference, Edge, Graph, GraphFormat
-from service.auth import may_read, may_write, v1_router
+from service.auth import Cursor, Limit, may_read, may_write, v1_router
 from service.bodies import json_body, read_record
 from service.problems import refusals
 from service.responses import file_responses, preferred_media_type, send_product_file
 from service.running_service import Here, Service
-
-Cursor = Annotated[str | None, Query(description="`next_cursor` of the previous page.")]
-Limit = Annotated[int, Query(ge=1, le=1000)]
 
 
 def product_router(
@@ -173,14 +170,6 @@ associations_router = product_router(
     "frames of the sessions. Each frame takes one worker approximately 0.1 s.",
 )  # fmt: skip
 
-_TEXT_SCHEMA = {"schema": {"type": "string"}}
-_GRAPH: dict[int | str, dict[str, Any]] = {
-    200: {
-        "model": Graph,
-        "description": "The graph in the requested format.",
-        "content": {MEDIA_TYPES["g2o"]: _TEXT_SCHEMA, MEDIA_TYPES["tum"]: _TEXT_SCHEMA},
-    }
-}
 _Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Minimum overlap of an edge.")]
 
 
@@ -218,7 +207,16 @@ def list_edges(
 
 
 @associations_router.get(
-    "/{job_id}/graph", response_class=Response, responses={**_GRAPH, **refusals(404, 409, 422)}
+    "/{job_id}/graph",
+    response_class=Response,
+    responses=file_responses(
+        MEDIA_TYPES["g2o"],
+        MEDIA_TYPES["tum"],
+        model=Graph,
+        tagged=False,
+        description="The graph in the requested format.",
+        statuses=(404, 409, 422),
+    ),
 )
 async def get_graph(
     map_name: str,

@@ -36,24 +36,11 @@ from sceneprint_client.api.base import Given, Label, record_of
 from sceneprint_client.api.query import MOST_OF_SEQUENCE
 from service import bodies
 from service.auth import Caller, Sender, may_read, require_readable, v1_router
-from service.bodies import (
-    FORM,
-    FRAME_BODY,
-    FormUpload,
-    media_type,
-    query_parameter,
-    read_form,
-    read_frames,
-    read_json,
-    read_meta,
-    read_upload,
-)
 from service.problems import refusals
 from service.running_service import Here, Service
 
 Asked = TypeVar("Asked", bound=Query)
 
-JSON = "application/json"
 TEMPLATE = "#/components/schemas/{model}"
 _QUERY = "The query"
 
@@ -66,12 +53,12 @@ class QueryBody(Generic[Asked]):
     ----------
     query : options of the query
     upload : the sent frame; None if a stored frame is named
-    named : fields of JSON beside the query, by name
+    named : fields of bodies.JSON beside the query, by name
     robot : name of the robot that sends the query; None if unknown
     """
 
     query: Asked
-    upload: FormUpload | None
+    upload: bodies.FormUpload | None
     named: Mapping[str, Any]
     robot: str | None = None
 
@@ -103,20 +90,20 @@ async def read_query(
     ------
     UnsupportedType, MalformedBody, InvalidRequest, StoreFull, UnusableStore : See `read_upload`.
     """
-    if media_type(request) == JSON:
+    if bodies.media_type(request) == bodies.JSON:
         fields = await read_object(request)
         sender = record_of(_Sender, {"robot": fields.pop("robot", None)}, _QUERY)
         own = {} if named in kind.model_fields else {named: fields.pop(named, None)}
         yield QueryBody(record_of(kind, fields, _QUERY), None, own, sender.robot)
         return
     options = [name for name in kind.model_fields if name != named]
-    async with read_upload(request, *options) as upload:
+    async with bodies.read_upload(request, *options) as upload:
         yield QueryBody(record_of(kind, upload.fields, _QUERY), upload, {}, upload.meta.robot)
 
 
 async def read_object(request: Request) -> dict[str, Any]:
     """Return the body as a JSON object; raise MalformedBody if it is not one."""
-    body = await read_json(request)
+    body = await bodies.read_json(request)
     if not isinstance(body, dict):
         raise MalformedBody("The body is not a JSON object. Send an object.")
     return body
@@ -139,68 +126,31 @@ def query_operation(kind: type[BaseModel], named: Mapping[str, Any], required: l
     named : schemas of the JSON fields beside the query, by name
     required : names of the fields that JSON must have
     """
-    form = FRAME_BODY["content"][FORM]["schema"]
     own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
-    texts = {n: as_text(one) for n, one in own.items() if n not in form["properties"]}
-    needed = sorted({*form["required"], *(name for name in required if name in texts)})
-    parts = {**form["properties"], **texts}
-    body = {"type": "object", "required": required, "properties": {**named, **own}}
-    return {
-        "requestBody": {
-            "required": True,
-            "content": {
-                FORM: {"schema": {**form, "required": needed, "properties": parts}},
-                JSON: {"schema": body},
-                **bodies.content(),
-            },
-        },
-        "parameters": bodies.parameters() + [_parameter(name, one) for name, one in texts.items()],
-    }
+    texts = {n: bodies.as_text(one) for n, one in own.items() if n not in bodies.FRAME_PARTS}
+    needed = sorted({*bodies.FRAME_PARTS, *(name for name in required if name in texts)})
+    body = bodies.form_body(bodies.FRAME_PARTS | texts, needed, "meta")
+    sent = {"type": "object", "required": required, "properties": {**named, **own}}
+    body["content"] |= {bodies.JSON: {"schema": sent}, **bodies.content()}
+    options = [bodies.option_parameter(name, one) for name, one in texts.items()]
+    return {"requestBody": body, "parameters": bodies.parameters() + options}
 
 
 def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
     """Return the form of a query with a sequence of frames, for the OpenAPI document."""
     own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
-    meta = {"type": "array", "items": {"$ref": "#/components/schemas/FrameMeta"}}
-    file = {"type": "string", "format": "binary"}
     properties = {
         "frame": {
-            "type": "array", "minItems": 2, "maxItems": most, "items": file,
+            "type": "array", "minItems": 2, "maxItems": most, "items": bodies.FILE,
             "description": "One `frame` part for each frame, in the order of time.",
         },
-        "metas": {**meta, "description": "One object for each frame, with its odometry `pose`."},
-        **{name: as_text(one) for name, one in own.items()},
+        "metas": {
+            "type": "array", "items": bodies.META,
+            "description": "One object for each frame, with its odometry `pose`.",
+        },
+        **{name: bodies.as_text(one) for name, one in own.items()},
     }  # fmt: skip
-    schema = {"type": "object", "required": ["frame", "metas"], "properties": properties}
-    encoding = {"metas": {"contentType": JSON}}
-    return {
-        "requestBody": {
-            "required": True, "content": {FORM: {"schema": schema, "encoding": encoding}}
-        }
-    }  # fmt: skip
-
-
-def _parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the query parameter of an option, for requests whose body is the frame."""
-    schema = {key: one for key, one in option.items() if key not in ("description", "title")}
-    text = f"{option.get('description', 'The same as the field in JSON.')} {bodies.BARE}"
-    return query_parameter(name, schema, text)
-
-
-def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of an option in a form: objects as JSON text, lists with commas."""
-    kinds = option.get("anyOf", [])
-    reference = next((one for one in kinds if "$ref" in one), None)
-    texts = {name: option[name] for name in ("description", "title") if name in option}
-    if reference is not None:
-        content = {"contentMediaType": JSON, "contentSchema": reference}
-        return {"type": "string", **content, **texts}
-    if any(one.get("type") == "array" for one in kinds):
-        values = option.get("default")
-        default = {} if values is None else {"default": ",".join(values)}
-        return {"type": "string", **default, **texts}
-    one = next((one for one in kinds if one.get("type") != "null"), None)
-    return dict(option) if one is None else {**one, **texts}
+    return {"requestBody": bodies.form_body(properties, ["frame", "metas"], "metas")}
 
 
 # The comparison of two frames, each named or sent in a part of a form.
@@ -235,12 +185,12 @@ async def read_pair(request: Request) -> AsyncIterator[PairBody]:
     MalformedBody if the body is neither, InvalidRequest for a missing or repeated frame or an
     invalid field, and StoreFull or UnusableStore if a file cannot be spooled.
     """
-    if media_type(request) == JSON:
+    if bodies.media_type(request) == bodies.JSON:
         how = record_of(Comparison, await read_object(request), "The comparison")
         a, b = (_pair_frame(name, how, {}, {}) for name in _SIDES)
         yield PairBody(a, b, how)
         return
-    async with read_form(request, most_files=2) as form:
+    async with bodies.read_form(request, most_files=2) as form:
         files, texts = _parts(form)
         own = {name: value for name, value in texts.items() if not name.startswith("meta_")}
         how = record_of(Comparison, own, "The comparison")
@@ -283,7 +233,7 @@ def _pair_frame(
     field = f"meta_{name}"
     if field not in texts:
         raise _wrong(field, "missing")
-    return Sent(files[name], read_meta(texts[field], f"The field `{field}`"))
+    return Sent(files[name], bodies.read_meta(texts[field], f"The field `{field}`"))
 
 
 def _wrong(name: str, how: str) -> InvalidRequest:
@@ -386,7 +336,10 @@ async def localize_sequence(
     """
     since, at = time.perf_counter(), time.time()
     options = tuple(Query.model_fields)
-    async with here.gate.place(), read_frames(request, *options, most=MOST_OF_SEQUENCE) as sent:
+    async with (
+        here.gate.place(),
+        bodies.read_frames(request, *options, most=MOST_OF_SEQUENCE) as sent,
+    ):
         query = record_of(Query, sent.texts, _QUERY)
         wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
         if wrong is not None:
@@ -483,26 +436,17 @@ similarity_router = v1_router(tag="queries")
 def _body() -> dict[str, Any]:
     """Return the body of a comparison, for the OpenAPI document."""
     own = Comparison.model_json_schema(ref_template=TEMPLATE)["properties"]
-    file = {"type": "string", "format": "binary", "description": "A depth image as PNG or NPY."}
-    meta = {
-        "type": "string",
-        "contentMediaType": JSON,
-        "contentSchema": {"$ref": "#/components/schemas/FrameMeta"},
-    }
+    file = {**bodies.FILE, "description": "A depth image as PNG or NPY."}
+    meta = {"type": "string", "contentMediaType": bodies.JSON, "contentSchema": bodies.META}
     parts = {"a": file, "meta_a": meta, "b": file, "meta_b": meta}
-    texts = {name: as_text(one) for name, one in own.items()}
-    return {
-        "required": True,
-        "content": {
-            JSON: {
-                "schema": {
-                    "type": "object", "required": ["frame_a", "frame_b"], "properties": own,
-                    "additionalProperties": False,
-                }
-            },
-            FORM: {"schema": {"type": "object", "properties": {**parts, **texts}}},
-        },
+    body = bodies.form_body(parts | {name: bodies.as_text(one) for name, one in own.items()}, [])
+    body["content"][bodies.JSON] = {
+        "schema": {
+            "type": "object", "required": ["frame_a", "frame_b"], "properties": own,
+            "additionalProperties": False,
+        }
     }  # fmt: skip
+    return body
 
 
 @similarity_router.post(

@@ -12,7 +12,7 @@ from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from service.auth import Caller, Sender, v1_router
 from service.bodies import json_body, read_record
 from service.problems import refusals
-from service.responses import files, send_product_file
+from service.responses import file_responses, send_product_file
 from service.running_service import Here, Service
 
 router = v1_router(tag="reconstructions")
@@ -48,11 +48,11 @@ def get_reconstruction(job_id: str, here: Here, caller: Sender) -> Reconstructio
 @router.get(
     "/reconstructions/{job_id}/mesh.ply",
     response_class=Response,
-    responses=files(
-        [MEDIA_TYPE],
-        "Points with normals, coloured by the first view that saw them, and triangles unless a "
-        "cloud was requested; binary little-endian. A comment names the coordinate frame.",
-        409,
+    responses=file_responses(
+        MEDIA_TYPE,
+        description="Points with normals, coloured by the first view that saw them, and triangles "
+        "unless a cloud was requested; binary little-endian. A comment names the coordinate frame.",
+        ranges=True,
     ),
 )
 async def get_mesh(job_id: str, request: Request, here: Here, caller: Sender) -> Response:

@@ -27,17 +27,27 @@ from sceneprint_client.api.results import (
     StoredQuery,
     View,
 )
-from service.auth import Caller, MatchMap, Sender, require_readable, v1_router
+from service.auth import (
+    Caller,
+    Cursor,
+    Limit,
+    MatchMap,
+    OnlyMap,
+    Sender,
+    require_readable,
+    v1_router,
+)
 from service.bodies import json_body, read_record
 from service.problems import refusals
+from service.responses import file_responses
 from service.running_service import Here, Service
 
 router = v1_router("/queries/{query_id}", "queries")
 
 
-def _ply(description: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
-    content = {PLY: {"schema": {"type": "string", "format": "binary"}}}
-    return {200: {"description": description, "content": content}, **refusals(*statuses)}
+def _file(kind: str, description: str) -> dict[int | str, dict[str, Any]]:
+    statuses = (404, 409, 422)
+    return file_responses(kind, description=description, statuses=statuses, tagged=False)
 
 
 @router.get("", responses=refusals(404, 422))
@@ -54,7 +64,7 @@ def get_answer(query_id: str, here: Here, caller: Sender) -> Answer:
 @router.get(
     "/cloud.ply",
     response_class=Response,
-    responses=_ply("Points and normals in the frame of the query's sensor.", 404, 409, 422),
+    responses=_file(PLY, "Points and normals in the frame of the query's sensor."),
 )
 async def get_query_cloud(query_id: str, here: Here, caller: Sender) -> Response:
     """Return the surface of the query that validation compares, as binary PLY in metres."""
@@ -96,7 +106,7 @@ async def get_match(
 @router.get(
     "/matches/{frame_id}/overlay.ply",
     response_class=Response,
-    responses=_ply("Both clouds, coloured, in the frame of the match's sensor.", 404, 409, 422),
+    responses=_file(PLY, "Both clouds, coloured, in the frame of the match's sensor."),
 )
 async def get_overlay(
     query_id: str,
@@ -130,15 +140,6 @@ async def get_overlay(
     return Response(data, media_type=PLY)
 
 
-_PNG: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The tEXt chunks explain the colours.",
-        "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
-    },
-    **refusals(404, 409, 422),
-}
-
-
 @router.get("/question", responses=refusals(404, 422))
 def get_question(query_id: str, here: Here, caller: Sender) -> StoredQuery:
     """Return the maps, the frame and the options of a query."""
@@ -146,7 +147,11 @@ def get_question(query_id: str, here: Here, caller: Sender) -> StoredQuery:
     return here.inspection.question(query_id)
 
 
-@router.get("/preview.png", response_class=Response, responses=_PNG)
+@router.get(
+    "/preview.png",
+    response_class=Response,
+    responses=_file(PNG, "The tEXt chunks explain the colours."),
+)
 async def get_query_preview(
     query_id: str,
     here: Here,
@@ -200,9 +205,7 @@ history_router = v1_router("/queries", "queries")
 def list_queries(
     here: Here,
     caller: Sender,
-    map_name: Annotated[
-        str | None, Query(alias="map", description="Only queries of this map.")
-    ] = None,
+    map_name: OnlyMap = None,
     status: Annotated[
         list[RecordStatus],
         Query(
@@ -218,8 +221,8 @@ def list_queries(
         AwareDatetime | None, Query(description="Latest time of the query, with time zone.")
     ] = None,
     kept: Annotated[bool, Query(description="Only queries with kept answers.")] = False,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    cursor: Cursor = None,
+    limit: Limit = 100,
 ) -> Page[QueryRecord]:
     """List past queries of the maps that the key may read, with sender, outcome and duration,
     newest first.

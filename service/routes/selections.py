@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated
 
-from fastapi import Depends, Query, Request
+from fastapi import Depends, Request
 
 from sceneprint.engine.maps.map_frames import get_frame
 from sceneprint.engine.maps.selections import delete_selection, edit_selection
@@ -18,7 +17,7 @@ from sceneprint_client.api.listing import (
     FrameSelection,
     FramesRestored,
 )
-from service.auth import may_read, may_write, v1_router
+from service.auth import Cursor, Limit, may_read, may_write, v1_router
 from service.bodies import json_body, read_record
 from service.problems import refusals
 from service.running_service import Here
@@ -75,10 +74,7 @@ def restore_frame(map_name: str, frame_id: str, here: Here) -> Frame:
 
 @router.get("/deletions", responses=refusals(404, 422), dependencies=[Depends(may_read)])
 def list_deletions(
-    map_name: str,
-    here: Here,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    map_name: str, here: Here, cursor: Cursor = None, limit: Limit = 100
 ) -> Page[FrameDeletion]:
     """List deletions of frames that can still be undone, newest first."""
     return here.tombstones.list_all(map_name, cursor, limit)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Query, Request, Response
 
@@ -12,32 +12,25 @@ from sceneprint.engine.maps.selections import delete_session, edit_session
 from sceneprint_client.api import Page
 from sceneprint_client.api.base import Label
 from sceneprint_client.api.listing import Run, Session, SessionChange, SessionEdit, Trajectory
-from service.auth import may_read, may_write, v1_router
+from service.auth import Cursor, Limit, may_read, may_write, v1_router
 from service.bodies import json_body, read_record
 from service.problems import refusals
-from service.responses import preferred_media_type
+from service.responses import file_responses, preferred_media_type
 from service.running_service import Here
 
 router = v1_router("/maps/{map_name}", "sessions", may_read)
 
 _PLAIN, _JSON = "text/plain", "application/json"
-_TRAJECTORY: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "Depending on Accept: TUM lines `t tx ty tz qx qy qz qw` with the "
-        "coordinate frames in comments, or JSON with the ids of the frames.",
-        "model": Trajectory,
-        "content": {_PLAIN: {"schema": {"type": "string"}}},
-    },
-    **refusals(404, 422),
-}
+_TRAJECTORY = file_responses(
+    _PLAIN, model=Trajectory, statuses=(404, 422), tagged=False,
+    description="Depending on Accept: TUM lines `t tx ty tz qx qy qz qw` with the coordinate "
+    "frames in comments, or JSON with the ids of the frames.",
+)  # fmt: skip
 
 
 @router.get("/sessions", responses=refusals(404, 422))
 def get_sessions(
-    map_name: str,
-    here: Here,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    map_name: str, here: Here, cursor: Cursor = None, limit: Limit = 100
 ) -> Page[Session]:
     """List the runs of a map by session and robot, with the number of frames and the times of each.
 

@@ -18,7 +18,7 @@ from sceneprint_client.api.surface import (
     SurfaceSighting,
     SurfaceTile,
 )
-from service.auth import may_read, may_write, v1_router
+from service.auth import Cursor, Limit, may_read, may_write, v1_router
 from service.problems import refusals
 from service.responses import file_responses, is_known, send_output
 from service.running_service import Here
@@ -74,8 +74,8 @@ def list_surface_tiles(
     here: Here,
     parent: Parent = None,
     level: Annotated[int, Query(ge=0, le=7, description="Level; 0 has the finest cells.")] = 0,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 1000,
+    cursor: Cursor = None,
+    limit: Limit = 1000,
 ) -> Page[SurfaceTile]:
     """List the tiles of a level, sorted by column, row and floor."""
     return here.surfaces.tiles(map_name, parent, level, cursor, limit)
@@ -116,8 +116,8 @@ def list_surface_frames(
             description="Box x0,y0,z0,x1,y1,z1 that contains the viewpoints, metres.",
         ),
     ] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 20,
+    cursor: Cursor = None,
+    limit: Limit = 20,
 ) -> Page[SurfaceSighting]:
     """List frames that saw a point, nearest viewpoint first, or frames that were taken in a box.
 

@@ -168,7 +168,7 @@ def test_a_key_is_looked_up_while_every_shared_thread_is_taken(tmp_path):
             slow = [object() for _ in range(int(shared.total_tokens))]
             for one in slow:
                 shared.acquire_on_behalf_of_nowait(one)
-            body = RequestBody(Request({"type": "http"}).receive, 0, 1.0)
+            body = RequestBody(Request({"type": "http"}).receive, 0)
             request = Request(
                 {
                     "type": "http", "app": app, "method": "GET", "path": "/v1/keys/me",

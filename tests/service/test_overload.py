@@ -16,7 +16,7 @@ from benchmarks.waiting import PATIENCE_S
 @pytest.fixture(scope="module")
 def busy(begin, make_map, small_shots):
     """A server that works on one thing at a time, lets one wait, and has a map of two frames."""
-    server = begin(concurrent_requests=1, queued_requests=1, body_timeout_s=3)
+    server = begin(concurrent_requests=1, queued_requests=1)
     path = make_map(server, "hall")
     for shot in small_shots[:2]:
         sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=200"})

@@ -301,7 +301,7 @@ def test_a_body_is_charged_before_it_is_written_and_given_back():
         for _ in range(count):
             await body.next()
 
-    first = RequestBody(receive, 1 << 30, 30)
+    first = RequestBody(receive, 1 << 30)
     first.charge(spool, "a")
     asyncio.run(read(first, 2))  # one MiB is kept in memory
     spool.require_room("a", 7 << 20)
