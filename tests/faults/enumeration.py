@@ -143,8 +143,9 @@ class Enumeration:
     def run(self, operation: str, fault: str, *, first: int = 1, step: int = 1) -> Trials:
         """Try a fault at calls `first`, `first + step` and so on, to the end of the operation."""
         trials, at = Trials(), first
-        while True:
-            failed, broken = self._try(operation, fault, at)
+        is_over = False
+        while not is_over:
+            failed, broken, is_over = self._try(operation, fault, at)
             if not failed:
                 break
             trials.calls += 1
@@ -153,8 +154,10 @@ class Enumeration:
             at += step
         return trials
 
-    def _try(self, operation: str, fault: str, at: int) -> tuple[str, list[str]]:
-        """Return the call that failed, or "" if the operation has fewer, and what is wrong."""
+    def _try(self, operation: str, fault: str, at: int) -> tuple[str, list[str], bool]:
+        """Return the call that failed, or "" if the operation has fewer; what is wrong; and whether
+        the operation had ended before the fault.
+        """
         self._count += 1
         store = self._store(f"trial-{self._count}", operation)
 
@@ -166,11 +169,15 @@ class Enumeration:
                     OPERATIONS[operation].act(engine, store, say)
                 except (SceneprintError, OSError) as error:
                     say(f"error {type(error).__name__}")
+                if not injector.failed:
+                    say("last")
                 injector.disarm()
                 say(f"failed {injector.failed}" if injector.failed else "finished")
 
         child = Child(act)
         broken = [line[2:] for line in child.lines if line.startswith("! ")]
+        if fault == "interrupts":  # Python and the databases repeat interrupted calls (PEP 475)
+            broken += [line for line in child.lines if line.startswith("error ")]
         killed = os.WIFSIGNALED(child.status) and os.WTERMSIG(child.status) == signal.SIGKILL
         failed = "killed" if killed else ""
         for line in child.lines:
@@ -189,7 +196,7 @@ class Enumeration:
         shutil.rmtree(store.folder)
         if self._server is not None:
             self._server.drop(store.folder.name)
-        return failed, broken
+        return failed, broken, "last" in child.lines
 
 
 def report(trials: dict[tuple[str, str], Trials]) -> Iterator[str]:

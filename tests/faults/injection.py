@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 import sqlite3
 import sys
@@ -18,13 +19,23 @@ from typing import Any
 
 from sqlalchemy.engine.default import DefaultDialect
 
-#: Faults by name: the error of a call on files, and SQLite's message; None kills the process.
+from tests.faults.disk import Disk
+
+#: Faults by name: the error of a call on files, and SQLite's message; None for the others.
+#: `power cut` kills the process, and undoes what was not synced. `interrupts` sends signals from
+#: the call on, which interrupt system calls (EINTR).
 FAULTS: dict[str, tuple[int, str] | None] = {
     "full disk": (errno.ENOSPC, "database or disk is full"),
     "input/output error": (errno.EIO, "disk I/O error"),
     "no descriptors": (errno.EMFILE, "unable to open database file"),
+    "interrupts": None,
     "kill": None,
+    "power cut": None,
 }
+#: Interval of the signals, seconds.
+_EVERY_S = 2e-4
+#: Beginning of the names of files that SQLite writes and syncs itself.
+_DATABASE = "sceneprint.db"
 #: Audit events of calls that change a folder, and how many of their first arguments are paths.
 _EVENTS = {
     "open": 1, "os.rename": 2, "os.link": 2, "os.remove": 1, "os.mkdir": 1, "os.rmdir": 1,
@@ -47,11 +58,13 @@ class Injector:
 
     def __init__(self, root: Path, fault: str, at: int) -> None:
         self._root, self._error, self._at = str(root), FAULTS[fault], at
-        self._only_opens = fault == "no descriptors"
+        self._fault, self._only_opens = fault, fault == "no descriptors"
+        self._disk = CutDisk(root) if fault == "power cut" else None
         self.calls, self.failed, self._is_armed = 0, "", False
 
     def arm(self) -> None:
         """Begin to count."""
+        signal.signal(signal.SIGALRM, lambda *_: None)
         sys.addaudithook(self._audit)
         for name in ("write", "pwrite", "fsync", "fdatasync"):
             setattr(os, name, self._on_descriptor(name, getattr(os, name)))
@@ -61,8 +74,11 @@ class Injector:
         self._is_armed = True
 
     def disarm(self) -> None:
-        """Stop counting."""
+        """Stop counting. A power cut after the last call ends the process."""
         self._is_armed = False
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if self._disk is not None and not self.failed:
+            self._disk.cut()
 
     def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self._is_armed or event not in _EVENTS:
@@ -70,6 +86,8 @@ class Injector:
         if event == "open" and not (arguments[2] or 0) & _WRITING:
             return
         if any(self._is_inside(path) for path in arguments[: _EVENTS[event]]):
+            if self._disk is not None:
+                self._disk.look()
             self._count(event, is_open=event == "open")
 
     def _is_inside(self, path: object) -> bool:
@@ -87,7 +105,10 @@ class Injector:
         def wrapped(descriptor: int, *more: Any) -> Any:
             if self._is_armed and self._holds(descriptor):
                 self._count(f"os.{name}")
-            return call(descriptor, *more)
+            result = call(descriptor, *more)
+            if self._is_armed and self._disk is not None and "sync" in name:
+                self._disk.synced(descriptor)
+            return result
 
         return wrapped
 
@@ -108,8 +129,13 @@ class Injector:
         if self.calls != self._at:
             return
         self.failed = call
+        if self._disk is not None:
+            self._disk.cut()
+        if self._fault == "interrupts":
+            signal.setitimer(signal.ITIMER_REAL, _EVERY_S, _EVERY_S)
         if self._error is None:
-            os.kill(os.getpid(), signal.SIGKILL)
+            if self._fault == "kill":
+                os.kill(os.getpid(), signal.SIGKILL)
             return
         number, message = self._error
         if cursor is None:
@@ -118,3 +144,32 @@ class Injector:
         if isinstance(connection, sqlite3.Connection):
             raise sqlite3.OperationalError(message)
         connection.close()  # the call itself fails then, as if the server had gone
+
+
+class CutDisk(Disk):
+    """A disk that loses power once, and keeps no record of earlier states."""
+
+    def _keep(self, what: str) -> None:
+        """Keep nothing."""
+
+    def look(self) -> None:
+        """Record the changes before a call."""
+        self._look()
+
+    def cut(self) -> None:
+        """Undo all that was not synced, and kill this process. SQLite syncs its files itself."""
+        tree = self.sure()
+        for path in sorted(self.root.rglob("*"), reverse=True):
+            if str(path.relative_to(self.root)) in tree or path.name.startswith(f"{_DATABASE}-"):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        for name, content in tree.items():  # folders before their content
+            path = self.root / name
+            if content is None:
+                path.mkdir(exist_ok=True)
+            elif not path.name.startswith(_DATABASE) or not path.exists():
+                path.write_bytes(content)
+        os.kill(os.getpid(), signal.SIGKILL)

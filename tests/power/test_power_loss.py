@@ -113,10 +113,12 @@ def lost_blobs(
             due = next(names for begun, names in reversed(promised) if begun <= step)
             if due - held.keys():
                 broken.add("a blob that is gone")
+            if step == len(disk.states) - 1 and digest in held:
+                broken.add("a removed blob that is back")
             kept = FolderBlobs(after_crash(tree) / "data" / "blobs")
-            for digest in held:
-                if held[digest] == contents[digest]:
-                    assert kept.get(digest) == contents[digest], what
+            for name in held:
+                if held[name] == contents[name]:
+                    assert kept.get(name) == contents[name], what
         return broken
 
     return run

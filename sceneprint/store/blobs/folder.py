@@ -514,6 +514,9 @@ class FolderBlobs(Blobs):
         """See `Blobs.remove`."""
         for digest in digests:
             self.path(digest).unlink(missing_ok=True)
+        for folder in {self.path(digest).parent for digest in digests}:
+            if folder.is_dir():
+                sync_folder(folder)  # otherwise a loss of power may bring deleted frames back
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
         """See `Blobs.condition`."""
