@@ -202,7 +202,8 @@ def test_a_join_is_undone(rooms: Rooms) -> None:
         (join,) = undone.json()["result"]["joins"]
         assert join == rooms.join | {"root": None, "undone": True}
     assert client.get(url).json() == undone.json()
-    lines = client.get("/v1/audit", params={"action": "association.undone"}).json()["items"]
+    of_map = {"action": "association.undone", "map": rooms.path.rpartition("/")[2]}
+    lines = client.get("/v1/audit", params=of_map).json()["items"]
     assert [one["target"] for one in lines] == [undone.json()["job_id"]]
     sessions = client.get(f"{rooms.path}/sessions").json()["items"]
     assert {one["robot"]: one["parent_frames"] for one in sessions} == {
