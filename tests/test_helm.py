@@ -101,6 +101,7 @@ def test_helm_and_kubernetes_accept_it(values: dict[str, Any], tmp_path: Path) -
     ("change", "message"),
     [
         ({"secret": ""}, "/secret"),
+        ({"single": {"enabled": False, "worker": 1}}, "worker"),
         ({"database": {"url": ""}}, "/database/url"),
         ({"database": {"url": "mysql://db/x"}}, "database.url must be postgresql+psycopg://"),
         ({"blobs": {"url": "/mnt/blobs"}}, "/blobs/url"),
@@ -268,3 +269,53 @@ def test_versions_and_dashboards_are_in_the_chart(tmp_path: Path) -> None:
     assert chart["version"] == __version__.replace("rc", "-rc.")
     held = rendered(ALL, tmp_path)["ConfigMap", "fleet-dashboards"]["data"]
     assert held == {f"sceneprint-{path.name}": path.read_text() for path in DASHBOARDS}
+
+
+SINGLE = {"single": {"enabled": True, "workers": 2, "dataSize": "9Gi", "storageClass": "local"}}
+
+
+def test_one_pod_has_the_whole_service_on_a_volume(tmp_path: Path) -> None:
+    returned, text, error = run_helm("lint", "--strict", values=SINGLE, folder=tmp_path)
+    assert (returned, "0 chart(s) failed" in text) == (0, True), text + error
+    objects = rendered(SINGLE, tmp_path)
+    assert {kind for kind, _ in objects} == {
+        "Deployment", "PersistentVolumeClaim", "Service", "PodDisruptionBudget", "NetworkPolicy",
+    }  # fmt: skip
+    for one in objects.values():
+        kubernetes_validate.validate(one, KUBERNETES, strict=True)
+    (spec,) = (one["spec"] for (kind, _), one in objects.items() if kind == "Deployment")
+    assert (spec["replicas"], spec["strategy"]) == (1, {"type": "Recreate"})
+    pod = spec["template"]["spec"]
+    (container,) = pod["containers"]
+    assert environment(container) == {
+        "SCENEPRINT_WORKERS": "2", "SCENEPRINT_CONCURRENT_REQUESTS": "2",
+    }  # fmt: skip
+    assert "envFrom" not in container
+    claim = objects["PersistentVolumeClaim", "fleet-data"]
+    assert claim["metadata"]["annotations"] == {"helm.sh/resource-policy": "keep"}
+    assert claim["spec"] == {
+        "accessModes": ["ReadWriteOnce"], "storageClassName": "local",
+        "resources": {"requests": {"storage": "9Gi"}},
+    }  # fmt: skip
+    data = {"name": "data", "persistentVolumeClaim": {"claimName": "fleet-data"}}
+    assert data in pod["volumes"]
+    own = rendered(SINGLE | {"secret": "keys"}, tmp_path)["Deployment", "fleet-api"]
+    (container,) = own["spec"]["template"]["spec"]["containers"]
+    assert container["envFrom"] == [{"secretRef": {"name": "keys"}}]
+
+
+def test_chart_and_compose_agree() -> None:
+    """Memory limits, and the health check of workers."""
+    compose = yaml.safe_load((CHART.parents[2] / "docker-compose.yml").read_text())["services"]
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    for part, names in (("api", ("service", "api")), ("worker", ("worker", "signer"))):
+        limit = values[part]["resources"]["limits"]["memory"]
+        found = {compose[name]["deploy"]["resources"]["limits"]["memory"] for name in names}
+        assert {f"{one}i" for one in found} == {limit}
+    parts = [values[part]["resources"]["limits"]["memory"] for part in ("api", "worker")]
+    together = values["single"]["resources"]["limits"]["memory"]
+    assert sum(int(one.removesuffix("Gi")) for one in parts) == int(together.removesuffix("Gi"))
+    probe = (CHART / "templates" / "worker.yaml").read_text()
+    for name in ("worker", "signer"):
+        check = compose[name]["healthcheck"]["test"][3]
+        assert f'command: [sh, -c, "{check}"]' in probe

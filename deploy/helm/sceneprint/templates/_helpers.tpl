@@ -39,11 +39,13 @@ would make Helm print the rejected URL with its password. */}}
 
 {{/* Environment of every pod. It is not a ConfigMap, since the migration runs before it would exist. */}}
 {{- define "sceneprint.env" -}}
+{{- if not .Values.single.enabled -}}
 {{- include "sceneprint.checkUrl" (dict "name" "url" "url" .Values.database.url) -}}
 - name: SCENEPRINT_DATABASE_URL
   value: {{ .Values.database.url | quote }}
 - name: SCENEPRINT_BLOB_URL
   value: {{ .Values.blobs.url | quote }}
+{{- end }}
 {{- range $name, $value := .Values.env }}
 - name: {{ $name }}
   value: {{ $value | quote }}
@@ -80,9 +82,11 @@ securityContext:
   readOnlyRootFilesystem: true
   capabilities:
     drop: [ALL]
+{{- with .Values.secret }}
 envFrom:
   - secretRef:
-      name: {{ .Values.secret }}
+      name: {{ . }}
+{{- end }}
 {{- end }}
 
 {{- define "sceneprint.mounts" -}}
@@ -96,8 +100,13 @@ envFrom:
 
 {{- define "sceneprint.volumes" -}}
 - name: data
+  {{- if .claim }}
+  persistentVolumeClaim:
+    claimName: {{ .claim }}
+  {{- else }}
   emptyDir:
     sizeLimit: {{ .dataSize }}
+  {{- end }}
 - name: cache
   emptyDir:
     sizeLimit: 1Gi
