@@ -110,7 +110,10 @@ class Bus:
     now_ns: int = 0
     callbacks: dict[str, Callable[[Any], None]] = field(default_factory=dict)
     kinds: dict[str, str] = field(default_factory=dict)
+    qos: dict[str, object] = field(default_factory=dict)
+    publishers: list[object] = field(default_factory=list)
     declared: dict[str, Any] = field(default_factory=dict)
+    described: dict[str, str] = field(default_factory=dict)
     services: dict[str, Callable[[Any, Any], Any]] = field(default_factory=dict)
     timers: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     published: list[Arrived] = field(default_factory=list)
@@ -123,7 +126,7 @@ class Bus:
 
 
 class StubNode:
-    """Stand-in for rclpy.node.Node that serialises published messages."""
+    """Stand-in for rclpy.lifecycle.LifecycleNode that serialises published messages."""
 
     bus: Bus
     types: Any
@@ -134,16 +137,40 @@ class StubNode:
     def get_name(self) -> str:
         return self.name
 
-    def declare_parameter(self, name: str, default: Any) -> SimpleNamespace:
+    def declare_parameter(self, name: str, default: Any, descriptor: Any) -> None:
         self.bus.declared[name] = default
+        self.bus.described[name] = descriptor.description
+
+    def get_parameter(self, name: str) -> SimpleNamespace:
+        default = self.bus.declared[name]
         value = self.bus.parameters.get(name, default)
         assert type(value) is type(default), name  # rclpy checks this too
         return SimpleNamespace(value=value)
 
+    def trigger_configure(self) -> Any:
+        return self.on_configure(None)  # type: ignore[attr-defined]
+
+    def trigger_activate(self) -> Any:
+        return self.on_activate(None)  # type: ignore[attr-defined]
+
     def create_subscription(
         self, kind: Any, topic: str, callback: Callable[[Any], None], qos: object
-    ) -> None:
+    ) -> str:
         self.bus.callbacks[topic], self.bus.kinds[topic] = callback, kind.ros_name
+        self.bus.qos[topic] = qos
+        return topic
+
+    def destroy_subscription(self, topic: str) -> None:
+        del self.bus.callbacks[topic]
+
+    def destroy_publisher(self, publisher: object) -> None:
+        self.bus.publishers.remove(publisher)
+
+    def destroy_service(self, name: str) -> None:
+        del self.bus.services[name]
+
+    def destroy_timer(self, timer: tuple[float, Callable[[], None]]) -> None:
+        self.bus.timers.remove(timer)
 
     def create_publisher(self, kind: Any, topic: str, qos: object) -> SimpleNamespace:
         def publish(message: Any) -> None:
@@ -151,19 +178,25 @@ class StubNode:
             read = self.types.deserialize_cdr(data, kind.ros_name)
             self.bus.published.append((topic, kind.ros_name, read))
 
-        return SimpleNamespace(publish=publish)
+        publisher = SimpleNamespace(publish=publish)
+        self.bus.publishers.append(publisher)
+        return publisher
 
-    def create_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
+    def create_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> str:
         self.bus.services[name] = callback
+        return name
 
-    def create_timer(self, period_s: float, callback: Callable[[], None]) -> None:
+    def create_timer(
+        self, period_s: float, callback: Callable[[], None]
+    ) -> tuple[float, Callable[[], None]]:
         self.bus.timers.append((period_s, callback))
+        return self.bus.timers[-1]
 
     def get_clock(self) -> Any:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.bus.now_ns))
 
     def get_logger(self) -> Any:
-        return SimpleNamespace(info=self.bus.log.append)
+        return SimpleNamespace(info=self.bus.log.append, error=self.bus.log.append)
 
     def destroy_node(self) -> None:
         self.bus.is_up = False
@@ -223,15 +256,18 @@ def bus(ros: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Bus:
         vars(one).update(names)
         monkeypatch.setitem(sys.modules, name, one)
 
-    kind = type("Node", (StubNode,), {"bus": made, "types": types})
+    kind = type("LifecycleNode", (StubNode,), {"bus": made, "types": types})
     stopped = type("ExternalShutdownException", (Exception,), {})
     module(
         "rclpy",
         init=lambda args=None: setattr(made, "is_up", True),
-        spin=lambda node: made.timers[0][1](),
+        spin=lambda node: [callback() for _, callback in made.timers[:1]],
         try_shutdown=lambda: setattr(made, "is_up", False),
     )
-    module("rclpy.node", Node=kind)
+    outcomes = SimpleNamespace(SUCCESS="success", FAILURE="failure")
+    module("rclpy.lifecycle", LifecycleNode=kind, TransitionCallbackReturn=outcomes)
+    module("rcl_interfaces")
+    module("rcl_interfaces.msg", ParameterDescriptor=SimpleNamespace)
     module("rclpy.executors", ExternalShutdownException=stopped)
     module(
         "rclpy.qos", qos_profile_sensor_data="sensor",

@@ -52,6 +52,12 @@ def play(node: Any, bus: Any, arrived: list[Any]) -> None:
             diagnose()
 
 
+def started(node_module: ModuleType) -> Any:
+    node = node_module.RelocaliserNode()
+    assert (node.trigger_configure(), node.trigger_activate()) == ("success", "success")
+    return node
+
+
 def test_a_node_on_a_drive(
     bus: Any, node_module: ModuleType, drive: Any, room: Any, service_url: str,
     ros: SimpleNamespace, tmp_path: Path,
@@ -60,7 +66,7 @@ def test_a_node_on_a_drive(
         "url": service_url, "map": "room", "topic": DEPTH, "map_frame": "world",
         "transform_tolerance_s": 0.25, "log_file": str(tmp_path / "drive.jsonl"),
     }  # fmt: skip
-    node = node_module.RelocaliserNode()
+    node = started(node_module)
     assert bus.kinds == {
         "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage",
         DEPTH: "sensor_msgs/msg/Image",
@@ -115,12 +121,46 @@ def test_without_transforms_and_initial_poses(
     bus.parameters = {"url": service_url, "map": "room", "topic": "/points", "kind": "points",
                       "publish_tf": False, "initial_pose_topic": "", "imu_topic": "/imu",
                       "odometry_topic": "/odom", "tracker.drift": 0.02}  # fmt: skip
-    node = node_module.RelocaliserNode()
+    node = started(node_module)
     assert set(bus.kinds) == {"/tf", "/tf_static", "/points", "/imu", "/odom"}
     arrived = [one for one in drive("points", frames=4) if one[0] != "/camera/depth/camera_info"]
     play(node, bus, arrived)
     assert {topic for topic, _, _ in bus.published} == {"~/pose", "/diagnostics"}
     assert node._core._tracker._core.parameters.drift == 0.02
+    node.destroy_node()
+
+
+def test_a_manager_starts_and_stops_a_node(bus: Any, node_module: ModuleType, drive: Any) -> None:
+    """Topics exist from configuration to cleanup; frames count only while the node is active."""
+    bus.parameters = {"map": "m", "topic": DEPTH, "autostart": False, "url": "http://127.0.0.1:9"}
+    assert node_module.main() == 0
+    assert (bus.callbacks, bus.log) == ({}, [])
+    bus.parameters["map"] = ""
+    node = node_module.RelocaliserNode()
+    assert node.trigger_configure() == "failure"
+    assert node.error.startswith("The parameters map = ''")
+    bus.parameters["map"] = "m"
+    assert node.trigger_configure() == "success"
+    assert bus.qos[DEPTH] == bus.qos["/camera/depth/camera_info"] == "sensor"
+    assert bus.qos["/tf_static"] == (100, "latched")
+    (frame,) = [message for topic, _, message in drive(frames=1) if topic == DEPTH]
+    tick, diagnose = (callback for _, callback in bus.timers)
+    for is_active, count in ((False, "0"), (True, "1"), (False, "1")):
+        if is_active:
+            assert node.on_activate(None) == "success"
+        elif count == "1":
+            assert node.on_deactivate(None) == "success"
+        bus.callbacks[DEPTH](frame)
+        tick()
+        diagnose()
+        (status,) = bus.on("/diagnostics")[-1].status
+        assert {one.key: one.value for one in status.values}["frames"] == count
+        assert (status.message == "the node is not active") is not is_active
+        assert status.level == (3 if is_active else 1)  # STALE, for no transform has arrived
+    assert node.on_cleanup(None) == "success"
+    assert (bus.callbacks, bus.publishers, bus.services, bus.timers) == ({}, [], {}, [])
+    assert node.trigger_configure() == "success"
+    assert bus.timers != []
     node.destroy_node()
 
 
@@ -154,6 +194,7 @@ def test_every_parameter_is_in_the_readme(bus: Any, node_module: ModuleType) -> 
     bus.parameters = {"map": "m", "topic": DEPTH}
     node_module.RelocaliserNode().destroy_node()
     text = (PACKAGE / "README.md").read_text()
+    assert min(map(len, bus.described.values())) > 5
     missing = [name for name in bus.declared if f"`{name}`" not in text
                and not name.startswith("tracker.")]  # fmt: skip
     assert missing == []
@@ -184,6 +225,27 @@ def test_launch_files_set_what_the_node_declares(bus: Any, node_module: ModuleTy
                 assert keys - {"use_sim_time"} <= bus.declared.keys(), path
 
 
+def test_launched_sensors_are_those_of_the_documentation() -> None:
+    """Topics, packages and launch files, which are constants of the launch file."""
+    tree = ast.parse((PACKAGE / "launch" / "relocaliser.launch.py").read_text())
+    (table,) = (one.value for one in tree.body if isinstance(one, ast.Assign))
+    assert isinstance(table, ast.Dict)
+    pages = ROOT / "docs" / "sensors"
+    names = [key.value for key in table.keys if isinstance(key, ast.Constant)]
+    assert sorted(names) == sorted({one.stem for one in pages.glob("*.md")} - {"iphone"})
+    for name, sensor in zip(names, table.values, strict=True):
+        text = (pages / f"{name}.md").read_text()
+        assert isinstance(sensor, ast.Call)
+        topic, imu, package, file = (ast.literal_eval(one) for one in sensor.args[:4])
+        assert f"ros2 launch {package} {file}" in text
+        assert f" {topic} " in text.partition("ros2 bag record")[2]
+        assert imu in text
+        given = ast.literal_eval(sensor.args[4]) if len(sensor.args) > 4 else {}
+        assert [key for key, value in given.items() if f"{key}:={value}" not in text] == []
+        kind = [one.value for one in (*sensor.args[5:], *(k.value for k in sensor.keywords))]
+        assert kind == (["points"] if "--model lidar" in text else [])
+
+
 def test_the_package_names_what_it_is_made_of() -> None:
     manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()
     needed = {one.text for one in manifest.iter("exec_depend")}
@@ -195,6 +257,7 @@ def test_the_package_names_what_it_is_made_of() -> None:
             elif isinstance(one, ast.Import):
                 imported |= {name.name.partition(".")[0] for name in one.names}
     ours = {"sceneprint_client", "setuptools", "__future__", "os", "sys", "dataclasses", "pathlib",
+            "functools", "collections", "types",
             "typing"}  # fmt: skip
     assert imported - ours <= needed
     setup = (PACKAGE / "setup.py").read_text()

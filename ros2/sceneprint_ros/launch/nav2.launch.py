@@ -4,7 +4,7 @@ With `amcl:=true`, AMCL localises and the relocaliser publishes its initial pose
 relocaliser publishes map -> odom.
 """
 
-from launch import LaunchDescription
+from launch import Condition, LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.conditions import IfCondition, UnlessCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
@@ -18,6 +18,21 @@ def _nav2(name: str, **more: object) -> IncludeLaunchDescription:
     """Return the action that includes a launch file of nav2_bringup."""
     file = PathJoinSubstitution([FindPackageShare("nav2_bringup"), "launch", name])
     return IncludeLaunchDescription(PythonLaunchDescriptionSource(file), **more)
+
+
+def _manager(
+    name: str, sim: LaunchConfiguration, condition: Condition | None = None, **more: object
+) -> Node:
+    """Return a lifecycle manager that starts one node."""
+    values = {"use_sim_time": sim, "autostart": True, "node_names": [name], **more}
+    return Node(
+        package="nav2_lifecycle_manager",
+        executable="lifecycle_manager",
+        name=f"lifecycle_manager_{name}",
+        output="screen",
+        parameters=[values],
+        condition=condition,
+    )
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -46,9 +61,12 @@ def generate_launch_description() -> LaunchDescription:
                     {
                         "use_sim_time": sim,
                         "publish_tf": ParameterValue(NotSubstitution(amcl), value_type=bool),
+                        "autostart": False,
                     },
                 ],
             ),
+            # Nodes of rclpy do not send the manager a heartbeat.
+            _manager("relocaliser", sim, bond_timeout=0.0),
             _nav2(
                 "localization_launch.py",
                 launch_arguments={**nav2, "map": yaml}.items(),
@@ -62,14 +80,7 @@ def generate_launch_description() -> LaunchDescription:
                 parameters=[{"yaml_filename": yaml, "use_sim_time": sim}],
                 condition=UnlessCondition(amcl),
             ),
-            Node(
-                package="nav2_lifecycle_manager",
-                executable="lifecycle_manager",
-                name="lifecycle_manager_map",
-                output="screen",
-                parameters=[{"use_sim_time": sim, "autostart": True, "node_names": ["map_server"]}],
-                condition=UnlessCondition(amcl),
-            ),
+            _manager("map_server", sim, UnlessCondition(amcl)),
             _nav2("navigation_launch.py", launch_arguments=nav2.items()),
         ]
     )

@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from std_srvs.srv import Trigger
@@ -26,6 +29,7 @@ from sceneprint_client import Client, Tracker
 from sceneprint_client.errors import InvalidRequest, SceneprintError
 from sceneprint_client.http import DEFAULT_URL
 from sceneprint_client.relocaliser import (
+    Level,
     Relocaliser,
     RelocaliserParameters,
     TrackedPose,
@@ -40,48 +44,40 @@ from sceneprint_client.tracker import TrackerParameters
 KINDS = {"depth": Image, "compressed_depth": CompressedImage, "points": PointCloud2}
 
 
+T = TypeVar("T")
+
+
+def described(default: T, text: str) -> T:
+    """Return a field with a description, which `ros2 param describe` prints."""
+    return field(default=default, metadata={"description": text})
+
+
 @dataclass(frozen=True)
 class NodeParameters:
-    """Parameters of the node. Those of the tracker are named `tracker.NAME`.
+    """Parameters of the node. Those of the tracker are named `tracker.NAME`."""
 
-    Parameters
-    ----------
-    url : address of the service
-    key : API key; empty: that of the environment variable SCENEPRINT_KEY
-    map : name of the map in the service
-    topic, kind : topic of the frames, and `depth`, `compressed_depth` or `points`
-    camera_info_topic : topic of the camera info; empty: `camera_info` beside the frames
-    imu_topic, odometry_topic : optional topics; empty: none
-    map_frame, odom_frame, base_frame, parent_frame, interval_s, wait_s, stale_s, planar : see
-        RelocaliserParameters; `map_frame` is the name of the map's frame in messages
-    publish_tf : whether to publish map -> odom while tracking; false beside AMCL, which does so
-    transform_tolerance_s : time in the future until which that transform is valid
-    initial_pose_topic : topic of the fixes; empty: none
-    rate_hz : publishing rate of everything except diagnostics, which are published once a second
-    log_file : log for `sceneprint_client.tracker.replay`; empty: none
-    """
-
-    url: str = DEFAULT_URL
-    key: str = ""
-    map: str = ""
-    topic: str = ""
-    kind: str = "depth"
-    camera_info_topic: str = ""
-    imu_topic: str = ""
-    odometry_topic: str = ""
-    map_frame: str = "map"
-    odom_frame: str = "odom"
-    base_frame: str = "base_link"
-    parent_frame: str = ""
-    interval_s: float = 0.5
-    wait_s: float = 0.5
-    stale_s: float = 2.0
-    planar: bool = False
-    publish_tf: bool = True
-    transform_tolerance_s: float = 0.2
-    initial_pose_topic: str = "/initialpose"
-    rate_hz: float = 20.0
-    log_file: str = ""
+    url: str = described(DEFAULT_URL, "address of the service")
+    key: str = described("", "API key; empty: the environment variable SCENEPRINT_KEY")
+    map: str = described("", "name of the map in the service")
+    topic: str = described("", "topic of the frames")
+    kind: str = described("depth", "depth, compressed_depth or points")
+    camera_info_topic: str = described("", "camera info; empty: camera_info beside the frames")
+    imu_topic: str = described("", "accelerations; empty: none")
+    odometry_topic: str = described("", "odometry, if tf does not have it; empty: none")
+    map_frame: str = described("map", "name of the map's frame in messages")
+    odom_frame: str = described("odom", "frame of the odometry")
+    base_frame: str = described("base_link", "frame of the robot")
+    parent_frame: str = described("", "parent frame that equals map_frame; empty: the first fix's")
+    interval_s: float = described(0.5, "minimum time between two queries, seconds")
+    wait_s: float = described(0.5, "maximum time that a frame waits for its transforms, seconds")
+    stale_s: float = described(2.0, "time without frames after which nothing is published, seconds")
+    planar: bool = described(False, "whether the robot drives on the plane z = 0 of the map")
+    publish_tf: bool = described(True, "publish map -> odom; false beside AMCL, which does so")
+    transform_tolerance_s: float = described(0.2, "validity of map -> odom, seconds")
+    initial_pose_topic: str = described("/initialpose", "topic of the fixes; empty: none")
+    rate_hz: float = described(20.0, "publishing rate; diagnostics are published once a second")
+    log_file: str = described("", "log for sceneprint_client.tracker.replay; empty: none")
+    autostart: bool = described(True, "start by itself; false under a lifecycle manager")
 
     def relocaliser(self) -> RelocaliserParameters:
         """Return the parameters of the relocaliser."""
@@ -90,72 +86,127 @@ class NodeParameters:
         return RelocaliserParameters(rectified=is_rectified(self.topic), **values)
 
 
-class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
-    """A node that publishes the pose of a robot; see README.md for its topics and parameters.
-
-    Raises
-    ------
-    SceneprintError : If a parameter is missing or invalid.
-    """
+class RelocaliserNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no types
+    """A managed node that publishes the pose of a robot while it is active; see README.md."""
 
     def __init__(self) -> None:
         super().__init__("relocaliser")
-        self._p = NodeParameters(**self._declared(NodeParameters))
-        tracking = TrackerParameters(**self._declared(TrackerParameters, "tracker."))
+        self.error = ""  #: reason of the last failed transition
+        self._declare(NodeParameters)
+        self._declare(TrackerParameters, "tracker.")
+        self._is_active = False
+        self._closing: list[Callable[[], object]] = []
+
+    def on_configure(self, _: object) -> Any:
+        """Read the parameters, and subscribe; FAILURE if a parameter is missing or invalid."""
+        try:
+            self._open()
+        except (SceneprintError, OSError) as error:
+            self.on_cleanup(None)
+            self.error = str(error)
+            self.get_logger().error(self.error)
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, _: object) -> Any:
+        """Begin to query and to publish."""
+        self._is_active = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, _: object) -> Any:
+        """Stop, and forget the pose: the robot may be moved before the next activation."""
+        self._is_active = False
+        self._core.relocalise("the node was deactivated")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, _: object) -> Any:
+        """Undo `on_configure`."""
+        self._is_active = False
+        while self._closing:
+            self._closing.pop()()
+        return TransitionCallbackReturn.SUCCESS
+
+    on_shutdown = on_cleanup
+
+    def _open(self) -> None:
+        self._p = NodeParameters(**self._values(NodeParameters))
+        tracking = TrackerParameters(**self._values(TrackerParameters, "tracker."))
         if not self._p.map or not self._p.topic or self._p.kind not in KINDS:
             raise InvalidRequest(
                 f"The parameters map = {self._p.map!r}, topic = {self._p.topic!r} and kind = "
                 f"{self._p.kind!r} are not valid: map and topic must not be empty, and kind must "
                 f"be one of {', '.join(KINDS)}. Set them in the launch file or with -p."
             )
-        self._client = Client(self._p.url, self._p.key or os.environ.get("SCENEPRINT_KEY") or None)
-        self._log: TextIO | None = None
+        client = Client(self._p.url, self._p.key or os.environ.get("SCENEPRINT_KEY") or None)
+        self._closing.append(client.close)
+        log: TextIO | None = None
         if self._p.log_file:
-            path = Path(self._p.log_file)
-            self._log = path.open("w", buffering=1, encoding="utf-8")
-        tracker = Tracker(self._client, self._p.map, parameters=tracking, log=self._log)
+            log = Path(self._p.log_file).open("w", buffering=1, encoding="utf-8")  # noqa: SIM115
+            self._closing.append(log.close)
+        tracker = Tracker(client, self._p.map, parameters=tracking, log=log)
         self._core = Relocaliser(tracker, self._p.relocaliser())
+        self._closing.append(self._core.close)
         self._last_report = ("", 0)
         self._subscribe()
-        self._poses = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
+        self._poses = self._publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._fixes = None
         if self._p.initial_pose_topic:
             topic = self._p.initial_pose_topic
-            self._fixes = self.create_publisher(PoseWithCovarianceStamped, topic, 10)
-        self._transforms = self.create_publisher(TFMessage, "/tf", 100)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_service(Trigger, "~/relocalise", self._relocalise)
+            self._fixes = self._publisher(PoseWithCovarianceStamped, topic, 10)
+        self._transforms = self._publisher(TFMessage, "/tf", 100)
+        self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics", 10)
+        service = self.create_service(Trigger, "~/relocalise", self._relocalise)
+        self._closing.append(partial(self.destroy_service, service))
         self._report = self._core.report(self._now_ns())
-        self.create_timer(1.0 / self._p.rate_hz, self._tick)
-        self.create_timer(1.0, self._diagnose)
+        for period_s, callback in ((1.0 / self._p.rate_hz, self._tick), (1.0, self._diagnose)):
+            timer = self.create_timer(period_s, callback)
+            self._closing.append(partial(self.destroy_timer, timer))
 
-    def _declared(self, kind: type[Any], prefix: str = "") -> dict[str, Any]:
-        """Declare parameters with the names and defaults of a record, and return their values."""
-        return {
-            one.name: self.declare_parameter(prefix + one.name, one.default).value
-            for one in fields(kind)
-        }
+    def _declare(self, kind: type[Any], prefix: str = "") -> None:
+        """Declare parameters with the names, defaults and descriptions of a record."""
+        for one in fields(kind):
+            text = one.metadata.get("description", f"see sceneprint_client.tracker.{kind.__name__}")
+            descriptor = ParameterDescriptor(description=text)
+            self.declare_parameter(prefix + one.name, one.default, descriptor)
+
+    def _values(self, kind: type[Any], prefix: str = "") -> dict[str, Any]:
+        return {one.name: self.get_parameter(prefix + one.name).value for one in fields(kind)}
+
+    def _publisher(self, kind: Any, topic: str, depth: int) -> Any:
+        publisher = self.create_publisher(kind, topic, depth)
+        self._closing.append(partial(self.destroy_publisher, publisher))
+        return publisher
+
+    def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
+        subscription = self.create_subscription(kind, topic, callback, qos)
+        self._closing.append(partial(self.destroy_subscription, subscription))
 
     def _subscribe(self) -> None:
         p, sensor = self._p, qos_profile_sensor_data
         fixed = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        listen = self.create_subscription
-        listen(TFMessage, "/tf", lambda one: self._core.take_transforms(one, fixed=False), 100)
-        listen(TFMessage, "/tf_static", lambda m: self._core.take_transforms(m, fixed=True), fixed)
-        listen(KINDS[p.kind], p.topic, self._core.take_frame, sensor)
+        take = self._core.take_transforms
+        self._listen(TFMessage, "/tf", partial(take, fixed=False), 100)
+        self._listen(TFMessage, "/tf_static", partial(take, fixed=True), fixed)
+        self._listen(KINDS[p.kind], p.topic, self._take_frame, sensor)
         if p.kind != "points":
             beside = topic_without_transport(p.topic).rpartition("/")[0] + "/camera_info"
             info = p.camera_info_topic or beside
-            listen(CameraInfo, info, self._core.take_camera_info, sensor)
+            self._listen(CameraInfo, info, self._core.take_camera_info, sensor)
         if p.imu_topic:
-            listen(Imu, p.imu_topic, self._core.take_imu, sensor)
+            self._listen(Imu, p.imu_topic, self._core.take_imu, sensor)
         if p.odometry_topic:
-            listen(Odometry, p.odometry_topic, self._core.take_odometry, sensor)
+            self._listen(Odometry, p.odometry_topic, self._core.take_odometry, sensor)
+
+    def _take_frame(self, message: Any) -> None:
+        if self._is_active:
+            self._core.take_frame(message)
 
     # Publishers.
 
     def _tick(self) -> None:
         """Process frames, and publish the pose while it is known."""
+        if not self._is_active:
+            return
         self._core.step()
         report = self._report = self._core.report(self._now_ns())
         is_new = (report.state.status, report.stamp_ns) != self._last_report
@@ -196,9 +247,9 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
         values = {"url": self._p.url, "map": self._p.map, **self._report.values}
         message.status = [
             DiagnosticStatus(
-                level=bytes([self._report.level]),
+                level=bytes([self._report.level if self._is_active else Level.WARN]),
                 name=f"{self.get_name()}: localisation",
-                message=self._report.message,
+                message=self._report.message if self._is_active else "the node is not active",
                 hardware_id=self._p.topic,
                 values=[KeyValue(key=key, value=value) for key, value in values.items()],
             )
@@ -217,23 +268,20 @@ class RelocaliserNode(Node):  # type: ignore[misc]  # rclpy has no types
 
     def destroy_node(self) -> None:
         """Stop all queries and close the log."""
-        self._core.close()
-        self._client.close()
-        if self._log is not None:
-            self._log.close()
+        self.on_cleanup(None)
         super().destroy_node()
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until it is stopped; return 2 if its parameters are not valid."""
+    """Run the node until it is stopped; return 2 if it starts itself and cannot."""
     rclpy.init(args=arguments)
+    node = RelocaliserNode()
     try:
-        node = RelocaliserNode()
-    except SceneprintError as error:
-        print(f"relocaliser: {error}", file=sys.stderr)
-        rclpy.try_shutdown()
-        return 2
-    try:
+        if node.get_parameter("autostart").value:
+            if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+                print(f"relocaliser: {node.error}", file=sys.stderr)
+                return 2
+            node.trigger_activate()
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
