@@ -20,7 +20,7 @@ from benchmarks.soak.recordings import Shot
 from sceneprint.engine.upkeep.purge import REASON
 from sceneprint_client import Client, Spool, errors
 from sceneprint_client.api import Added
-from sceneprint_client.http import StreamPosition, frame_form, read_events
+from sceneprint_client.http import StreamPosition, frame_form
 
 #: Intervals of uploads that are followed by a query, and by the deletion of the frame.
 QUERY_EVERY, DELETE_EVERY = 5, 10
@@ -322,7 +322,9 @@ class Listener(SoakThread):
         with closing(client.send(request, stream=True)) as response:
             if not response.is_success:
                 return
-            for event in read_events(response.iter_lines(), place):
+            for line in response.iter_lines():
+                if (event := place.read(line)) is None:
+                    continue
                 self.heard[event.kind, event.frame_id] += 1
                 if event.kind == "frame.deleted" and event.data.get("reason") == REASON:
                     self.retired.setdefault(event.frame_id, time.monotonic())

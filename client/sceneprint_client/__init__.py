@@ -14,13 +14,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sceneprint_client.client import Client, Status
+    from sceneprint_client.client import AsyncClient, Client, Status
     from sceneprint_client.frame_files import FrameFile, meta_of
     from sceneprint_client.spool import Spool
     from sceneprint_client.tracker import AsyncTracker, State, Tracker
 
 __version__ = "1.0.0rc1"
 __all__ = [
+    "AsyncClient",
     "AsyncTracker",
     "Client",
     "FrameFile",
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "AsyncClient": "client",
     "AsyncTracker": "tracker",
     "Client": "client",
     "FrameFile": "frame_files",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from datetime import datetime
 from urllib.parse import quote
 
@@ -20,8 +20,9 @@ from sceneprint_client.api.admin import (
     Stats,
 )
 from sceneprint_client.api.base import checked
+from sceneprint_client.calls import Call, Series
 from sceneprint_client.errors import InvalidRequest
-from sceneprint_client.http import PAGE, follow_stream, without_none
+from sceneprint_client.http import PAGE, without_none
 from sceneprint_client.jobs import JobMethods
 
 _EVENTS = "/v1/events"
@@ -30,7 +31,8 @@ _EVENTS = "/v1/events"
 class AdminMethods(JobMethods):
     """Client methods for keys, events, statistics and models."""
 
-    def create_key(
+    @Call
+    async def create_key(
         self, name: str, grants: Mapping[str, Scope], expires_at: datetime | None = None,
         tenant: str | None = None,
     ) -> MadeKey:  # fmt: skip
@@ -54,13 +56,15 @@ class AdminMethods(JobMethods):
             NewKey, "The key", name=name, grants=dict(grants), expires_at=expires_at,
             tenant=tenant,
         )  # fmt: skip
-        return self._call(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
+        return await self._call(MadeKey, "POST", "/v1/keys", json=new.model_dump(mode="json"))
 
-    def keys(self) -> list[Key]:
+    @Call
+    async def keys(self) -> list[Key]:
         """Return all keys by name, without secrets."""
-        return list(self._pages(Page[Key], "/v1/keys"))
+        return [one async for one in self._pages(Page[Key], "/v1/keys")]
 
-    def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
+    @Call
+    async def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
         """Replace the secret of a key. Only the returned record contains the new secret.
 
         Parameters
@@ -75,17 +79,22 @@ class AdminMethods(JobMethods):
         InvalidRequest : If the overlap is out of range.
         """
         path = f"/v1/keys/{quote(name, safe='')}/rotate"
-        return self._call(MadeKey, "POST", path, params={"overlap_s": overlap_s})
+        return await self._call(MadeKey, "POST", path, params={"overlap_s": overlap_s})
 
-    def revoke_key(self, name: str) -> None:
+    @Call
+    async def revoke_key(self, name: str) -> None:
         """Revoke a key; raise UnknownKey if it does not exist."""
-        self._delete(f"/v1/keys/{quote(name, safe='')}")
+        await self._delete(f"/v1/keys/{quote(name, safe='')}")
 
-    def me(self) -> Me:
+    @Call
+    async def me(self) -> Me:
         """Return the permissions of this client's key."""
-        return self._call(Me, "GET", "/v1/keys/me")
+        return await self._call(Me, "GET", "/v1/keys/me")
 
-    def audit(self, actor: str | None = None, map_name: str | None = None) -> Iterator[AuditLine]:
+    @Series
+    def audit(
+        self, actor: str | None = None, map_name: str | None = None
+    ) -> AsyncIterator[AuditLine]:
         """Yield the entries of the audit log, newest first.
 
         Parameters
@@ -95,10 +104,11 @@ class AdminMethods(JobMethods):
         """
         return self._pages(Page[AuditLine], "/v1/audit", actor=actor, map=map_name)
 
+    @Series
     def events(
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         follow: bool = True,
-    ) -> Iterator[Event]:  # fmt: skip
+    ) -> AsyncIterator[Event]:  # fmt: skip
         """Yield events in order: first stored events, then new ones as they occur.
 
         The client reconnects after a broken stream without losing or repeating an event. If the
@@ -119,11 +129,11 @@ class AdminMethods(JobMethods):
         Unreachable : If the service did not answer the first request.
         """
         if follow:
-            parameters = without_none(map=map_name, kind=list(kinds))
-            return follow_stream(lambda last: self._open_stream(_EVENTS, last, parameters), after)
+            return self._follow(_EVENTS, after, without_none(map=map_name, kind=list(kinds)))
         return self._stored_events(map_name, kinds, after)
 
-    def event_page(
+    @Call
+    async def event_page(
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         cursor: str | None = None, limit: int = 100, newest_first: bool = True,
     ) -> EventPage:  # fmt: skip
@@ -133,22 +143,24 @@ class AdminMethods(JobMethods):
             order="newest" if newest_first else "oldest",
         )  # fmt: skip
         headers = {"Accept": "application/json"}
-        return self._call(EventPage, "GET", _EVENTS, params=parameters, headers=headers)
+        return await self._call(EventPage, "GET", _EVENTS, params=parameters, headers=headers)
 
-    def _stored_events(
+    async def _stored_events(
         self, map_name: str | None, kinds: Sequence[str], after: str | None
-    ) -> Iterator[Event]:
+    ) -> AsyncIterator[Event]:
         cursor = None
         while True:
-            page = self.event_page(
+            page = await self.event_page(
                 map_name, kinds=kinds, after=after, cursor=cursor, limit=PAGE, newest_first=False
             )
-            yield from page.items
+            for event in page.items:
+                yield event
             cursor = page.next_cursor
             if cursor is None:
                 return
 
-    def stats(self, map_name: str | None = None, *, minutes: int = 60) -> Stats:
+    @Call
+    async def stats(self, map_name: str | None = None, *, minutes: int = 60) -> Stats:
         """Return statistics of the service or one map, and their history of up to 60 minutes.
 
         Raises
@@ -162,8 +174,9 @@ class AdminMethods(JobMethods):
                 (("minutes", "out of range"),),
             )
         parameters = without_none(minutes=minutes, map=map_name)
-        return self._call(Stats, "GET", "/v1/stats", params=parameters)
+        return await self._call(Stats, "GET", "/v1/stats", params=parameters)
 
-    def models(self) -> list[ModelInfo]:
+    @Call
+    async def models(self) -> list[ModelInfo]:
         """Return the models that ship with the service, and those that its maps use or used."""
-        return self._call(Page[ModelInfo], "GET", "/v1/models").items
+        return (await self._call(Page[ModelInfo], "GET", "/v1/models")).items

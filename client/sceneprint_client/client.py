@@ -1,4 +1,4 @@
-"""Synchronous client of a service."""
+"""Clients of a service: methods of Client block, methods of AsyncClient are coroutines."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pydantic import Field
 
 from sceneprint_client.administration import AdminMethods
 from sceneprint_client.api.base import ApiRecord
+from sceneprint_client.calls import Blocking, Call, settled
 from sceneprint_client.errors import MissingDependency
 from sceneprint_client.http import DEFAULT_URL, ServiceConnection
 from sceneprint_client.map_contents import MapMethods, SurfaceMethods
@@ -44,7 +45,56 @@ class Status(ApiRecord):
     read_only: bool = Field(default=False, description="Whether the service rejects all changes.")
 
 
-class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMethods):
+class ServiceMethods(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMethods):
+    """All methods of both clients."""
+
+    def __init__(
+        self, url: str = DEFAULT_URL, key: str | None = None, *, timeout_s: float = 60.0
+    ) -> None:
+        super().__init__(url, key, timeout_s)
+
+    @Call
+    async def status(self) -> Status:
+        """Return the version, and the number of frames and jobs in each state."""
+        return await self._call(Status, "GET", "/readyz")
+
+    @Call
+    async def healthy(self) -> bool:
+        """Return whether the service answers one request within a short timeout."""
+        try:
+            timeout = min(self._timeout_s, _HEALTHY_S)
+            response = await settled(self._http.get("/healthz", timeout=timeout))
+            return response.status_code == 200 and bool(response.json()["status"] == "ok")
+        except (httpx.TransportError, ValueError, KeyError, TypeError):
+            return False
+
+
+class AsyncClient(ServiceMethods):
+    """The methods of Client as coroutines; lists of frames and the like are for `async for`.
+
+    Use it in one event loop, with `async with`. A cancelled call closes its connection, and is not
+    repeated; the service may have executed it. Files are read in threads.
+
+    Parameters
+    ----------
+    url, key, timeout_s : see Client
+
+    Raises
+    ------
+    Unreachable : If the URL is invalid. The first request shows whether a service answers.
+    """
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        await self.close()
+
+
+class Client(ServiceMethods, Blocking):
     """Maps, frames and queries of a service; safe to share between threads.
 
     Requests are repeated after brief failures and while the service is busy. Repeating an upload
@@ -60,11 +110,6 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
     ------
     Unreachable : If the URL is invalid. The first request shows whether a service answers.
     """
-
-    def __init__(
-        self, url: str = DEFAULT_URL, key: str | None = None, *, timeout_s: float = 60.0
-    ) -> None:
-        super().__init__(url, key, timeout_s)
 
     @classmethod
     def embedded(cls, path: str | Path) -> Self:
@@ -87,7 +132,7 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
         if find_spec("sceneprint") is None:
             raise MissingDependency(
                 "Client.embedded runs the service in this process, and its package is not "
-                "installed. Run: pip install sceneprint"
+                "installed. In a clone, run: pip install ."
             )
         # The client has no dependency on the service, so its package is imported by name.
         service = import_module("service.embedded").LocalService(Path(path))
@@ -103,16 +148,3 @@ class Client(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMetho
         trace: TracebackType | None,
     ) -> None:  # fmt: skip
         self.close()
-
-    def status(self) -> Status:
-        """Return the version, and the number of frames and jobs in each state."""
-        return self._call(Status, "GET", "/readyz")
-
-    def healthy(self) -> bool:
-        """Return whether the service answers one request within a short timeout."""
-        try:
-            timeout = min(self._timeout_s, _HEALTHY_S)
-            response = self._http.get("/healthz", timeout=timeout)
-            return response.status_code == 200 and bool(response.json()["status"] == "ok")
-        except (httpx.TransportError, ValueError, KeyError, TypeError):
-            return False

@@ -6,6 +6,7 @@ QueryFrame, Query  --query_form, query_json-->  arguments of a request  --_call-
 
 from __future__ import annotations
 
+import asyncio
 import email.utils
 import json
 import logging
@@ -14,9 +15,9 @@ import random
 import re
 import ssl
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from http import HTTPStatus
 from os import PathLike
@@ -41,6 +42,7 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.admin import Event, Product
 from sceneprint_client.api.base import checked, is_loopback
+from sceneprint_client.calls import Blocking, Call, P, T, settled
 from sceneprint_client.errors import (
     NotFound,
     SceneprintError,
@@ -307,14 +309,18 @@ class ServiceConnection:
     MissingDependency : If a SOCKS proxy is set and its package is not installed.
     """
 
+    #: The same client for its own calls: its methods are coroutines, which never suspend.
+    _core: ServiceConnection | None = None
+
     def __init__(
         self, url: str, key: str | None, timeout_s: float,
-        transport: httpx.BaseTransport | None = None, worker: LocalWorker | None = None,
+        transport: Any = None, worker: LocalWorker | None = None,
     ) -> None:  # fmt: skip
         self._url = url.rstrip("/")
         self._timeout_s = timeout_s
         self._worker = worker
         self._answered = False  # whether the service has ever answered
+        self._is_blocking = isinstance(self, Blocking)
         headers = {"User-Agent": f"sceneprint-client/{__version__}"}
         if key is not None:
             headers["Authorization"] = f"Bearer {_checked_key(key)}"
@@ -322,7 +328,7 @@ class ServiceConnection:
             parsed = httpx.URL(self._url)
             if parsed.scheme not in ("http", "https") or not parsed.host:
                 raise httpx.InvalidURL("it does not begin with http:// or https://")
-            self._http = httpx.Client(
+            self._http = (httpx.Client if self._is_blocking else httpx.AsyncClient)(
                 base_url=self._url,
                 headers=headers,
                 timeout=timeout_s,
@@ -344,80 +350,163 @@ class ServiceConnection:
             ) from error
         self._log_filter = RequestLogFilter(self._url)
         logging.getLogger("httpx").addFilter(self._log_filter)
+        if self._is_blocking:
+            self._core = copy(self)
 
-    def close(self) -> None:
+    @Call
+    async def close(self) -> None:
         """Close connections and files."""
         logging.getLogger("httpx").removeFilter(self._log_filter)
-        self._http.close()
+        http = self._http
+        if isinstance(http, httpx.Client):
+            http.close()
+        else:
+            await http.aclose()
 
-    def _call(self, kind: type[Record], method: str, path: str, **request: Any) -> Record:
+    async def _run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function that computes or reads files; not in the thread of an event loop."""
+        if self._is_blocking:
+            return function(*args, **kwargs)
+        return await asyncio.to_thread(function, *args, **kwargs)
+
+    async def _pause(self, seconds: float) -> None:
+        await settled((time if self._is_blocking else asyncio).sleep(seconds))
+
+    async def _call(self, kind: type[Record], method: str, path: str, **request: Any) -> Record:
         """Send a request and return its answer as a record."""
-        return read_record(kind, self._send(method, path, **request))
+        return read_record(kind, await self._send(method, path, **request))
 
-    def _create(self, kind: type[Record], path: str, options: BaseModel) -> Record:
+    async def _create(self, kind: type[Record], path: str, options: BaseModel) -> Record:
         """Create a job from a record of its options and return it."""
         document = options.model_dump(mode="json", exclude_unset=True)
-        return self._call(kind, "POST", path, json=document)
+        return await self._call(kind, "POST", path, json=document)
 
-    def _bytes(self, path: str, **request: Any) -> bytes:
+    async def _bytes(self, path: str, **request: Any) -> bytes:
         """Return the bytes of the answer to a GET."""
-        return self._send("GET", path, **request).content
+        return (await self._send("GET", path, **request)).content
 
-    def _delete(self, path: str) -> None:
-        self._send("DELETE", path)
+    async def _delete(self, path: str) -> None:
+        await self._send("DELETE", path)
 
-    def _pages(self, kind: type[Page[Item]], path: str, **parameters: Any) -> Iterator[Item]:
-        """Yield the items of all pages of a list; the first page is requested immediately."""
-
-        def page_after(cursor: str | None) -> Page[Item]:
+    async def _pages(
+        self, kind: type[Page[Item]], path: str, **parameters: Any
+    ) -> AsyncIterator[Item]:
+        """Yield the items of all pages of a list."""
+        cursor: str | None = None
+        while True:
             query = without_none(**parameters, cursor=cursor, limit=PAGE)
-            return self._call(kind, "GET", path, params=query)
+            page = await self._call(kind, "GET", path, params=query)
+            for item in page.items:
+                yield item
+            cursor = page.next_cursor
+            if cursor is None:
+                return
 
-        def items(page: Page[Item]) -> Iterator[Item]:
-            yield from page.items
-            while page.next_cursor is not None:
-                page = page_after(page.next_cursor)
-                yield from page.items
-
-        return items(page_after(None))
-
-    def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
+    async def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
         """Send a request with retries; 404 counts as success if an earlier DELETE was lost."""
-        response, lost = self._persist(lambda: self._http.request(method, path, **request))
+        response, lost = await self._persist(lambda: self._http.request(method, path, **request))
         deleted_before = method == "DELETE" and lost > 0 and response.status_code == 404
         if response.is_success or deleted_before:
             return response
         raise error_of(response)
 
-    def _persist(self, send: Callable[[], httpx.Response]) -> tuple[httpx.Response, int]:
-        response, lost = persist(send, self._url, met=self._answered)
-        self._answered = True
-        return response, lost
+    async def _persist(
+        self, send: Callable[[], httpx.Response | Awaitable[httpx.Response]]
+    ) -> tuple[httpx.Response, int]:
+        """Send an idempotent request until it is answered.
 
-    def _open_stream(
+        Returns
+        -------
+        response : the first response that does not request a retry, or the last one
+        lost : number of unanswered attempts that the service may have executed
+
+        Raises
+        ------
+        Unreachable : If the service does not answer.
+        """
+        until, lost = time.monotonic() + LIMIT_S, 0
+        for tried in range(1, TRIES + 1):
+            pause = min(FIRST_PAUSE_S * 2 ** (tried - 1), LONGEST_PAUSE_S)
+            pause *= random.uniform(0.5, 1.5)
+            hopeless = tried == TRIES
+            error: httpx.TransportError | None = None
+            response: httpx.Response | None = None
+            try:
+                response = await settled(send())
+            except httpx.TransportError as caught:
+                error = caught
+                nobody = isinstance(caught, (httpx.ConnectError, httpx.ConnectTimeout))
+                lost += not nobody
+                hopeless |= isinstance(caught, _HOPELESS)
+                hopeless |= nobody and not self._answered and tried >= TRIES_UNMET
+            if response is not None:
+                self._answered = True
+                if response.status_code not in _BUSY:
+                    return response, lost
+                pause = max(pause, retry_after_s(response.headers.get("Retry-After", "")))
+            if hopeless or time.monotonic() + pause > until:
+                if response is not None:
+                    return response, lost
+                raise unreachable(self._url, error) from error
+            await self._pause(pause)
+        raise AssertionError("the last attempt returns or raises")
+
+    async def _open_stream(
         self, path: str, last: str | None, parameters: dict[str, Any]
     ) -> httpx.Response:
         """Open a stream of events that starts after an id."""
 
-        def send() -> httpx.Response:
+        async def send() -> httpx.Response:
             headers = {"Accept": "text/event-stream"} | without_none(**{"Last-Event-ID": last})
             request = self._http.build_request(
                 "GET", path, params=parameters, headers=headers, timeout=SILENCE_S
             )
-            response = self._http.send(request, stream=True)
+            response = await settled(self._http.send(request, stream=True))
             if not response.is_success:
-                response.read()
+                await settled(response.read() if self._is_blocking else response.aread())
             return response
 
-        response, _ = self._persist(send)
+        response, _ = await self._persist(send)
         if not response.is_success:
             raise error_of(response)
         return response
 
-    def _work_or_wait(self, pause_s: float) -> None:
+    async def _follow(
+        self, path: str, after: str | None, parameters: dict[str, Any]
+    ) -> AsyncIterator[Event]:
+        """Yield events without end; a stream that ends or breaks is opened again.
+
+        Parameters
+        ----------
+        path, parameters : address of the stream
+        after : id of the event before the first one; None yields only new events
+        """
+        place, met = StreamPosition(after), False
+        while True:
+            place = StreamPosition(place.last, place.pause_s)
+            try:
+                response = await self._open_stream(path, place.last, parameters)
+                met = True
+                try:
+                    async for line in _lines(response):
+                        if (event := place.read(line)) is not None:
+                            yield event
+                finally:
+                    if self._is_blocking:
+                        response.close()
+                    else:
+                        await response.aclose()
+            except httpx.TransportError:
+                pass  # the stream broke or timed out
+            except errors.Unreachable:
+                if not met:
+                    raise
+            await self._pause(place.pause_s)
+
+    async def _work_or_wait(self, pause_s: float) -> None:
         """Run a job in this process, or wait while workers of the service run jobs."""
         if self._worker is None:
-            time.sleep(pause_s)
+            await self._pause(pause_s)
         else:
             self._worker.work(pause_s)
 
@@ -464,54 +553,6 @@ def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
 
 #: Statuses of a proxy that cannot reach the service.
 _OF_PROXY = (502, 503, 504)
-
-# Retries after temporary failures.
-
-
-def persist(
-    send: Callable[[], httpx.Response], url: str, *, met: bool
-) -> tuple[httpx.Response, int]:
-    """Send an idempotent request until it is answered.
-
-    Parameters
-    ----------
-    send : function that sends the request
-    url : address of the service, for the message
-    met : whether the service has answered before
-
-    Returns
-    -------
-    response : the first response that does not request a retry, or the last one
-    lost : number of unanswered attempts that the service may have executed
-
-    Raises
-    ------
-    Unreachable : If the service does not answer.
-    """
-    until, lost = time.monotonic() + LIMIT_S, 0
-    for tried in range(1, TRIES + 1):
-        pause = min(FIRST_PAUSE_S * 2 ** (tried - 1), LONGEST_PAUSE_S) * random.uniform(0.5, 1.5)
-        error: httpx.TransportError | None = None
-        response: httpx.Response | None = None
-        hopeless = tried == TRIES
-        try:
-            response = send()
-        except httpx.TransportError as caught:
-            error = caught
-            nobody = isinstance(caught, (httpx.ConnectError, httpx.ConnectTimeout))
-            lost += not nobody
-            hopeless |= isinstance(caught, _HOPELESS)
-            hopeless |= nobody and not met and tried >= TRIES_UNMET
-        if response is not None:
-            if response.status_code not in _BUSY:
-                return response, lost
-            pause = max(pause, retry_after_s(response.headers.get("Retry-After", "")))
-        if hopeless or time.monotonic() + pause > until:
-            if response is not None:
-                return response, lost
-            raise unreachable(url, error) from error
-        time.sleep(pause)
-    raise AssertionError("the last attempt returns or raises")
 
 
 def unreachable(url: str, error: Exception | None) -> errors.Unreachable:
@@ -630,51 +671,34 @@ class StreamPosition:
 
     last: str | None
     pause_s: float = STREAM_PAUSE_S
+    _id: str | None = field(default=None, init=False, compare=False)
+    _data: list[str] = field(default_factory=list, init=False, compare=False)
 
-
-def read_events(lines: Iterable[str], place: StreamPosition) -> Iterator[Event]:
-    """Yield the events of a stream; each updates the position before it is yielded."""
-    data: list[str] = []
-    last = place.last
-    for line in lines:
+    def read(self, line: str) -> Event | None:
+        """Return the event that a line completes, after the position was moved behind it."""
         name, _, value = line.partition(":")
         value = value.removeprefix(" ")
         if not line:
-            place.last = last
-            if data:
-                yield Event.model_validate_json("\n".join(data))
-            data = []
-        elif name == "data":
-            data.append(value)
+            self.last = self.last if self._id is None else self._id
+            data, self._data = self._data, []
+            return Event.model_validate_json("\n".join(data)) if data else None
+        if name == "data":
+            self._data.append(value)
         elif name == "id" and "\0" not in value:
-            last = value
+            self._id = value
         elif name == "retry" and value.isascii() and value.isdigit():
-            place.pause_s = min(float(value[:9]) / 1e3, SILENCE_S)
+            self.pause_s = min(float(value[:9]) / 1e3, SILENCE_S)
+        return None
 
 
-def follow_stream(
-    opened: Callable[[str | None], httpx.Response], after: str | None
-) -> Iterator[Event]:
-    """Yield events without end; a stream that ends or breaks is opened again.
-
-    Parameters
-    ----------
-    opened : function that opens a stream after an event id; raises if no stream is available
-    after : id of the event before the first one; None yields only new events
-    """
-    place = StreamPosition(after)
-    met = False
-    while True:
-        try:
-            with closing(opened(place.last)) as response:
-                met = True
-                yield from read_events(response.iter_lines(), place)
-        except httpx.TransportError:
-            pass  # the stream broke or timed out
-        except errors.Unreachable:
-            if not met:
-                raise
-        time.sleep(place.pause_s)
+async def _lines(response: httpx.Response) -> AsyncIterator[str]:
+    """Yield the lines of a response of either class of httpx."""
+    if isinstance(response.stream, httpx.SyncByteStream):
+        for line in response.iter_lines():
+            yield line
+    else:
+        async for line in response.aiter_lines():
+            yield line
 
 
 #: First and longest pause between two checks of a job, seconds.

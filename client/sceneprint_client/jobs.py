@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, get_args
 
@@ -31,6 +31,7 @@ from sceneprint_client.api.sessions import (
     GraphFormat,
 )
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
+from sceneprint_client.calls import Call, Series
 from sceneprint_client.errors import InvalidRequest, UnreadableArchive, UnreadableCloud
 from sceneprint_client.http import (
     ServiceConnection,
@@ -58,15 +59,18 @@ _CHUNK = 1 << 20
 class JobMethods(ServiceConnection):
     """Client methods for jobs and their results."""
 
-    def job(self, job_id: str) -> Job:
+    @Call
+    async def job(self, job_id: str) -> Job:
         """Return a job; raise UnknownJob if it does not exist."""
-        return self._call(Job, "GET", job_path(job_id))
+        return await self._call(Job, "GET", job_path(job_id))
 
-    def jobs(self, state: JobState | None = None) -> Iterator[Job]:
+    @Series
+    def jobs(self, state: JobState | None = None) -> AsyncIterator[Job]:
         """Yield the jobs of all maps, newest first, optionally only those in one state."""
         return self._pages(Page[Job], "/v1/jobs", state=state)
 
-    def cancel_job(self, job_id: str) -> Job:
+    @Call
+    async def cancel_job(self, job_id: str) -> Job:
         """Cancel a job that has not ended; its frame becomes `failed`.
 
         Raises
@@ -74,9 +78,10 @@ class JobMethods(ServiceConnection):
         UnknownJob : If the job does not exist.
         JobOver : If the job has ended.
         """
-        return self._call(Job, "POST", f"{job_path(job_id)}/cancel")
+        return await self._call(Job, "POST", f"{job_path(job_id)}/cancel")
 
-    def retry_job(self, job_id: str) -> Job:
+    @Call
+    async def retry_job(self, job_id: str) -> Job:
         """Retry a job that is dead, cancelled or failed.
 
         Returns
@@ -88,9 +93,10 @@ class JobMethods(ServiceConnection):
         UnknownJob : If the job does not exist.
         CannotRetry : If the job did not fail, or there is nothing to retry.
         """
-        return self._call(Job, "POST", f"{job_path(job_id)}/retry")
+        return await self._call(Job, "POST", f"{job_path(job_id)}/retry")
 
-    def retry_dead_jobs(self, map_name: str | None = None) -> Iterator[RetriedJobs]:
+    @Series
+    async def retry_dead_jobs(self, map_name: str | None = None) -> AsyncIterator[RetriedJobs]:
         """Retry all dead jobs, or those of a map, except jobs with an earlier retry.
 
         Yields
@@ -104,13 +110,14 @@ class JobMethods(ServiceConnection):
         cursor: str | None = None
         while True:
             parameters = without_none(map=map_name, cursor=cursor)
-            done = self._call(RetriedJobs, "POST", "/v1/jobs/retry", params=parameters)
+            done = await self._call(RetriedJobs, "POST", "/v1/jobs/retry", params=parameters)
             yield done
             cursor = done.next_cursor
             if cursor is None:
                 return
 
-    def wait(
+    @Call
+    async def wait(
         self, job_ids: Iterable[str], *, timeout_s: float = 600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> list[Job]:  # fmt: skip
@@ -136,7 +143,7 @@ class JobMethods(ServiceConnection):
         for pause in growing_pauses(until):
             while waiting:  # repeats without a pause while jobs of the window have ended
                 window = waiting[:_WINDOW]
-                known |= {job_id: self.job(job_id) for job_id in window}
+                known |= {job_id: await self.job(job_id) for job_id in window}
                 left = [job_id for job_id in window if not known[job_id].state.over]
                 waiting[:_WINDOW] = left
                 if progress is not None:
@@ -145,10 +152,11 @@ class JobMethods(ServiceConnection):
                     break
             if not waiting:
                 break
-            self._work_or_wait(pause)
-        return [known[job_id] if job_id in known else self.job(job_id) for job_id in order]
+            await self._work_or_wait(pause)
+        return [known[job_id] if job_id in known else await self.job(job_id) for job_id in order]
 
-    def import_archive(
+    @Call
+    async def import_archive(
         self, map_name: str, archive: Path | BinaryIO, options: ImportOptions | None = None
     ) -> Job:
         """Import an archive of sequences into a map; a worker reads its frames one by one.
@@ -171,18 +179,19 @@ class JobMethods(ServiceConnection):
         UnreadableArchive : If the file cannot be read or is not an archive.
         """
         if not isinstance(archive, Path):
-            return self._send_archive(map_name, archive, options or ImportOptions())
+            return await self._send_archive(map_name, archive, options or ImportOptions())
         try:
             with archive.open("rb") as file:
                 name = archive.name.partition(".")[0][:64] or "import"
                 own = options or checked(ImportOptions, "The archive's name", name=name)
-                return self._send_archive(map_name, file, own)
+                return await self._send_archive(map_name, file, own)
         except OSError as error:
             raise UnreadableArchive(
                 f"{archive}: The file cannot be read ({error.strerror}). Check its path."
             ) from error
 
-    def import_map(
+    @Call
+    async def import_map(
         self, map_name: str, file: Path | BinaryIO, options: ImportOptions | None = None
     ) -> Job:
         """Import a map from a single file, a cloud or a mesh: a worker renders views of it.
@@ -206,39 +215,54 @@ class JobMethods(ServiceConnection):
         UnreadableCloud : If the file cannot be read or its format cannot hold a map.
         """
         if not isinstance(file, Path):
-            return self._send_archive(map_name, file, _map_import_options(options, None))
+            return await self._send_archive(map_name, file, _map_import_options(options, None))
         try:
             with file.open("rb") as opened:
-                return self._send_archive(map_name, opened, _map_import_options(options, file.name))
+                return await self._send_archive(
+                    map_name, opened, _map_import_options(options, file.name)
+                )
         except OSError as error:
             raise UnreadableCloud(
                 f"{file}: The file cannot be read ({error.strerror}). Check its path."
             ) from error
 
-    def import_items(self, map_name: str, job_id: str) -> Iterator[ImportItem]:
+    @Series
+    def import_items(self, map_name: str, job_id: str) -> AsyncIterator[ImportItem]:
         """Yield the results for the members of an archive so far, in the order of the archive."""
         job = job_path(job_id).rpartition("/")[2]
         return self._pages(Page[ImportItem], f"{map_path(map_name)}/imports/{job}/items")
 
-    def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
+    async def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
         """Send an archive; each attempt starts at its beginning."""
         path = f"{map_path(map_name)}/imports"
         parameters = {"options": options.model_dump_json(exclude_defaults=True, by_alias=True)}
 
-        def send() -> httpx.Response:
+        def send() -> httpx.Response | Awaitable[httpx.Response]:
             archive.seek(0)
             return self._http.request(
-                "POST", path, content=iter(lambda: archive.read(_CHUNK), b""), params=parameters,
+                "POST", path, content=self._pieces(archive), params=parameters,
                 timeout=self._timeout_s, headers={"Content-Type": "application/octet-stream"},
             )  # fmt: skip
 
-        response, _ = self._persist(send)
+        response, _ = await self._persist(send)
         if not response.is_success:
             raise error_of(response)
         return read_record(Job, response)
 
-    def compute(
-        self, kind: type[_Product], map_name: str, *, timeout_s: float = 3600.0,
+    def _pieces(self, archive: BinaryIO) -> Any:
+        """Return an iterator over the content of an archive, of the kind that httpx requires."""
+        if self._is_blocking:
+            return iter(lambda: archive.read(_CHUNK), b"")
+
+        async def pieces() -> AsyncIterator[bytes]:
+            while piece := await self._run(archive.read, _CHUNK):
+                yield piece
+
+        return pieces()
+
+    @Call
+    async def compute(
+        self, /, kind: type[_Product], map_name: str, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None, **request: Any,
     ) -> _Product:  # fmt: skip
         """Compute a product of a map: coverage, an association, or a difference of sessions.
@@ -262,10 +286,11 @@ class JobMethods(ServiceConnection):
         InvalidRequest : If the map lacks the requested frames, or a field is out of range.
         """
         options = checked(kind.request_type, f"The {kind.noun}", **request)
-        product = self._create(kind, f"{map_path(map_name)}/{kind.collection}", options)
-        return self.wait_for_product(product, timeout_s=timeout_s, progress=progress)
+        product = await self._create(kind, f"{map_path(map_name)}/{kind.collection}", options)
+        return await self.wait_for_product(product, timeout_s=timeout_s, progress=progress)
 
-    def product(self, kind: type[_Product], map_name: str | None, job_id: str) -> _Product:
+    @Call
+    async def product(self, kind: type[_Product], map_name: str | None, job_id: str) -> _Product:
         """Return a product; raise UnknownMap or UnknownJob if it does not exist.
 
         Parameters
@@ -273,9 +298,10 @@ class JobMethods(ServiceConnection):
         kind : MapCoverage, Association, Difference or Reconstruction
         map_name, job_id : ids of the product; `map_name` is None for a Reconstruction
         """
-        return self._call(kind, "GET", product_path(kind, map_name, job_id))
+        return await self._call(kind, "GET", product_path(kind, map_name, job_id))
 
-    def products(self, kind: type[_Product], map_name: str) -> Iterator[_Product]:
+    @Series
+    def products(self, kind: type[_Product], map_name: str) -> AsyncIterator[_Product]:
         """Yield the products of a map, newest first; coverage results omit their plans.
 
         Parameters
@@ -285,7 +311,8 @@ class JobMethods(ServiceConnection):
         page: type[Page[_Product]] = Page[kind]  # type: ignore[valid-type]
         return self._pages(page, f"{map_path(map_name)}/{kind.collection}")
 
-    def delete_product(self, kind: type[Product], map_name: str | None, job_id: str) -> None:
+    @Call
+    async def delete_product(self, kind: type[Product], map_name: str | None, job_id: str) -> None:
         """Delete a product with its results, even while a worker computes it; see `product`.
 
         Raises
@@ -293,9 +320,10 @@ class JobMethods(ServiceConnection):
         UnknownMap, UnknownJob : If the map or job does not exist.
         JoinStands : If the product is an association whose join must be undone first.
         """
-        self._delete(product_path(kind, map_name, job_id))
+        await self._delete(product_path(kind, map_name, job_id))
 
-    def wait_for_product(
+    @Call
+    async def wait_for_product(
         self, product: _Product, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> _Product:  # fmt: skip
@@ -315,10 +343,11 @@ class JobMethods(ServiceConnection):
             pause = next(pauses, None)
             if product.state.over or pause is None:
                 return product
-            self._work_or_wait(pause)
-            product = self.product(type(product), product.map, product.job_id)
+            await self._work_or_wait(pause)
+            product = await self.product(type(product), product.map, product.job_id)
 
-    def undo_join(self, map_name: str, job_id: str) -> Association:
+    @Call
+    async def undo_join(self, map_name: str, job_id: str) -> Association:
         """Undo the join of an association, and return its frames to the poses of their uploads.
 
         Frames that other joins move keep the result of these. The sessions of the map are not
@@ -330,12 +359,13 @@ class JobMethods(ServiceConnection):
         NotIndexed : If the job has not succeeded.
         """
         path = f"{product_path(Association, map_name, job_id)}/join"
-        return self._call(Association, "DELETE", path)
+        return await self._call(Association, "DELETE", path)
 
+    @Series
     def edges(
         self, map_name: str, job_id: str, *, min_overlap: float = 0.0,
         consistent: bool | None = None,
-    ) -> Iterator[Edge]:  # fmt: skip
+    ) -> AsyncIterator[Edge]:  # fmt: skip
         """Yield the edges of an association in the order of their discovery.
 
         Parameters
@@ -355,7 +385,8 @@ class JobMethods(ServiceConnection):
             min_overlap=min_overlap, consistent=consistent,
         )  # fmt: skip
 
-    def graph(
+    @Call
+    async def graph(
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", *,
         min_overlap: float = 0.0, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
@@ -387,11 +418,12 @@ class JobMethods(ServiceConnection):
             "consistent": consistent,
         }  # fmt: skip
         path = f"{product_path(Association, map_name, job_id)}/graph"
-        return self._bytes(path, params=parameters).decode()
+        return (await self._bytes(path, params=parameters)).decode()
 
+    @Series
     def coverage_frames(
         self, map_name: str, job_id: str, outcome: CoverageOutcome | None = None
-    ) -> Iterator[CoverageFrame]:
+    ) -> AsyncIterator[CoverageFrame]:
         """Yield the query frames of a coverage job, optionally only those with one outcome.
 
         Raises
@@ -401,7 +433,8 @@ class JobMethods(ServiceConnection):
         path = f"{product_path(MapCoverage, map_name, job_id)}/frames"
         return self._pages(Page[CoverageFrame], path, outcome=outcome)
 
-    def coverage_changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
+    @Call
+    async def coverage_changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
         """Return the cells that became better or worse since an earlier job with the same options.
 
         Raises
@@ -411,9 +444,10 @@ class JobMethods(ServiceConnection):
         InvalidRequest : If the two results cannot be compared.
         """
         path = f"{product_path(MapCoverage, map_name, job_id)}/changes"
-        return self._call(CoverageChanges, "GET", path, params={"since": since})
+        return await self._call(CoverageChanges, "GET", path, params={"since": since})
 
-    def difference_points(self, map_name: str, job_id: str) -> SurfacePoints:
+    @Call
+    async def difference_points(self, map_name: str, job_id: str) -> SurfacePoints:
         """Return the cells of both sessions as points. `patches` holds the kind of each: SAME,
         GONE, NEW, UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
 
@@ -425,10 +459,12 @@ class JobMethods(ServiceConnection):
         """
         from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
-        return decode_points(self._bytes(f"{product_path(Difference, map_name, job_id)}/points"))
+        path = f"{product_path(Difference, map_name, job_id)}/points"
+        return decode_points(await self._bytes(path))
 
-    def reconstruct(
-        self, query: str | Answer, *, wait_s: float | None = None, **request: Any
+    @Call
+    async def reconstruct(
+        self, /, query: str | Answer, *, wait_s: float | None = None, **request: Any
     ) -> Reconstruction:
         """Fuse the accepted matches of an answer into a surface, in the query's camera frame.
 
@@ -449,10 +485,15 @@ class JobMethods(ServiceConnection):
         """
         options = checked(NewReconstruction, "The reconstruction", **request)
         query_id = query if isinstance(query, str) else query.query_id
-        product = self._create(Reconstruction, f"{query_path(query_id)}/reconstruction", options)
-        return product if wait_s is None else self.wait_for_product(product, timeout_s=wait_s)
+        product = await self._create(
+            Reconstruction, f"{query_path(query_id)}/reconstruction", options
+        )
+        if wait_s is None:
+            return product
+        return await self.wait_for_product(product, timeout_s=wait_s)
 
-    def reconstruction_mesh(self, job_id: str) -> bytes:
+    @Call
+    async def reconstruction_mesh(self, job_id: str) -> bytes:
         """Return the surface of a reconstruction as a PLY file.
 
         Raises
@@ -460,7 +501,7 @@ class JobMethods(ServiceConnection):
         UnknownJob : If the job does not exist.
         NotIndexed : If the job has not succeeded.
         """
-        return self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
+        return await self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
 
 
 def _map_import_options(options: ImportOptions | None, name: str | None) -> ImportOptions:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -42,6 +42,7 @@ from sceneprint_client.api.surface import (
     SurfaceSighting,
     SurfaceTile,
 )
+from sceneprint_client.calls import Call, Series
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import (
     ServiceConnection,
@@ -60,8 +61,9 @@ if TYPE_CHECKING:
 class MapMethods(ServiceConnection):
     """Client methods for maps, their frames and the results of these."""
 
-    def create_map(
-        self, name: str, title: str | None = None, model: str = "depth",
+    @Call
+    async def create_map(
+        self, /, name: str, title: str | None = None, model: str = "depth",
         up: Sequence[float] | None = None, **limits: float | None,
     ) -> Map:  # fmt: skip
         """Create a map, or confirm that it exists with the same properties.
@@ -81,17 +83,20 @@ class MapMethods(ServiceConnection):
         """
         known: dict[str, Any] = limits if up is None else {**limits, "up": list(up)}
         new = checked(NewMap, "The map", name=name, title=title, model=model, **known)
-        return self._call(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
+        return await self._call(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
 
-    def maps(self) -> list[Map]:
+    @Call
+    async def maps(self) -> list[Map]:
         """Return all maps by name."""
-        return self._call(Page[Map], "GET", "/v1/maps").items
+        return (await self._call(Page[Map], "GET", "/v1/maps")).items
 
-    def map(self, name: str) -> Map:
+    @Call
+    async def map(self, name: str) -> Map:
         """Return a map; raise UnknownMap if it does not exist."""
-        return self._call(Map, "GET", map_path(name))
+        return await self._call(Map, "GET", map_path(name))
 
-    def edit_map(
+    @Call
+    async def edit_map(
         self, map_name: str, changes: Mapping[str, Any], if_match: str | None = None, *,
         dry_run: bool = False,
     ) -> Map:  # fmt: skip
@@ -102,15 +107,17 @@ class MapMethods(ServiceConnection):
         retention would delete immediately.
         """
         parameters = {"dry_run": "true"} if dry_run else {}
-        return self._call(
+        return await self._call(
             Map, "PATCH", map_path(map_name), params=parameters, **_edit_request(changes, if_match)
         )
 
-    def delete_map(self, name: str) -> None:
+    @Call
+    async def delete_map(self, name: str) -> None:
         """Delete a map and its contents permanently; raise UnknownMap if it does not exist."""
-        self._delete(map_path(name))
+        await self._delete(map_path(name))
 
-    def reencode(self, map_name: str, model: str) -> Map:
+    @Call
+    async def reencode(self, map_name: str, model: str) -> Map:
         """Sign a map again with another model; the map switches when all frames are signed.
 
         Parameters
@@ -123,9 +130,12 @@ class MapMethods(ServiceConnection):
         InvalidRequest : If the model does not exist.
         Conflict : If the map has this model, or is being signed with a third model.
         """
-        return self._call(Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model})
+        return await self._call(
+            Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model}
+        )
 
-    def cancel_reencoding(self, map_name: str) -> Map:
+    @Call
+    async def cancel_reencoding(self, map_name: str) -> Map:
         """Cancel a re-encoding: the map keeps its model.
 
         Raises
@@ -133,12 +143,14 @@ class MapMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         Conflict : If the map is not being re-encoded.
         """
-        return self._call(Map, "DELETE", f"{map_path(map_name)}/reencoding")
+        return await self._call(Map, "DELETE", f"{map_path(map_name)}/reencoding")
 
-    def frame(self, map_name: str, frame_id: str) -> Frame:
+    @Call
+    async def frame(self, map_name: str, frame_id: str) -> Frame:
         """Return a frame; raise UnknownMap or UnknownFrame if it does not exist."""
-        return self._call(Frame, "GET", frame_path(map_name, frame_id))
+        return await self._call(Frame, "GET", frame_path(map_name, frame_id))
 
+    @Series
     def frames(
         self, map_name: str, state: FrameState | None = None, *,
         robot: str | Iterable[str] = (), session: str | Iterable[str] = (),
@@ -147,7 +159,7 @@ class MapMethods(ServiceConnection):
         received_before: datetime | None = None, parent_frame: str | None = None,
         has_pose: bool | None = None, content_id: str | None = None, name: str | None = None,
         find: str | None = None, order: Literal["asc", "desc", "taken"] = "asc",
-    ) -> Iterator[Frame]:  # fmt: skip
+    ) -> AsyncIterator[Frame]:  # fmt: skip
         """Yield the frames of a map in order of arrival; deleted frames only with `state`.
 
         A frame must meet all conditions; a frame without the field does not meet its condition.
@@ -183,7 +195,8 @@ class MapMethods(ServiceConnection):
         parameters = listing.model_dump(mode="json", exclude_defaults=True)
         return self._pages(Page[Frame], f"{map_path(map_name)}/frames", **parameters)
 
-    def edit_frame(
+    @Call
+    async def edit_frame(
         self, map_name: str, frame_id: str, changes: Mapping[str, Any],
         if_match: str | None = None,
     ) -> Frame:  # fmt: skip
@@ -200,15 +213,17 @@ class MapMethods(ServiceConnection):
         InvalidRequest, InvalidPose : If a field is unknown, cannot be edited, or is invalid.
         PreconditionFailed : If the frame was edited after you read it.
         """
-        return self._call(
+        return await self._call(
             Frame, "PATCH", frame_path(map_name, frame_id), **_edit_request(changes, if_match)
         )
 
-    def delete_frame(self, map_name: str, frame_id: str) -> None:
+    @Call
+    async def delete_frame(self, map_name: str, frame_id: str) -> None:
         """Delete a frame; raise UnknownMap or UnknownFrame if it does not exist."""
-        self._delete(frame_path(map_name, frame_id))
+        await self._delete(frame_path(map_name, frame_id))
 
-    def restore_frame(self, map_name: str, frame_id: str) -> Frame:
+    @Call
+    async def restore_frame(self, map_name: str, frame_id: str) -> Frame:
         """Restore a deleted frame, within ten minutes by default.
 
         Raises
@@ -217,9 +232,10 @@ class MapMethods(ServiceConnection):
         Conflict : If the same content was uploaded again.
         QuotaExceeded : If the quota of the map has no room for the frame.
         """
-        return self._call(Frame, "POST", f"{frame_path(map_name, frame_id)}/restore")
+        return await self._call(Frame, "POST", f"{frame_path(map_name, frame_id)}/restore")
 
-    def delete_frames(
+    @Call
+    async def delete_frames(
         self, map_name: str, frame_ids: Sequence[str] | None = None,
         filter: Mapping[str, Any] | None = None,  # noqa: A002  (as in JSON)
     ) -> tuple[int, list[FrameDeletion]]:  # fmt: skip
@@ -243,7 +259,7 @@ class MapMethods(ServiceConnection):
         body = without_none(frame_ids=_list_or_none(frame_ids), filter=filter)
         count, deletions = 0, list[FrameDeletion]()
         while True:
-            done = self._call(
+            done = await self._call(
                 FramesDeleted, "POST", f"{map_path(map_name)}/frames/delete", json=body
             )
             count += done.frames
@@ -251,8 +267,9 @@ class MapMethods(ServiceConnection):
             if not done.remaining:
                 return count, deletions
 
-    def edit_frames(
-        self, map_name: str, frame_ids: Sequence[str] | None = None,
+    @Call
+    async def edit_frames(
+        self, /, map_name: str, frame_ids: Sequence[str] | None = None,
         filter: Mapping[str, Any] | None = None,  # noqa: A002  (as in JSON)
         **changes: Any,
     ) -> tuple[int, list[dict[str, Any]]]:  # fmt: skip
@@ -276,14 +293,17 @@ class MapMethods(ServiceConnection):
         body = without_none(frame_ids=_list_or_none(frame_ids), filter=filter) | changes
         count, inverse = 0, list[dict[str, Any]]()
         while True:
-            done = self._call(FramesEdited, "POST", f"{map_path(map_name)}/frames/edit", json=body)
+            done = await self._call(
+                FramesEdited, "POST", f"{map_path(map_name)}/frames/edit", json=body
+            )
             count += done.frames
             inverse += done.inverse
             if not done.remaining:
                 return count, inverse
             body["after"] = done.last_frame_id
 
-    def restore_deletion(self, map_name: str, deletion_id: str) -> FramesRestored:
+    @Call
+    async def restore_deletion(self, map_name: str, deletion_id: str) -> FramesRestored:
         """Restore the frames of a deletion, within ten minutes by default.
 
         Parameters
@@ -298,18 +318,20 @@ class MapMethods(ServiceConnection):
         path = f"{deletion_path(map_name, deletion_id)}/restore"
         count, refused = 0, dict[str, RefusedFrame]()
         while True:
-            done = self._call(FramesRestored, "POST", path)
+            done = await self._call(FramesRestored, "POST", path)
             count += done.frames
             refused |= {one.frame_id: one for one in done.refused}
             if not done.remaining or not done.frames:
                 update = {"frames": count, "refused": list(refused.values())}
                 return done.model_copy(update=update)
 
-    def deletions(self, map_name: str) -> Iterator[FrameDeletion]:
+    @Series
+    def deletions(self, map_name: str) -> AsyncIterator[FrameDeletion]:
         """Yield the deletions that can still be undone, newest first."""
         return self._pages(Page[FrameDeletion], f"{map_path(map_name)}/deletions")
 
-    def sessions(self, map_name: str) -> Iterator[Session]:
+    @Series
+    def sessions(self, map_name: str) -> AsyncIterator[Session]:
         """Yield the sessions of a map by robot, with frame counts, times and parent frames.
 
         Raises
@@ -318,7 +340,8 @@ class MapMethods(ServiceConnection):
         """
         return self._pages(Page[Session], f"{map_path(map_name)}/sessions")
 
-    def delete_session(self, map_name: str, session: str, robot: str | None = None) -> int:
+    @Call
+    async def delete_session(self, map_name: str, session: str, robot: str | None = None) -> int:
         """Delete all frames of a session and return their number; `restore_deletion` undoes it.
 
         Parameters
@@ -333,12 +356,13 @@ class MapMethods(ServiceConnection):
         path, deleted = f"{map_path(map_name)}/sessions", 0
         while True:
             parameters = without_none(session=session, robot=robot)
-            change = self._call(SessionChange, "DELETE", path, params=parameters)
+            change = await self._call(SessionChange, "DELETE", path, params=parameters)
             deleted += change.frames
             if not change.remaining:
                 return deleted
 
-    def edit_session(
+    @Call
+    async def edit_session(
         self, map_name: str, session: str, *, rename: str | None = None,
         rename_robot: str | None = None, add_tags: Sequence[str] = (),
         remove_tags: Sequence[str] = (), robot: str | None = None,
@@ -366,12 +390,13 @@ class MapMethods(ServiceConnection):
         body = {name: value for name, value in changes.items() if value}
         while True:
             parameters = without_none(session=session, robot=robot, after=after)
-            change = self._call(SessionChange, "PATCH", path, json=body, params=parameters)
+            change = await self._call(SessionChange, "PATCH", path, json=body, params=parameters)
             edited, after = edited + change.frames, change.last_frame_id
             if not change.remaining:
                 return edited
 
-    def trajectory(
+    @Call
+    async def trajectory(
         self, map_name: str, session: str, *, robot: str | None = None,
         parent_frame: str | None = None, captured_after: datetime | None = None,
         captured_before: datetime | None = None, most: int | None = None,
@@ -395,9 +420,12 @@ class MapMethods(ServiceConnection):
         InvalidRequest : If the session is ambiguous, or too long for one answer.
         """
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
-        return self._call(Trajectory, "GET", **_run_request(map_name, run, "application/json"))
+        return await self._call(
+            Trajectory, "GET", **_run_request(map_name, run, "application/json")
+        )
 
-    def trajectory_text(
+    @Call
+    async def trajectory_text(
         self, map_name: str, session: str, *, robot: str | None = None,
         parent_frame: str | None = None, captured_after: datetime | None = None,
         captured_before: datetime | None = None, most: int | None = None,
@@ -405,9 +433,10 @@ class MapMethods(ServiceConnection):
     ) -> str:  # fmt: skip
         """Return the text of a TUM file; parameters and errors as for `trajectory`."""
         run = _run(session, robot, parent_frame, captured_after, captured_before, most, clock)
-        return self._bytes(**_run_request(map_name, run, "text/plain")).decode()
+        return (await self._bytes(**_run_request(map_name, run, "text/plain"))).decode()
 
-    def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> bytes:
+    @Call
+    async def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> bytes:
         """Return points and normals of a frame's surface as PLY.
 
         Parameters
@@ -423,9 +452,12 @@ class MapMethods(ServiceConnection):
         """
         if within not in CLOUD_FRAMES:
             raise _unknown("frame", within, CLOUD_FRAMES)
-        return self._bytes(f"{frame_path(map_name, frame_id)}/cloud.ply", params={"frame": within})
+        return await self._bytes(
+            f"{frame_path(map_name, frame_id)}/cloud.ply", params={"frame": within}
+        )
 
-    def frame_points(
+    @Call
+    async def frame_points(
         self, map_name: str, frame_id: str, within: CloudFrame = "optical",
         limit: int = MOST_DRAWN,
     ) -> SurfacePoints:  # fmt: skip
@@ -441,9 +473,10 @@ class MapMethods(ServiceConnection):
         if within not in CLOUD_FRAMES:
             raise _unknown("frame", within, CLOUD_FRAMES)
         path = f"{frame_path(map_name, frame_id)}/points"
-        return decode_points(self._bytes(path, params={"frame": within, "limit": limit}))
+        return decode_points(await self._bytes(path, params={"frame": within, "limit": limit}))
 
-    def preview(
+    @Call
+    async def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = WIDTH
     ) -> bytes:
         """Return a PNG picture of an indexed frame: "depth", "normals" or "patches". Errors are
@@ -456,19 +489,24 @@ class MapMethods(ServiceConnection):
                 f"The width is {width}. Pass a width from {WIDTHS[0]} to {WIDTHS[1]}.",
                 (("width", "out of range"),),
             )
-        return self._bytes(
+        return await self._bytes(
             f"{frame_path(map_name, frame_id)}/preview.png", params={"view": view, "width": width}
         )
 
-    def patches(self, map_name: str, frame_id: str) -> FramePatches:
+    @Call
+    async def patches(self, map_name: str, frame_id: str) -> FramePatches:
         """Return the surface patches of an indexed frame. Errors are those of `cloud`."""
-        return self._call(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
+        return await self._call(FramePatches, "GET", f"{frame_path(map_name, frame_id)}/patches")
 
-    def signature(self, map_name: str, frame_id: str) -> FrameSignature:
+    @Call
+    async def signature(self, map_name: str, frame_id: str) -> FrameSignature:
         """Return the signature of an indexed frame. Errors are those of `cloud`."""
-        return self._call(FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature")
+        return await self._call(
+            FrameSignature, "GET", f"{frame_path(map_name, frame_id)}/signature"
+        )
 
-    def upload_of(self, map_name: str, frame_id: str) -> bytes:
+    @Call
+    async def upload_of(self, map_name: str, frame_id: str) -> bytes:
         """Return the original bytes of a frame's upload.
 
         Raises
@@ -476,9 +514,12 @@ class MapMethods(ServiceConnection):
         UnknownMap, UnknownFrame : If the map or frame does not exist or was deleted.
         NotIndexed : If the service did not store the upload.
         """
-        return self._bytes(f"{frame_path(map_name, frame_id)}/upload")
+        return await self._bytes(f"{frame_path(map_name, frame_id)}/upload")
 
-    def map_copy(self, map_name: str, have: Sequence[str] = ()) -> tuple[MapCopy, dict[str, bytes]]:
+    @Call
+    async def map_copy(
+        self, map_name: str, have: Sequence[str] = ()
+    ) -> tuple[MapCopy, dict[str, bytes]]:
         """Return a map at one moment, with those missing parts of its rows that fit one answer.
 
         Raises
@@ -487,7 +528,7 @@ class MapMethods(ServiceConnection):
         ValueError : If the answer is not a copy of a map.
         """
         body = CopyRequest(have=list(have)).model_dump()
-        data = self._send("POST", f"{map_path(map_name)}/copy", json=body).content
+        data = (await self._send("POST", f"{map_path(map_name)}/copy", json=body)).content
         line, _, rest = data.partition(b"\n")
         head, parts, start = MapCopy.model_validate_json(line), dict[str, bytes](), 0
         for one in head.parts:
@@ -496,13 +537,15 @@ class MapMethods(ServiceConnection):
                 start += one.bytes
         return head, parts
 
-    def copied_artifact(self, map_name: str, digest: str) -> bytes:
+    @Call
+    async def copied_artifact(self, map_name: str, digest: str) -> bytes:
         """Return the validation geometry of a frame; raise NotFound for an unknown digest."""
-        return self._bytes(f"{map_path(map_name)}/copy/artifacts/{digest}")
+        return await self._bytes(f"{map_path(map_name)}/copy/artifacts/{digest}")
 
-    def copied_model(self, map_name: str) -> bytes:
+    @Call
+    async def copied_model(self, map_name: str) -> bytes:
         """Return the file of a map's model; raise UnknownMap if the map does not exist."""
-        return self._bytes(f"{map_path(map_name)}/copy/model")
+        return await self._bytes(f"{map_path(map_name)}/copy/model")
 
 
 def _list_or_none(names: Sequence[str] | None) -> list[str] | None:
@@ -548,11 +591,13 @@ def _unknown(what: str, name: str, known: Iterable[str]) -> InvalidRequest:
 class SurfaceMethods(ServiceConnection):
     """Client methods for the fused surfaces of maps."""
 
-    def surface(self, map_name: str) -> MapSurface:
+    @Call
+    async def surface(self, map_name: str) -> MapSurface:
         """Return the fused surface of a map's posed frames."""
-        return self._call(MapSurface, "GET", surface_path(map_name))
+        return await self._call(MapSurface, "GET", surface_path(map_name))
 
-    def begin_surface(self, map_name: str) -> MapSurface:
+    @Call
+    async def begin_surface(self, map_name: str) -> MapSurface:
         """Build the surface of a map immediately, or add new frames to it.
 
         Workers do this by themselves, unless `SCENEPRINT_BUILD_SURFACES` is `on_request`.
@@ -562,15 +607,17 @@ class SurfaceMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         InvalidRequest : If the map has no indexed frame with a pose.
         """
-        return self._call(MapSurface, "POST", surface_path(map_name))
+        return await self._call(MapSurface, "POST", surface_path(map_name))
 
-    def delete_surface(self, map_name: str) -> None:
+    @Call
+    async def delete_surface(self, map_name: str) -> None:
         """Delete the surface of a map; the service does not rebuild it until `begin_surface`."""
-        self._delete(surface_path(map_name))
+        await self._delete(surface_path(map_name))
 
+    @Series
     def surface_tiles(
         self, map_name: str, parent: str | None = None, level: int = 0
-    ) -> Iterator[SurfaceTile]:
+    ) -> AsyncIterator[SurfaceTile]:
         """Yield the tiles of a level by column, row and floor; `surface` lists the levels.
 
         Parameters
@@ -585,7 +632,8 @@ class SurfaceMethods(ServiceConnection):
         path = f"{surface_path(map_name)}/tiles"
         return self._pages(Page[SurfaceTile], path, parent=parent, level=level)
 
-    def surface_tile(self, map_name: str, digest: str) -> bytes:
+    @Call
+    async def surface_tile(self, map_name: str, digest: str) -> bytes:
         """Return the cells of a tile; `sceneprint_client.surface_encoding.decode_tile` reads them.
 
         Raises
@@ -593,12 +641,13 @@ class SurfaceMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         NotFound : If the tile was changed or removed; list the tiles again.
         """
-        return self._bytes(surface_tile_path(map_name, digest))
+        return await self._bytes(surface_tile_path(map_name, digest))
 
+    @Series
     def surface_frames(
         self, map_name: str, at: Sequence[float] | None = None, *, radius: float | None = None,
         box: Sequence[float] | None = None, parent: str | None = None,
-    ) -> Iterator[SurfaceSighting]:  # fmt: skip
+    ) -> AsyncIterator[SurfaceSighting]:  # fmt: skip
         """Yield frames that saw a spot, nearest viewpoint first, or frames taken within a box.
 
         Parameters
@@ -620,7 +669,8 @@ class SurfaceMethods(ServiceConnection):
         )  # fmt: skip
         return self._pages(Page[SurfaceSighting], f"{surface_path(map_name)}/frames", **parameters)
 
-    def surface_plan(
+    @Call
+    async def surface_plan(
         self, map_name: str, parent: str | None = None, *, width: int = PLAN_WIDTH,
         low: float | None = None, high: float | None = None,
     ) -> bytes:  # fmt: skip
@@ -643,4 +693,4 @@ class SurfaceMethods(ServiceConnection):
                 (("width", "out of range"),),
             )
         parameters = without_none(parent=parent, width=width, low=low, high=high)
-        return self._bytes(f"{surface_path(map_name)}/plan.png", params=parameters)
+        return await self._bytes(f"{surface_path(map_name)}/plan.png", params=parameters)

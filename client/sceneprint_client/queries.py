@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from sceneprint_client.api.results import (
     Similarities,
     StoredQuery,
 )
+from sceneprint_client.calls import Call, Series
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import (
     QueryFrame,
@@ -64,7 +65,8 @@ _MOST_ALIKE = 200
 class QueryMethods(ServiceConnection):
     """Client methods for queries and their answers."""
 
-    def query(
+    @Call
+    async def query(
         self, map_name: str | None = None, frame: FrameInput | None = None,
         meta: MetaInput | None = None, *, frame_id: str | None = None,
         maps: str | Iterable[str] | None = None, up: Sequence[float] | None = None,
@@ -94,12 +96,12 @@ class QueryMethods(ServiceConnection):
         """
         check_options(how)
         if maps is None:
-            name, query_frame = query_target(map_name, frame, meta, frame_id, up)
+            name, query_frame = await self._run(query_target, map_name, frame, meta, frame_id, up)
             request = _query_request(query_frame, query_of(Query, how), robot)
-            return self._call(Answer, "POST", f"{map_path(name)}/queries", **request)
+            return await self._call(Answer, "POST", f"{map_path(name)}/queries", **request)
         if (frame_id is None) != (map_name is None):
             raise TypeError("with `maps`, pass `map_name` only with `frame_id`")
-        _, query_frame = query_target(map_name or "", frame, meta, frame_id, up)
+        _, query_frame = await self._run(query_target, map_name or "", frame, meta, frame_id, up)
         named = query_frame if isinstance(query_frame, NamedFrame) else None
         names = maps if isinstance(maps, str) else list(maps)
         several = query_of(SeveralQuery, how, maps=names, frame=named)
@@ -107,9 +109,10 @@ class QueryMethods(ServiceConnection):
             request = {"json": {**query_json(several), **without_none(robot=robot)}}
         else:
             request = query_form(*_with_robot(robot, *query_frame), several)
-        return self._call(Answer, "POST", "/v1/queries", **request)
+        return await self._call(Answer, "POST", "/v1/queries", **request)
 
-    def localize(
+    @Call
+    async def localize(
         self, map_name: str, frame: FrameInput | None = None,
         meta: MetaInput | None = None, *, frame_id: str | None = None,
         up: Sequence[float] | None = None, robot: str | None = None,
@@ -117,11 +120,12 @@ class QueryMethods(ServiceConnection):
     ) -> Localization:  # fmt: skip
         """Return the status and pose of a frame in a map; see `query` for the parameters."""
         check_options(how)
-        name, query_frame = query_target(map_name, frame, meta, frame_id, up)
+        name, query_frame = await self._run(query_target, map_name, frame, meta, frame_id, up)
         request = _query_request(query_frame, query_of(Query, how), robot)
-        return self._call(Localization, "POST", f"{map_path(name)}/localize", **request)
+        return await self._call(Localization, "POST", f"{map_path(name)}/localize", **request)
 
-    def localize_sequence(
+    @Call
+    async def localize_sequence(
         self, map_name: str, frames: Sequence[FrameInput],
         metas: Sequence[MetaInput] | None = None, **how: Unpack[QueryOptions],
     ) -> Localization:  # fmt: skip
@@ -145,13 +149,16 @@ class QueryMethods(ServiceConnection):
                 f"There are {len(frames)} frames and {len(metas)} `metas`. Pass one for each.",
                 (("metas", "pass one for each frame"),),
             )
-        request = frames_form(frames, [None] * len(frames) if metas is None else metas)
+        request = await self._run(
+            frames_form, frames, [None] * len(frames) if metas is None else metas
+        )
         fields = query_json(query_of(Query, how))
         request["data"] |= {name: form_text(value) for name, value in fields.items()}
         path = f"{map_path(map_name)}/localize/sequence"
-        return self._call(Localization, "POST", path, **request)
+        return await self._call(Localization, "POST", path, **request)
 
-    def similarity(
+    @Call
+    async def similarity(
         self, a: FrameInput | NamedFrame | tuple[str, str],
         b: FrameInput | NamedFrame | tuple[str, str],
         meta_a: MetaInput | None = None, meta_b: MetaInput | None = None, *, validate: bool = True,
@@ -179,23 +186,24 @@ class QueryMethods(ServiceConnection):
         body = how.model_dump(mode="json", exclude_defaults=True, by_alias=True)
         files = {}
         for name, frame, meta in (("a", a, meta_a), ("b", b, meta_b)):
-            found = compared_frame(frame, meta)
+            found = await self._run(compared_frame, frame, meta)
             if isinstance(found, NamedFrame):
                 body[f"frame_{name}"] = found.model_dump()
             else:
                 files[name] = (name, found[0], "application/octet-stream")
                 body[f"meta_{name}"] = meta_json(found[1])
         if not files:
-            return self._call(Similarity, "POST", "/v1/similarity", json=body)
+            return await self._call(Similarity, "POST", "/v1/similarity", json=body)
         fields = {name: form_text(value) for name, value in body.items()}
-        return self._call(Similarity, "POST", "/v1/similarity", files=files, data=fields)
+        return await self._call(Similarity, "POST", "/v1/similarity", files=files, data=fields)
 
+    @Series
     def queries(
         self, map_name: str | None = None, *,
         status: RecordStatus | Iterable[RecordStatus] = (), robot: str | None = None,
         since: datetime | str | None = None, until: datetime | str | None = None,
         kept: bool = False,
-    ) -> Iterator[QueryRecord]:  # fmt: skip
+    ) -> AsyncIterator[QueryRecord]:  # fmt: skip
         """Yield past queries, newest first; the service stores them for 30 days by default.
 
         Parameters
@@ -217,7 +225,8 @@ class QueryMethods(ServiceConnection):
             since=_as_text(since), until=_as_text(until), kept=True if kept else None,
         )  # fmt: skip
 
-    def delete_queries(self, map_name: str) -> None:
+    @Call
+    async def delete_queries(self, map_name: str) -> None:
         """Delete all past queries of a map with their answers, permanently.
 
         Raises
@@ -225,22 +234,25 @@ class QueryMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         Forbidden : If the key does not have `admin` for the map.
         """
-        self._send("DELETE", "/v1/queries", params={"map": map_name})
+        await self._send("DELETE", "/v1/queries", params={"map": map_name})
 
-    def answer(self, query_id: str) -> Answer:
+    @Call
+    async def answer(self, query_id: str) -> Answer:
         """Return the answer to an earlier query while it is stored.
 
         Raises
         ------
         UnknownQuery : If the query is not stored.
         """
-        return self._call(Answer, "GET", query_path(query_id))
+        return await self._call(Answer, "GET", query_path(query_id))
 
-    def stored_query(self, query_id: str) -> StoredQuery:
+    @Call
+    async def stored_query(self, query_id: str) -> StoredQuery:
         """Return the parameters of an earlier query and the expiry of its answer."""
-        return self._call(StoredQuery, "GET", f"{query_path(query_id)}/question")
+        return await self._call(StoredQuery, "GET", f"{query_path(query_id)}/question")
 
-    def keep_answer(self, query_id: str, title: str | None = None) -> QueryRecord:
+    @Call
+    async def keep_answer(self, query_id: str, title: str | None = None) -> QueryRecord:
         """Keep an answer until it is released, or change the title of a kept one.
 
         Parameters
@@ -255,13 +267,15 @@ class QueryMethods(ServiceConnection):
         InvalidRequest : If the title is too long.
         """
         body = without_none(title=title)
-        return self._call(QueryRecord, "PUT", f"{query_path(query_id)}/keep", json=body)
+        return await self._call(QueryRecord, "PUT", f"{query_path(query_id)}/keep", json=body)
 
-    def release_answer(self, query_id: str) -> None:
+    @Call
+    async def release_answer(self, query_id: str) -> None:
         """Release a kept answer; raise UnknownQuery if it is not kept."""
-        self._send("DELETE", f"{query_path(query_id)}/keep")
+        await self._send("DELETE", f"{query_path(query_id)}/keep")
 
-    def query_cloud(self, query_id: str) -> bytes:
+    @Call
+    async def query_cloud(self, query_id: str) -> bytes:
         """Return points and normals of a query's surface as PLY, in the frame of its sensor.
 
         Raises
@@ -269,16 +283,18 @@ class QueryMethods(ServiceConnection):
         UnknownQuery : If the answer is not stored.
         NotIndexed : If the query ran without validation.
         """
-        return self._bytes(f"{query_path(query_id)}/cloud.ply")
+        return await self._bytes(f"{query_path(query_id)}/cloud.ply")
 
-    def query_points(self, query_id: str, limit: int = MOST_DRAWN) -> SurfacePoints:
+    @Call
+    async def query_points(self, query_id: str, limit: int = MOST_DRAWN) -> SurfacePoints:
         """Return at most `limit` points of `query_cloud` as arrays."""
         from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
         path = f"{query_path(query_id)}/points"
-        return decode_points(self._bytes(path, params={"limit": limit}))
+        return decode_points(await self._bytes(path, params={"limit": limit}))
 
-    def similarities(self, query_id: str, limit: int = 50) -> Similarities:
+    @Call
+    async def similarities(self, query_id: str, limit: int = 50) -> Similarities:
         """Return pairwise similarities of a query and its nearest frames.
 
         Parameters
@@ -296,11 +312,12 @@ class QueryMethods(ServiceConnection):
                 f"{limit} frames cannot be compared with each other. Pass 1 to {_MOST_ALIKE}.",
                 (("limit", f"pass 1 to {_MOST_ALIKE}"),),
             )
-        return self._call(
+        return await self._call(
             Similarities, "GET", f"{query_path(query_id)}/similarities", params={"limit": limit}
         )
 
-    def match_details(
+    @Call
+    async def match_details(
         self, query_id: str, frame_id: str, map_name: str | None = None
     ) -> MatchDetails:
         """Validate one match of a query again, and return its details.
@@ -316,11 +333,12 @@ class QueryMethods(ServiceConnection):
         UnknownMap, UnknownFrame : If no match has this id, or its frame was deleted.
         NotIndexed : If the query ran without validation, or the map now has another model.
         """
-        return self._call(
+        return await self._call(
             MatchDetails, "GET", match_path(query_id, frame_id), params=without_none(map=map_name)
         )
 
-    def overlay(
+    @Call
+    async def overlay(
         self, query_id: str, frame_id: str, map_name: str | None = None,
         color: OverlayColour = "source", transform: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
@@ -343,7 +361,7 @@ class QueryMethods(ServiceConnection):
                     f"An overlay has no {name} {value!r:.80}. Pass one of {', '.join(known)}.",
                     ((name, f"pass one of {', '.join(known)}"),),
                 )
-        return self._bytes(
+        return await self._bytes(
             f"{match_path(query_id, frame_id)}/overlay.ply",
             params=without_none(map=map_name, color=color, transform=transform),
         )

@@ -43,8 +43,8 @@ from sceneprint_client.tracker_core import (
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from sceneprint_client.client import Client
     from sceneprint_client.http import FrameInput, MetaInput
-    from sceneprint_client.queries import QueryMethods
 
 __all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters", "replay"]
 
@@ -86,7 +86,7 @@ class Tracker:
     """
 
     def __init__(
-        self, client: QueryMethods, map_name: str, *, camera: MetaInput | None = None,
+        self, client: Client, map_name: str, *, camera: MetaInput | None = None,
         parameters: TrackerParameters | None = None, log: TextIO | None = None,
     ) -> None:  # fmt: skip
         self._client, self._map, self._camera = client, map_name, camera

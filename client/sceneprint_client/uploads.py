@@ -15,6 +15,7 @@ from sceneprint_client.api.frames import (
     BatchItem,
     check_frame_id,
 )
+from sceneprint_client.calls import Call
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import (
     ServiceConnection,
@@ -37,7 +38,8 @@ _LONGEST_WAIT_S = 60
 class UploadMethods(ServiceConnection):
     """Client methods that add frames to a map."""
 
-    def upload(
+    @Call
+    async def upload(
         self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
@@ -70,12 +72,13 @@ class UploadMethods(ServiceConnection):
         InvalidRequest : If `priority` or `if_novel` is out of range.
         """
         until = time.monotonic() + (wait_s or 0.0)
-        added, _ = self.add(
+        added, _ = await self.add(
             map_name, frame, meta, wait_s=wait_s, priority=priority, if_novel=if_novel, up=up
         )  # fmt: skip
-        return self._await_job(map_name, added, until)
+        return await self._await_job(map_name, added, until)
 
-    def add(
+    @Call
+    async def add(
         self, map_name: str, frame: FrameInput, meta: MetaInput | None = None,
         *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
@@ -84,12 +87,13 @@ class UploadMethods(ServiceConnection):
 
         The service may end the wait early; `upload` repeats it until `wait_s` has passed.
         """
-        return self._upload(
+        return await self._upload(
             "POST", f"{map_path(map_name)}/frames", frame, meta, wait_s or 0.0,
             upload_fields(priority, if_novel), up,
         )  # fmt: skip
 
-    def put_frame(
+    @Call
+    async def put_frame(
         self, map_name: str, frame_id: str, frame: FrameInput,
         meta: MetaInput | None = None, *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
@@ -110,13 +114,14 @@ class UploadMethods(ServiceConnection):
         """
         check_frame_id(frame_id)
         until = time.monotonic() + (wait_s or 0.0)
-        added, _ = self._upload(
+        added, _ = await self._upload(
             "PUT", frame_path(map_name, frame_id), frame, meta, wait_s or 0.0,
             upload_fields(priority, if_novel), up,
         )  # fmt: skip
-        return self._await_job(map_name, added, until)
+        return await self._await_job(map_name, added, until)
 
-    def upload_batch(
+    @Call
+    async def upload_batch(
         self, map_name: str, frames: Sequence[FrameInput],
         metas: Sequence[MetaInput] | FrameMeta | None = None, *, priority: int = 0,
         if_novel: float | bool | None = None,
@@ -147,32 +152,33 @@ class UploadMethods(ServiceConnection):
                 (("frames", "too many or too few"),),
             )
         known = [None] * len(frames) if metas is None else metas
-        request = frames_form(frames, known)
+        request = await self._run(frames_form, frames, known)
         request["data"] |= upload_fields(priority, if_novel)
-        return self._call(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request).items
+        batch = await self._call(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request)
+        return batch.items
 
-    def _upload(
+    async def _upload(
         self, method: str, path: str, frame: FrameInput, meta: MetaInput | None,
         wait_s: float, fields: dict[str, str], up: Sequence[float] | None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """Send a frame; the service does not wait if the map already has it."""
-        sent = frame_form(*frame_bytes(frame, meta, with_pose=True, up=up))
+        sent = frame_form(*await self._run(frame_bytes, frame, meta, with_pose=True, up=up))
         sent["data"] |= fields
         # A service in this process has no other worker that could sign the frame in the meantime.
         wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)
-        response = self._send(
+        response = await self._send(
             method, path, headers={"Prefer": f"wait={wait}"} if wait else {},
             timeout=self._timeout_s + wait, **sent,
         )  # fmt: skip
         return read_record(Added, response), response.status_code != 200
 
-    def _await_job(self, map_name: str, added: Added, until: float) -> Added:
+    async def _await_job(self, map_name: str, added: Added, until: float) -> Added:
         """Wait for the job of an upload until a time of `time.monotonic`, and return the upload."""
         for pause in growing_pauses(until):
             if added.state not in (FrameState.RECEIVED, FrameState.SIGNING):
                 break
-            self._work_or_wait(pause)
-            now = self._call(Frame, "GET", frame_path(map_name, added.frame_id))
+            await self._work_or_wait(pause)
+            now = await self._call(Frame, "GET", frame_path(map_name, added.frame_id))
             added = added.model_copy(update={"state": now.state, "reason": now.reason})
         return added
 

@@ -175,7 +175,7 @@ def test_what_is_not_there(client: Client, map_name: str) -> None:
         with pytest.raises(UnknownJob):
             client.job(name)
     with pytest.raises(UnknownMap):
-        client.frames("nobody")
+        next(client.frames("nobody"))
     assert client.map(map_name).name == map_name
 
 

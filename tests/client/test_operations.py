@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import threading
 from datetime import UTC, datetime
-from typing import Any
 
+import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
@@ -15,7 +15,7 @@ from sceneprint.formats.dataset import FrameReference
 from sceneprint.models import PRESETS, read_model
 from sceneprint_client import Client
 from sceneprint_client.api.admin import Event
-from sceneprint_client.http import StreamPosition, follow_stream, read_events
+from sceneprint_client.http import ServiceConnection, StreamPosition
 
 
 def test_events_that_are_kept(
@@ -140,43 +140,42 @@ def test_a_stream_is_read_as_the_standard_says() -> None:
         f"data: {data[:half]}", f"data:{data[half:]}", "", "id: 9", "data: {",
     ]  # fmt: skip
     place = StreamPosition(None)
-    found = [(one, place.last) for one in read_events(lines, place)]
+    found = [(one, place.last) for line in lines if (one := place.read(line)) is not None]
     assert found == [(EVENT, "7")]
-    assert place == StreamPosition("7", 0.02)  # what was cut off is asked for again
+    # what was cut off is requested again
+    assert place == StreamPosition("7", 0.02)
 
 
-class Answered:
-    """A stream that has come to its end."""
-
-    def __init__(self, body: str) -> None:
-        self._body = body
-
-    def iter_lines(self) -> list[str]:
-        return self._body.split("\n")
-
-    def close(self) -> None:
-        pass
+#: Bodies of a stream that ends three times, the service being away in between.
+STREAMS = [
+    f"retry: 10\n\nid: 4\n\nid: 5\ndata: {EVENT.model_dump_json()}\n\nid: 6\ndata: {{",
+    None,
+    f"id: 6\ndata: {EVENT.model_dump_json()}\n\n: alive\nid: 8\n\n",
+    f"id: 9\ndata: {EVENT.model_dump_json()}\n\n",
+]
 
 
-def test_a_broken_stream_is_taken_up_where_it_broke() -> None:
-    told = [EVENT.model_copy(update={"id": one}) for one in "569"]
-    said: list[str | Unreachable] = [
-        f"retry: 10\n\nid: 4\n\nid: 5\ndata: {told[0].model_dump_json()}\n\nid: 6\ndata: {{",
-        Unreachable("it starts anew"),
-        f"id: 6\ndata: {told[1].model_dump_json()}\n\n: alive\nid: 8\n\n",
-        f"id: 9\ndata: {told[2].model_dump_json()}\n\n",
-    ]
-    asked: list[str | None] = []
+class Stream:
+    """A network whose answers are those of a stream."""
 
-    def opened(last: str | None) -> Any:
-        asked.append(last)
-        answer = said[len(asked) - 1]
-        if isinstance(answer, Unreachable):
-            raise answer
-        return Answered(answer)
+    def __init__(self) -> None:
+        self.after: list[str | None] = []
 
-    assert list(itertools.islice(follow_stream(opened, None), 3)) == told
-    assert asked == [None, "5", "5", "8"]
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        self.after.append(request.headers.get("Last-Event-ID"))
+        body = STREAMS[len(self.after) - 1]
+        if body is None:
+            raise httpx.ProxyError("a proxy restarts")  # is not retried within a request
+        return httpx.Response(200, text=body)
+
+
+def test_a_broken_stream_continues_where_it_broke() -> None:
+    stream = Stream()
+    client = Client.__new__(Client)
+    ServiceConnection.__init__(client, "http://x", None, 5.0, httpx.MockTransport(stream))
+    with client:
+        assert list(itertools.islice(client.events(), 3)) == [EVENT] * 3
+    assert stream.after == [None, "5", "5", "8"]
 
 
 def test_where_no_service_is_that_is_said_at_once() -> None:

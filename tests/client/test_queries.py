@@ -130,9 +130,9 @@ def test_all_ways_of_asking(
     assert cart.frame.frame_id == ids[3]
     assert list(client.queries(map_name, robot="spot", until=spot.at)) == []
     with pytest.raises(InvalidRequest, match="status"):
-        client.queries(map_name, status="lost")  # type: ignore[arg-type]
+        next(client.queries(map_name, status="lost"))  # type: ignore[arg-type]
     with pytest.raises(UnknownMap):
-        client.queries("nowhere")
+        next(client.queries("nowhere"))
     client.delete_queries(map_name)
     assert list(client.queries(map_name)) == []
 

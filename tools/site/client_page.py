@@ -25,8 +25,9 @@ def public_methods(kind: type) -> dict[str, Callable[..., object]]:
     for base in reversed(kind.__mro__):
         if not base.__module__.startswith("sceneprint_client"):
             continue
-        for name, one in vars(base).items():
-            function = one.__func__ if isinstance(one, classmethod | staticmethod) else one
+        for name in vars(base):
+            one = getattr(kind, name)
+            function = getattr(one, "__func__", one)
             if not name.startswith("_") and inspect.isfunction(function):
                 found[name] = function
     return found
@@ -58,7 +59,7 @@ def _describe(name: str, one: Any) -> str:
         if callable(one):
             return page(f"## {name}", fenced(signature(name, one), "python"), markdown_of(one))
         return page(f"## {name}", f"{code(str(one))}")
-    methods = public_methods(one)
+    methods = {} if one is sceneprint_client.AsyncClient else public_methods(one)
     constructor = getattr(one, "__init__", None)
     shown = signature(name, constructor) if inspect.isfunction(constructor) else f"class {name}"
     properties = table(

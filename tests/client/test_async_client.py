@@ -1,0 +1,158 @@
+"""Tests of AsyncClient: its methods against a service, concurrency, retries, cancellation."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import shutil
+from asyncio import StreamReader, StreamWriter
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.waiting import PATIENCE_S
+from sceneprint.formats.dataset import FrameReference
+from sceneprint_client import AsyncClient, Client
+from sceneprint_client.api import FrameState
+from sceneprint_client.api.coverage import MapCoverage
+from sceneprint_client.errors import Busy, UnknownMap, Unreachable
+from tests.client.conftest import Reply, Scripted
+
+BUSY: Reply = (503, {}, {"type": "/problems/busy", "title": "", "status": 503, "detail": "later"})
+
+
+def public_methods(kind: type) -> dict[str, Any]:
+    found = inspect.getmembers(kind, inspect.isfunction)
+    return {name: one for name, one in found if not name.startswith("_")}
+
+
+def test_both_clients_have_the_same_methods() -> None:
+    blocking, others = public_methods(Client), public_methods(AsyncClient)
+    assert blocking.keys() == others.keys()
+    assert len(others) > 90
+    for name, one in others.items():
+        own, other = inspect.signature(blocking[name]), inspect.signature(one)
+        assert own.parameters == other.parameters
+        items = other.return_annotation.startswith("AsyncIterator[")
+        assert inspect.iscoroutinefunction(one) != items, name
+        assert not inspect.iscoroutinefunction(blocking[name])
+        assert own.return_annotation == other.return_annotation.replace("AsyncI", "I")
+        assert one.__doc__ == blocking[name].__doc__
+
+
+def test_a_map_from_upload_to_deletion(
+    service_url: str, map_name: str, tmp_path: Path, references: tuple[FrameReference, ...]
+) -> None:
+    folder = references[0].path.parents[1]
+    archive = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", folder))
+
+    async def session() -> None:
+        async with AsyncClient(service_url) as client:
+            made = await client.create_map(map_name, model="depth")
+            job = await client.import_archive(map_name, archive)
+            (job,) = await client.wait([job.job_id], timeout_s=PATIENCE_S)
+            assert job.state == "succeeded"
+            items = [one.frame_id async for one in client.import_items(map_name, job.job_id)]
+            assert len(set(items)) == 3
+            await client.wait([j.job_id async for j in client.jobs() if j.map == map_name])
+            added = await client.upload(map_name, references[3], wait_s=PATIENCE_S)
+            assert added.state is FrameState.INDEXED
+            found = [one.frame_id async for one in client.frames(map_name)]
+            assert found == [*items, added.frame_id]
+            coverage = await client.compute(MapCoverage, map_name, timeout_s=PATIENCE_S)
+            assert coverage.state == "succeeded"
+            kinds = [one.kind async for one in client.events(map_name, follow=False)]
+            assert kinds[0] == "map.created"
+            assert kinds.count("frame.indexed") == 4
+            many = [client.query(map_name, frame_id=items[i % 3], k=2) for i in range(10)]
+            answers = await asyncio.gather(*many)
+            assert [one.counts.map for one in answers] == [3] * 10
+            assert len({one.query_id for one in answers}) == 10
+            assert answers[0].matches == answers[3].matches
+            await client.delete_map(made.name)
+            with pytest.raises(UnknownMap, match=map_name):
+                await anext(client.frames(map_name))
+
+    asyncio.run(session())
+
+
+@asynccontextmanager
+async def answering(
+    respond: Callable[[StreamReader], Awaitable[bytes]],
+) -> AsyncIterator[str]:
+    """Run a server in this event loop, and yield its address."""
+
+    async def answer(reader: StreamReader, writer: StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        body = await respond(reader)
+        writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
+        writer.close()
+
+    async with await asyncio.start_server(answer, "127.0.0.1") as server:
+        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+
+
+def test_ten_requests_are_in_progress_at_once() -> None:
+    async def session() -> list[bool]:
+        together = asyncio.Barrier(10)
+
+        async def respond(_: StreamReader) -> bytes:
+            await together.wait()
+            return b'{"status": "ok"}'
+
+        async with answering(respond) as url, AsyncClient(url) as client:
+            return await asyncio.gather(*(client.healthy() for _ in range(10)))
+
+    assert asyncio.run(session()) == [True] * 10
+
+
+def test_a_cancelled_call_closes_its_connection() -> None:
+    async def session() -> list[bytes]:
+        begun, rest = asyncio.Event(), list[bytes]()
+
+        async def respond(reader: StreamReader) -> bytes:
+            begun.set()
+            rest.append(await reader.read())  # until the client closes the connection
+            return b""
+
+        async with answering(respond) as url, AsyncClient(url) as client:
+            call = asyncio.create_task(client.map("hall"))
+            await begun.wait()
+            call.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await call
+            async with asyncio.timeout(PATIENCE_S):
+                while not rest:
+                    await asyncio.sleep(0)
+        return rest
+
+    assert asyncio.run(session()) == [b""]
+
+
+def test_requests_are_repeated(hasty: None, scripted: Callable[[list[Reply]], Scripted]) -> None:
+    page = {"items": [], "next_cursor": None}
+    lost: Reply = (0, {}, None)
+    server = scripted([BUSY, lost, (200, {}, page), lost, (404, {}, None), BUSY])
+
+    async def session() -> None:
+        async with AsyncClient(server.url) as client:
+            assert await client.maps() == []
+            await client.delete_map("hall")  # the answer to the first deletion was lost
+            with pytest.raises(Busy, match="later"):
+                await client.map("hall")
+
+    asyncio.run(session())
+    assert [method for method, *_ in server.asked] == ["GET"] * 3 + ["DELETE"] * 2 + ["GET"] * 8
+
+
+def test_where_no_service_is() -> None:
+    async def session() -> None:
+        async with AsyncClient("http://127.0.0.1:9") as client:
+            assert not await client.healthy()
+            with pytest.raises(Unreachable):
+                await anext(client.events())
+
+    asyncio.run(session())
