@@ -100,6 +100,11 @@ class ApiRecord(BaseModel):
     # Validators are built on first use, which makes the start faster.
     model_config = ConfigDict(frozen=True, defer_build=True)
 
+    def _repr_html_(self) -> str:
+        from sceneprint_client.notebook import html_of  # only notebooks call this
+
+        return html_of(self)
+
 
 class Page(ApiRecord, Generic[T]):
     """A page of a list."""

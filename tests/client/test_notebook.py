@@ -1,0 +1,96 @@
+"""Tests of the HTML that notebooks show for records."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from datetime import UTC, datetime
+from typing import Any
+
+from sceneprint_client.api import Answer, Frame, Map, Match
+from sceneprint_client.api.base import CameraIntrinsics, Transform
+from sceneprint_client.api.query import Alternative, Location, Validation
+
+EVIL = "<script>alert('&\"')</script>"
+
+
+def pose(x: float, y: float, child: str = "query.optical") -> Transform:
+    """A sensor that looks along y with z up, or along x if it is no camera."""
+    axes = [[1, 0, 0, x], [0, 0, 1, y], [0, -1, 0, 1.5], [0, 0, 0, 1]]
+    if not child.endswith("optical"):
+        axes = [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, 1.5], [0, 0, 0, 1]]
+    return Transform.model_validate(
+        {"parent_frame": "hall", "child_frame": child, "matrix": axes,
+         "translation": {"x": x, "y": y, "z": 1.5}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    )  # fmt: skip
+
+
+def match(rank: int, frame_id: str) -> Match:
+    validation = Validation.model_construct(status="accepted", overlap=0.8125, reason="")
+    return Match.model_construct(
+        rank=rank, frame_id=frame_id, map="hall", similarity=0.75, validation=validation
+    )
+
+
+def elements(record: Any) -> ElementTree.Element:
+    return ElementTree.fromstring(f"<div>{record._repr_html_()}</div>")
+
+
+def cells(table: ElementTree.Element) -> list[list[str | None]]:
+    return [[cell.text for cell in row] for row in table]
+
+
+def test_an_answer_has_a_plan_and_its_matches() -> None:
+    answer = Answer.model_construct(
+        query_id="q1", status="ambiguous", reason=EVIL, location=None, maps=["hall"], seed=7,
+        alternatives=[Alternative(pose=pose(0, 0), confidence=0.6, support=2),
+                      Alternative(pose=pose(4, 2, "query.sensor"), support=1)],
+        matches=[match(i, f"{i:032x}") for i in range(1, 11)],
+    )  # fmt: skip
+    html = elements(answer)
+    fields, plan, matches = html[1], html[2], html[3]
+    assert dict(cells(fields)) == {  # type: ignore[arg-type]
+        "query_id": "q1", "status": "ambiguous", "reason": EVIL, "maps": "hall", "frames": "1",
+        "alternatives": "0.00, 0.00, 1.50 m in hall, confidence 0.60; 4.00, 2.00, 1.50 m in hall",
+        "kind": "depth",
+    }  # fmt: skip
+    # 120 pixels are 4 m; y points up
+    circles = [(one.get("cx"), one.get("cy"), one.get("fill")) for one in plan.iter("circle")]
+    assert circles == [("20", "140", "none"), ("140", "80", "none")]
+    assert [one.get("d") for one in plan.iter("path")] == ["M20 140l0 -14", "M140 80l14 0"]
+    assert cells(matches)[1] == ["1", f"{1:032x}", "hall", "0.75", "0.8125", "accepted"]
+    assert len(cells(matches)) == 1 + 5
+    assert len(answer._repr_html_()) < 2_500
+
+
+def test_a_found_pose_is_filled() -> None:
+    located = Location(pose=pose(1, 1), confidence=0.995, support=3, votes=3, spread_m=0.1,
+                       spread_deg=1.0)  # fmt: skip
+    answer = Answer.model_construct(query_id="q", status="found", location=located, matches=[])
+    html = elements(answer)
+    assert ["location", "1.00, 1.00, 1.50 m in hall, confidence 0.99"] in cells(html[1])
+    assert [one.get("fill") for one in html.iter("circle")] == ["currentColor"]
+    assert len(html.findall("table")) == 1
+
+
+def test_maps_and_frames_are_tables() -> None:
+    at = datetime(2026, 11, 30, 12, tzinfo=UTC)
+    shown = Map(
+        name="hall", title=EVIL, model="depth-1", model_id="1" * 64, created_at=at, revision=3,
+        frames={"indexed": 5, "failed": 1}, etag="e",
+    )  # fmt: skip
+    assert cells(elements(shown)[1]) == [
+        ["name", "hall"], ["title", EVIL], ["model", "depth-1"],
+        ["created_at", "2026-11-30 12:00:00+00:00"], ["revision", "3"],
+        ["frames", "5 indexed, 1 failed"], ["posed_frames", "0"], ["parent_frames", "0"],
+        ["used_frames", "0"], ["used_bytes", "0"],
+    ]  # fmt: skip
+    camera = CameraIntrinsics(width=640, height=480, fx=525, fy=525, cx=320, cy=240)
+    frame = Frame.model_construct(
+        frame_id="f", intrinsics=camera, pose=pose(1, 2), tags=["a", EVIL], name="x" * 300
+    )
+    rows = dict(cells(elements(frame)[1]))  # type: ignore[arg-type]
+    assert rows["intrinsics"] == "640 x 480 pixels"
+    assert rows["pose"] == "1.00, 2.00, 1.50 m in hall"
+    assert rows["tags"] == f"a; {EVIL}"
+    assert rows["name"] == "x" * 160 + "..."
+    assert "<script" not in frame._repr_html_() + shown._repr_html_()
