@@ -13,6 +13,7 @@ from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.concurrency import contextmanager_in_threadpool
 from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
@@ -81,6 +82,9 @@ PARSED: tuple[type[BaseModel], ...] = (
 def openapi_of(app: FastAPI) -> dict[str, Any]:
     """Return the OpenAPI document of an application, which is built once."""
     if app.openapi_schema is None:
+        for route in app.routes:
+            if isinstance(route, APIRoute):
+                route.operation_id = route.name  # the function that a generated client has for it
         document = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes
         )

@@ -128,6 +128,8 @@ def query_operation(kind: type[BaseModel], named: Mapping[str, Any], required: l
     """
     own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
     texts = {n: bodies.as_text(one) for n, one in own.items() if n not in bodies.FRAME_PARTS}
+    # Generated clients send the default, and as text if the field may be a text or a list.
+    own["stages"]["default"] = texts["stages"]["default"]
     needed = sorted({*bodies.FRAME_PARTS, *(name for name in required if name in texts)})
     body = bodies.form_body(bodies.FRAME_PARTS | texts, needed, "meta")
     sent = {"type": "object", "required": required, "properties": {**named, **own}}

@@ -23,7 +23,7 @@ class Recorder:
         self.tried: set[str] = set()
         document = client.get("/openapi.json").json()
         self.operations = {
-            operation["operationId"].partition("_v1_")[0]: (method.upper(), path)
+            operation["operationId"]: (method.upper(), path)
             for path, methods in document["paths"].items()
             for method, operation in methods.items()
         }

@@ -617,9 +617,10 @@ def novelty_of(value: bool | float | str | None) -> float | None:
     ------
     InvalidRequest : If the value is none of these.
     """
-    if value is None or value is False or value == "false":
+    text = str(value).lower()  # generated clients send Python's names, True and False
+    if value is None or text == "false":
         return None
-    if value is True or value == "true":
+    if text == "true":
         return NOVEL
     try:
         share = float(value)
