@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -63,8 +64,19 @@ def test_a_service_needs_neither_lab_nor_viewers(tmp_path: Path) -> None:
     for code, error in found["scenes"]:
         assert code == 2
         assert error.count("\n") == 1
-        assert error.endswith("Run: pip install sceneprint-viewers\n")
+        assert error.endswith("In a clone, run: pip install ./viewers\n")
     code, error = found["upload"]
     assert code == 2
     assert "nowhere.png: The file or folder does not exist" in error
     assert not file.exists()
+
+
+def test_no_text_installs_from_an_index_what_none_has() -> None:
+    """No index has our distributions: pip would find nothing, or a package of another owner."""
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split("\n")
+    files = [ROOT / one for one in listed if Path(one).suffix in (".md", ".py", ".js", ".html")]
+    wrong = re.compile(r"pip install (-\S+ )*['\"]?sceneprint")
+    found = [path for path in files if path.exists() and wrong.search(path.read_text())]
+    assert found == []

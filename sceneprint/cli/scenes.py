@@ -96,7 +96,7 @@ def _opener() -> SceneOpener:
         return found
     raise MissingDependency(
         "Scenes are written by sceneprint-viewers, which is not installed. "
-        "Run: pip install sceneprint-viewers"
+        "In a clone, run: pip install ./viewers"
     )
 
 

@@ -132,5 +132,5 @@ def test_without_the_package_of_the_service(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(client, "find_spec", lambda name: None)
-    with pytest.raises(errors.MissingDependency, match="pip install sceneprint"):
+    with pytest.raises(errors.MissingDependency, match=r"In a clone, run: pip install \."):
         Client.embedded(tmp_path)

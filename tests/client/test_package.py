@@ -167,5 +167,5 @@ def test_the_wheel_localises_alone(
     assert asked.pose is not None
     assert math.dist(told["at"], asked.pose[:3, 3]) < 0.10
     assert told["frame"].startswith("There is no frame 'nobody'")
-    assert told["embedded"].endswith("Run: pip install sceneprint")
+    assert told["embedded"].endswith("In a clone, run: pip install .")
     assert told["loaded"] == []

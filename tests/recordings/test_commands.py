@@ -271,7 +271,7 @@ def test_without_rosbags_the_extra_is_named(
     done = sceneprint("upload", "bag", recording, expect=2)
     assert done.stderr == (
         "sceneprint upload: ROS recordings require rosbags, which is not installed. Run: "
-        "pip install 'sceneprint[ros]'\n"
+        "pip install 'rosbags>=0.11.9,<0.12'\n"
     )
 
 

@@ -102,7 +102,7 @@ def _decompressed(packed: bytes, size: int) -> bytes:
     except ImportError as cause:
         raise MissingDependency(
             "Depth of Record3D is compressed with LZFSE, but the package lzfse is not installed. "
-            "Run: pip install 'sceneprint[record3d]'"
+            "Run: pip install 'lzfse>=0.4.2,<0.5'"
         ) from cause
     try:
         samples: bytes = lzfse.decompress(packed)

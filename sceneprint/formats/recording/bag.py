@@ -299,7 +299,7 @@ def _types(*, ros1: bool) -> Typestore:
     except ImportError as cause:
         raise MissingDependency(
             "ROS recordings require rosbags, which is not installed. "
-            "Run: pip install 'sceneprint[ros]'"
+            "Run: pip install 'rosbags>=0.11.9,<0.12'"
         ) from cause
     _limit_decompression()
     _read_any_profile()
