@@ -331,8 +331,9 @@ export class Scene {
       const { path, place } = this.#selected;
       made.push({ at: this.near(placeOf(this.#drawn[path].world[place])), node: h("span", { class: "paths-label", dataset: { kind: "selected" } }, "Chosen") });
     }
-    this.#labels = [...[...this.#marks.values()].flat(), ...made]; // the first have the first choice of a place
-    put(this.#parts.labels, this.#labels.map((one) => one.node));
+    const marks = [...this.#marks.values()].flat();
+    this.#labels = [...marks, ...made]; // the first have the first choice of a place
+    put(this.#parts.labels, [...made, ...marks].map((one) => one.node));
     for (const { node } of this.#labels) node.hidden = false; // what is hidden has no size
     for (const one of this.#labels) one.size = { width: one.node.offsetWidth, height: one.node.offsetHeight };
     this.#moved();
