@@ -161,9 +161,12 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         "neighbours in a sequence": sequence.n_neighbours,
         "correspondences of sequences": sequence.n_sources * sequence.n_nearest,
         "cells along a plan": plan.side,
-        "yaws of a plan": max(plan.n_yaws, plan.kept_yaws),
+        "yaws of a plan": max(plan.n_yaws, plan.kept_yaws, 2 * plan.sliced_yaws),
         "heights of a plan": round(plan.height_range / plan.height_step),
-        "hypotheses of plans": max(plan.n_kept * plan.n_heights, plan.kept_yaws * plan.n_peaks),
+        "hypotheses of plans": max(
+            max(plan.n_kept, plan.n_sliced) * plan.n_heights,
+            max(plan.kept_yaws, 2 * plan.sliced_yaws) * plan.n_peaks,
+        ),
     }
     _check_counts(counts)
 

@@ -11,14 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
+    _draw_slices,
     _height_offsets,
+    _slice,
+    _slice_spectrum,
     dominant_up,
     draw_plan,
     other_plans,
     plan_hypotheses,
+    slice_hypotheses,
 )
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import inverse, pose_difference, select_distinct, transform_points
+from sceneprint.geometry.validation.validation import validate as validate_pair
 from sceneprint.models import Model, read_model
 from sceneprint.pipeline import associate, geometry_of, validate
 from sceneprint.signing import see
@@ -122,6 +127,53 @@ def test_the_true_transform_is_proposed(yaw: float) -> None:
     assert len(found) == P.n_kept * P.n_heights
 
 
+def test_slices_are_heights_above_the_lowest_point_of_the_neighbourhood() -> None:
+    # cells of .5 m: slices end at .4, 1.2, 2.6 and 12 m above the ground, in squares of 4 m
+    ground = [(1.0, 1.0, -1.5)]
+    above = [(5.0, 5.0, z - 1.5) for z in (0.3, 0.5, 1.1, 1.3, 2.7, 11.9, 12.1)]
+    apart = [(13.0, 1.0, 0.0)]  # two squares from the others, so it is its own ground
+    slices = _slice(np.array(ground + above + apart), P)
+    assert slices.tolist() == [0, 0, 1, 1, 2, 3, 3, 0, 0]
+
+
+def test_slices_are_drawn_as_roots_of_limited_counts() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-9, 9, (3000, 3)).astype(np.float32)
+    points[:40] = points[0]
+    slices, yaw, cell, side = rng.integers(0, 4, 3000).astype(np.uint8), 0.7, 1.0, 16
+    slices[:40] = 2
+    drawn = np.zeros((3, side, side), np.float32)
+    _draw_slices(points, slices, math.cos(yaw), math.sin(yaw), cell, drawn)
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    expected = np.zeros((3, side, side))
+    for point, k in zip(points @ np.eye(3, 2), slices, strict=True):
+        u, v = np.floor(turn @ point / cell + 0.5).astype(int)
+        if k > 0 and max(abs(u), abs(v)) < side / 2:
+            expected[k - 1, v, u] += 1  # negative cells count from the end
+    np.testing.assert_allclose(drawn, np.sqrt(np.minimum(expected, 3)), atol=1e-6)
+    assert expected.max() > 3
+
+
+def test_a_half_turn_conjugates_the_spectrum_of_slices() -> None:
+    plan = draw_plan(seen_from(pose(4, 5, 1.2, 12)), P)
+    before, after = (_slice_spectrum(plan, yaw, P) for yaw in (0.3, 0.3 + math.pi))
+    assert np.abs(before).max() > 10
+    np.testing.assert_allclose(after, before.conj(), atol=1e-2)
+
+
+@pytest.mark.parametrize("yaw", [3, 90, 178, 268])
+def test_slices_propose_the_true_transform(yaw: float) -> None:
+    source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
+    a, b = draw_plan(seen_from(source), P), draw_plan(seen_from(target), P)
+    found = slice_hypotheses(a, b, P)
+    metres, degrees, rank = nearest(found, inverse(target) @ source)
+    # half a cell of 1 m along both axes, half a yaw (2.5 degrees), half a step of height
+    assert metres < 1.2
+    assert degrees < 3.0
+    assert rank < 4
+    assert len(found) <= P.n_sliced * P.n_heights
+
+
 def test_a_scanner_on_its_side_is_found_by_the_other_axes() -> None:
     source, target = pose(4, 5, 1.2, 12, 0, 90), pose(10, 3, 2.0, 40)
     surfaces = seen_from(source), seen_from(target)
@@ -192,3 +244,20 @@ def test_a_query_upside_down_is_found_when_nothing_else_is_accepted(
     # a known up says at once what the other axes had to be tried for
     told = validate(query, match, ups=(np.array([0.0, 0, -1]), np.array([0.0, 0, 1])))
     assert told.status == "accepted"
+
+
+def test_two_scans_of_a_street_are_aligned_by_slices() -> None:
+    model = read_model("lidar")
+    clouds = synthesise_survey(9019, 0, 2, kind="block").clouds
+    match, query = (geometry_of(see(cloud, model.parameters), model) for cloud in clouds)
+    assert clouds[0].pose is not None
+    assert clouds[1].pose is not None
+    true = inverse(clouds[0].pose) @ clouds[1].pose
+    p = model.parameters.validation
+    # without priority for slices, these four are hypotheses at places 30 m away and more
+    few = replace(p, alignment=replace(p.alignment, n_refined=4))
+    found = validate_pair(query, match, 0, few).T_match_query
+    assert found is not None
+    metres, radians = pose_difference(found, true)
+    assert metres < 0.5  # .24 m
+    assert radians < math.radians(1.5)  # .7 deg

@@ -101,6 +101,8 @@ def test_what_would_take_for_ever_is_refused(small_model: Model, cloud: CloudPar
         ("rivals.n_proposed", 1_000_000_000),
         ("alignment.plan.side", 1_000_000_000),
         ("alignment.plan.n_yaws", 1_000_000_000),
+        ("alignment.plan.sliced_yaws", 1_000_000_000),
+        ("alignment.plan.n_sliced", 1_000_000_000),
         ("alignment.plan.height_step", 1e-9),
         ("alignment.plan.n_peaks", 1_000_000_000),
         ("alignment.fine_stride", 0),

@@ -60,6 +60,7 @@ from sceneprint.geometry.registration.plan_search import (
     draw_plan,
     other_plans,
     plan_hypotheses,
+    slice_hypotheses,
 )
 from sceneprint.geometry.registration.sequence_alignment import (
     Matching,
@@ -410,6 +411,7 @@ class AlignmentParameters:
     matching: MatchingParameters = field(default_factory=MatchingParameters)
     consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
     n_refined: int = 16  #: number of hypotheses that are refined
+    n_sliced: int = 4  #: number of hypotheses of slices among them, whatever their scores
     score_stride: int = 2  #: stride of the points that score hypotheses
     n_fine: int = 6  #: number of hypotheses of scans that are refined finely before ranking
     fine_stride: int = 4  #: stride of the pixels in this refinement
@@ -550,13 +552,12 @@ def align_scans(
     a, b = query.geometry, match.geometry
     ups = query.up, match.up
     voted = _vote(a, b, rng, p, matching, ups)
-    plans = [(query.plan(p.plan), match.plan(p.plan))]
-    if other_axes:
-        plans = other_plans(a.surface, b.surface, p.plan)
-    planned = plan_hypotheses(plans, p.plan)
-    hypotheses = np.concatenate([voted, planned])
+    planned, sliced = _search_plans(query, match, p.plan, other_axes=other_axes)
+    hypotheses = np.concatenate([voted, sliced, planned])
     scores = _scores(query, match, hypotheses, p, overlap_p)
-    chosen = select_distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
+    priorities = scores.copy()  # slices are too coarse for the scores, so their best have priority
+    priorities[len(voted) : len(voted) + min(len(sliced), p.n_sliced)] = math.inf
+    chosen = select_distinct(hypotheses, priorities, p.same_m, p.same_rad, p.n_refined)
     transforms, index = refine_with_index(a.surface, b.surface, hypotheses[chosen], p.coarse)
     if not len(index):
         return None
@@ -576,6 +577,23 @@ def align_scans(
     there = _refine_finally(query, match, T, others, p, search)
     back = _refine_finally(match, query, inverse(T), inverses(others), p, search)
     return replace(there, proposed=hypotheses[np.argsort(-scores, kind="stable")]), back
+
+
+def _search_plans(
+    query: FrameSamples, match: FrameSamples, p: PlanParameters, *, other_axes: bool
+) -> tuple[Floats, Floats]:
+    """Return the hypotheses of plans, and those of slices for scanners that see all around.
+
+    Streets require slices, but their scanners stand upright.
+    """
+    a, b = query.geometry.surface, match.geometry.surface
+    if other_axes:
+        return plan_hypotheses(other_plans(a, b, p), p), np.empty((0, 4, 4))
+    pair = query.plan(p), match.plan(p)
+    planned = plan_hypotheses([pair], p)
+    if a.spread is None or b.spread is None:
+        return planned, np.empty((0, 4, 4))
+    return planned, slice_hypotheses(*pair, p)
 
 
 def align_guided(

@@ -1,16 +1,22 @@
 """Transforms between scans by correlation of their plans, as seen from above (Sec. III-E).
 
-    Surface  --draw_plan-->  ScanPlan        ScanPlan, ScanPlan  --plan_hypotheses-->  (n, 4, 4)
+    Surface  --draw_plan-->  ScanPlan
+    ScanPlan, ScanPlan  --plan_hypotheses, slice_hypotheses-->  (n, 4, 4)
 
 Scans from distant viewpoints share few patches with similar surroundings, so correspondences yield
 no correct transform, but their plans fit. Upright surfaces are drawn, with their normals, into an
 image as seen from above, which is rotated through all yaws and correlated with the other image.
 Level surfaces determine the height. This method is not part of the paper.
+
+In streets, few surfaces are as large as the walls of a hall, and the normals of trees and cars are
+unreliable. Therefore the points above the ground are also drawn without normals, in three slices of
+heights, and in cells of double width that cover the whole range of a scanner.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +25,7 @@ from numpy.typing import NDArray
 from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.registration.overlap import first_per_cube
 from sceneprint.geometry.rigid import select_distinct
-from sceneprint.types import Floats, Floats32, Ints32, Sphere, Surface
+from sceneprint.types import Bytes, Floats, Floats32, Ints32, Sphere, Surface
 
 #: Minimum cosine at which a normal votes for a candidate for up, and maximum cosine at which a
 #: perpendicular normal gives half a vote.
@@ -30,6 +36,9 @@ _NEAR, _LEVEL = math.cos(math.radians(8.0)), math.sin(math.radians(8.0))
 _MOST_CANDIDATES, _MOST_VOTERS, _REFINEMENTS = 100, 1500, 8
 #: Minimum vertical component of the normals of level surfaces, and maximum of upright surfaces.
 _FLAT, _UPRIGHT = 0.9, 0.5
+#: Edges of the slices of heights above the ground, and width of the squares whose lowest points are
+#: the ground, in cells.
+_SLICE_EDGES, _GROUND_CELLS = (0.8, 2.4, 5.2, 24.0), 8.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,9 @@ class PlanParameters:
     height_range: float = 3.0  #: maximum absolute value of a height in the histogram, metres
     blur: float = 0.7  #: standard deviation of the Gaussian blur, cells
     flat_weight: float = 0.3  #: weight of the vertical component of normals
+    sliced_yaws: int = 18  #: number of yaws, apart from half turns, whose slices are correlated
+    n_sliced: int = 25  #: `n_kept` of slices
+    slice_blur: float = 0.5  #: `blur` of slices
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +71,7 @@ class ScanPlan:
     ----------
     R : (3, 3) R_level_sensor; its rows are two level axes and up
     points, normals : (N, 3) float32, one row per voxel, in the axes of R
+    slices : (N,) uint8, slice of heights above the ground, from 1; 0 outside of all slices
     azimuths : (n_yaws,) histogram of the directions that upright surfaces face
     heights : (2, n) histograms of the heights of surfaces that face up and down
     """
@@ -66,6 +79,7 @@ class ScanPlan:
     R: Floats
     points: Floats32
     normals: Floats32
+    slices: Bytes
     azimuths: Floats
     heights: Floats
 
@@ -157,7 +171,7 @@ def draw_plan(
     R = np.stack([level, np.cross(up, level), up])
     at, facing = at @ R.T, facing @ R.T
     return ScanPlan(
-        R, at.astype(np.float32), facing.astype(np.float32),
+        R, at.astype(np.float32), facing.astype(np.float32), _slice(at, p),
         _azimuths(facing, p.n_yaws), _heights(at, facing, p),
     )  # fmt: skip
 
@@ -278,11 +292,69 @@ def _take_peaks(scores: Floats32, n: int, values: Floats, cells: Ints32) -> None
                 scores[v % side, u % side] = -np.float32(np.inf)
 
 
+@kernel
+def _draw_slices(
+    points: Floats32, slices: Bytes, cosine: float, sine: float, cell: float, image: Floats32
+) -> None:
+    """Write the roots of the numbers of points per cell, at most three, to (n_slices, side, side).
+
+    The roots and the limit prevent one wall from dominating. Cell 0 is centred on the scanner, and
+    negative cells follow the positive ones, so that a half turn reverses both axes.
+    """
+    side = image.shape[1]
+    for i in range(len(points)):
+        column = int(np.floor((cosine * points[i, 0] - sine * points[i, 1]) / cell + 0.5))
+        line = int(np.floor((sine * points[i, 0] + cosine * points[i, 1]) / cell + 0.5))
+        if slices[i] == 0 or 2 * max(abs(column), abs(line)) >= side:
+            continue
+        k, v, u = slices[i] - 1, line % side, column % side
+        image[k, v, u] = np.sqrt(min(image[k, v, u] * image[k, v, u] + 1.0, 3.0))
+
+
+def _slice(points: Floats, p: PlanParameters) -> Bytes:
+    """Return the slice (N,) of each level point by its height above the lowest neighbour."""
+    reach = math.ceil(p.side / _GROUND_CELLS)  # of the images, beyond which no point is drawn
+    squares = np.floor(np.clip(points[:, :2] / (_GROUND_CELLS * p.cell), -reach, reach)).astype(int)
+    squares += reach + 1
+    lowest = np.full((2 * reach + 3, 2 * reach + 3), np.inf)
+    np.minimum.at(lowest, tuple(squares.T), points[:, 2])
+    for axis in (0, 1):
+        lowest = np.minimum(lowest, np.minimum(np.roll(lowest, 1, axis), np.roll(lowest, -1, axis)))
+    heights = (points[:, 2] - lowest[tuple(squares.T)]) / p.cell
+    slices = np.searchsorted(_SLICE_EDGES, heights)
+    return np.where(slices < len(_SLICE_EDGES), slices, 0).astype(np.uint8)
+
+
 def _spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.complex64]:
-    """Return the Fourier transform of a plan's image at a yaw, (3, side, side / 2 + 1)."""
+    """Return the Fourier transform of the image of normals at a yaw, (3, side, side / 2 + 1)."""
     image = np.zeros((3, p.side, p.side), np.float32)
     _draw(plan.points, plan.normals, math.cos(yaw), math.sin(yaw), p.cell, p.flat_weight, image)
     return np.fft.rfft2(image).astype(np.complex64, copy=False)
+
+
+def _slice_spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.complex64]:
+    """Return the Fourier transform of the images of slices, (n_slices, side, side / 2 + 1)."""
+    image = np.zeros((len(_SLICE_EDGES) - 1, p.side, p.side), np.float32)
+    _draw_slices(plan.points, plan.slices, math.cos(yaw), math.sin(yaw), 2 * p.cell, image)
+    counts = np.bincount(plan.slices, minlength=len(_SLICE_EDGES))[1:, None, None]
+    # square roots prevent a slice with many points from dominating
+    image /= np.sqrt(np.sqrt(np.maximum(counts, 1), dtype=np.float32))
+    return np.fft.rfft2(image).astype(np.complex64, copy=False)
+
+
+def _blurred(spectrum: NDArray[np.complex64], blur: float) -> NDArray[np.complex64]:
+    """Return the spectrum of a blurred image; a blur of both images is a squared Gaussian."""
+    side = spectrum.shape[1]
+    squares = np.fft.fftfreq(side)[:, None] ** 2 + np.fft.rfftfreq(side)[None] ** 2
+    result: NDArray[np.complex64] = spectrum * np.exp(-((2 * math.pi * blur) ** 2) * squares)
+    return result.astype(np.complex64)
+
+
+def _yaw_agreement(source: ScanPlan, target: ScanPlan) -> Floats:
+    """Return the correlation (n_yaws,) of two histograms of azimuths at each yaw of the source."""
+    yaws = np.arange(len(source.azimuths))
+    result: Floats = source.azimuths[yaws - yaws[:, None]] @ target.azimuths
+    return result
 
 
 def plan_hypotheses(plans: Plans, p: PlanParameters) -> Floats:
@@ -307,28 +379,62 @@ def _correlate_plans(
     source: ScanPlan, target: ScanPlan, p: PlanParameters
 ) -> tuple[Floats, Floats]:
     """Return transforms (n, 4, 4) that align one plan with the other, and their correlations."""
-    yaws = np.arange(p.n_yaws)
-    ways = [float(np.roll(source.azimuths, k) @ target.azimuths) for k in yaws]
-    best_yaws = np.argsort(-np.array(ways), kind="stable")[: p.kept_yaws]
-    lines = np.fft.fftfreq(p.side)[:, None] ** 2 + np.fft.rfftfreq(p.side)[None] ** 2
-    # a blur of both images is the square of a Gaussian's Fourier transform
-    blurred = _spectrum(target, 0.0, p) * np.exp(-((2 * math.pi * p.blur) ** 2) * lines)
-    blurred = blurred.astype(np.complex64)
-    values = np.empty(len(best_yaws) * p.n_peaks)
+    yaws = np.argsort(-_yaw_agreement(source, target), kind="stable")[: p.kept_yaws]
+    angles = 2 * math.pi * yaws / p.n_yaws
+    blurred = _blurred(_spectrum(target, 0.0, p), p.blur)
+    products = (blurred * _spectrum(source, float(angle), p).conj() for angle in angles)
+    return _transforms_at_peaks(source, target, angles, products, p.cell, p.n_kept, p)
+
+
+def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> Floats:
+    """Return transforms (n, 4, 4) T_target_source that align what is above the ground, best first.
+
+    A half turn of an image conjugates its Fourier transform, so each transform serves two yaws.
+    """
+    half = p.n_yaws // 2
+    agreement = _yaw_agreement(source, target)
+    pairs = np.argsort(-(agreement[:half] + agreement[half : 2 * half]), kind="stable")
+    angles = 2 * math.pi * pairs[: p.sliced_yaws] / p.n_yaws
+    blurred = _blurred(_slice_spectrum(target, 0.0, p), p.slice_blur)
+
+    def products() -> Iterator[NDArray[np.complex64]]:
+        for angle in angles:
+            spectrum = _slice_spectrum(source, float(angle), p)
+            yield blurred * spectrum.conj()
+            yield blurred * spectrum
+
+    both = np.stack([angles, angles + math.pi], axis=1).ravel()
+    found, _ = _transforms_at_peaks(source, target, both, products(), 2 * p.cell, p.n_sliced, p)
+    return found
+
+
+def _transforms_at_peaks(
+    source: ScanPlan, target: ScanPlan, angles: Floats, products: Iterable[NDArray[np.complex64]],
+    cell: float, n_kept: int, p: PlanParameters,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Return the transforms (n, 4, 4) at the peaks of correlations, and the correlations.
+
+    Parameters
+    ----------
+    source, target : two plans
+    angles : yaw of the source in each correlation, radians
+    products : products of the spectra of both images, (channels, side, side / 2 + 1)
+    cell : width of a cell, metres
+    n_kept : number of distinct yaws and shifts; n is this number times that of heights
+    """
+    values = np.empty(len(angles) * p.n_peaks)
     cells = np.empty((len(values), 2), np.int32)
-    for place, k in enumerate(best_yaws):
-        spectrum = _spectrum(source, 2 * math.pi * k / p.n_yaws, p)
-        product = (blurred * spectrum.conj()).sum(axis=0)
-        scores = np.fft.irfft2(product, s=(p.side, p.side)).astype(np.float32, copy=False)
+    for place, product in enumerate(products):
+        scores = np.fft.irfft2(product.sum(axis=0), s=(p.side, p.side))
         own = slice(place * p.n_peaks, (place + 1) * p.n_peaks)
-        _take_peaks(scores, p.n_peaks, values[own], cells[own])
+        _take_peaks(scores.astype(np.float32, copy=False), p.n_peaks, values[own], cells[own])
     flat = np.tile(np.eye(4), (len(values), 1, 1))
-    angles = 2 * math.pi * np.repeat(best_yaws, p.n_peaks) / p.n_yaws
-    flat[:, 0, 0], flat[:, 0, 1] = np.cos(angles), -np.sin(angles)
-    flat[:, 1, 0], flat[:, 1, 1] = np.sin(angles), np.cos(angles)
-    flat[:, :2, 3] = ((cells[:, ::-1] + p.side // 2) % p.side - p.side // 2) * p.cell
+    yaws = np.repeat(angles, p.n_peaks)
+    flat[:, 0, 0], flat[:, 0, 1] = np.cos(yaws), -np.sin(yaws)
+    flat[:, 1, 0], flat[:, 1, 1] = np.sin(yaws), np.cos(yaws)
+    flat[:, :2, 3] = ((cells[:, ::-1] + p.side // 2) % p.side - p.side // 2) * cell
     # neighbouring yaws propose the same shifts, which would displace different ones
-    best = select_distinct(flat, values, 2 * p.cell, 3 * math.pi / p.n_yaws, p.n_kept)
+    best = select_distinct(flat, values, 2 * cell, 3 * math.pi / p.n_yaws, n_kept)
     lifts = _height_offsets(source, target, p)
     level = np.repeat(flat[best], len(lifts), axis=0)
     level[:, 2, 3] = np.tile(lifts, len(best))
