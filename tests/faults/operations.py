@@ -25,7 +25,7 @@ from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.tables import events, frames, jobs, signatures
-from sceneprint_client.api import FrameState, NewMap, Query
+from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions
 from tests.whole_engine import Engine
 
@@ -37,7 +37,7 @@ MAP, BUNDLES = "hall", "bundles"
 _LEFTOVERS = {"unreferenced-file"}
 
 #: First words of lines by which an operation acknowledges; an id or a name follows.
-ACKNOWLEDGED = ("added", "deleted", "bundle")
+ACKNOWLEDGED = ("added", "deleted", "bundle", "restored")
 
 Say = Callable[[str], None]
 
@@ -157,7 +157,8 @@ def _back_up_once(engine: Engine, store: Store) -> None:
 
 
 def _restore(engine: Engine, store: Store, say: Say) -> None:
-    restore_to_folder(str(store.folder / BUNDLES), store.folder / "restored")
+    restored = restore_to_folder(str(store.folder / BUNDLES), store.folder / "restored")
+    say(f"restored {restored.manifest.name}")
 
 
 def _import(engine: Engine, store: Store, say: Say) -> None:
@@ -277,6 +278,9 @@ def _wrong_events(engine: Engine) -> Iterator[str]:
             tuple(row) for row in connection.execute(select(events.c.kind, events.c.frame_id))
         )
         rows = list(connection.execute(select(frames.c.id, frames.c.state)))
+        ended = connection.execute(select(jobs.c.kind, jobs.c.state))
+        lost = [row for row in ended if row.state in (JobState.DEAD, JobState.FAILED)]
+    yield from (f"a job {row.kind} is {row.state}" for row in lost)
     for name, state in rows:
         for kind in ("received", state):
             if told["frame." + kind, name] != 1:
@@ -306,6 +310,8 @@ def _wrong_bundles(store: Store, operation: str, said: dict[str, str]) -> Iterat
     take_backup(store.settings, place)
     restored = store.folder / "restored"
     if not (restored / "sceneprint.db").exists():
+        if "restored" in said:
+            yield "an acknowledged restore is missing"
         restore_to_folder(place, restored)
     if len(contents(Store(restored, None, store.uploads))) != STORED:
         yield "the restored store lacks frames"
