@@ -8,6 +8,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import FilePayload, Locator, Page, Response, expect
 
+from benchmarks.rooms import circled
 from sceneprint.decoders.child_process import array_samples, text_samples
 from sceneprint.formats.depth_file import encode_npy
 
@@ -302,3 +304,53 @@ def test_a_cloud_or_mesh_may_be_a_whole_map(
     expect(more).to_contain_text(f"{result['found']} were found, {result['ambiguous']} ambiguous")
     [frame] = station.client.get("/v1/maps/whole/frames", params={"limit": 1}).json()["items"]
     assert frame["tags"] == ["virtual"]
+
+
+@pytest.mark.thorough
+def test_a_recording_becomes_a_map_with_its_coverage(
+    page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]],
+    ros: SimpleNamespace, tmp_path: Path,
+) -> None:  # fmt: skip
+    def fill(writer: Any) -> None:
+        for i, shot in enumerate(circled(range(0, 360, 60))):
+            writer.transforms(20 * i, {("odom", "camera"): np.array(shot.meta["pose"]["matrix"])})
+            lens = shot.meta["intrinsics"]
+            k = tuple(lens[name] for name in ("fx", "fy", "cx", "cy"))
+            writer.camera_info(20 * i, k=k, size=(lens["width"], lens["height"]))
+            writer.image(20 * i, 1000 * np.nan_to_num(np.load(io.BytesIO(shot.data))))
+            writer.image(20 * i, np.full((48, 64), 2000 + i), topic="/other/image_raw")
+            writer.camera_info(20 * i, "/other/camera_info")
+
+    bag = ros.write(tmp_path, fill, "ros1", name="Room 7")
+    page.goto(f"{station.home}#/")
+    settle(page)
+    transfer = page.evaluate_handle(
+        """([name, data]) => {
+            const transfer = new DataTransfer();
+            const bytes = Uint8Array.from(atob(data), (one) => one.charCodeAt(0));
+            transfer.items.add(new File([bytes], name));
+            return transfer;
+        }""",
+        [bag.name, base64.b64encode(bag.read_bytes()).decode()],
+    )
+    page.locator("main").dispatch_event("drop", {"dataTransfer": transfer})
+    dialog = page.get_by_role("dialog", name="New map")
+    expect(dialog.get_by_label("Name")).to_have_value("room-7")
+    expect(dialog.get_by_role("radio", name="Rooms")).to_be_checked()
+    dialog.get_by_role("button", name="Create map").click()
+    mine = row(page, bag.name)
+    expect(mine.locator(".row-more > p").first).to_contain_text("2 topics have frames")
+    topics = mine.locator("tbody tr").all_inner_texts()
+    assert [one.split()[0] for one in topics][:2] == [
+        "/camera/depth/image_raw", "/other/image_raw",
+    ]  # fmt: skip
+    mine.get_by_role("button", name="Import /camera/depth/image_raw").click()
+    expect(mine.locator(".row-plan .plan")).to_be_visible()
+    expect(mine.locator(".badge")).to_have_text("imported")
+    expect(mine.locator(".row-more > p").first).to_have_text("Frames: 6 imported.")
+    expect(mine.get_by_role("heading", name="6 of 6 frames queried")).to_be_visible()
+    assert axe(page) == []
+    about = station.client.get("/v1/maps/room-7").json()
+    assert (about["frames"]["indexed"], about["posed_frames"]) == (6, 6)
+    mine.get_by_role("link", name="Coverage, cell by cell").click()
+    expect(page.get_by_role("heading", name="Coverage of room-7")).to_be_visible()

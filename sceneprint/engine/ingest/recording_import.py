@@ -50,13 +50,14 @@ class RecordingImporter:
             raise UnreadableArchive(
                 "The recording was removed when its import failed or was cancelled. Send it again."
             )
-        with self._decoder(files[ARCHIVE], options.name) as decoder:
-            if _INDEX not in files:
+        if _INDEX not in files:
+            with self._decoder(files[ARCHIVE], options.name) as decoder:
                 return self._read(decoder, options)
-            with self._store.blobs.open(files[_INDEX].blob) as stored:
-                index = RecordingIndex.parse(stored.read())
-            if index.outline.problem is not None:
-                raise UnreadableArchive(index.outline.problem)
+        with self._store.blobs.open(files[_INDEX].blob) as stored:
+            index = RecordingIndex.parse(stored.read())
+        if index.outline.problem is not None:
+            raise UnreadableArchive(index.outline.problem)
+        with self._decoder(files[ARCHIVE], options.name) as decoder:
             return self._add(task, options, decoder, index, is_over)
 
     @contextmanager
@@ -84,7 +85,7 @@ class RecordingImporter:
         index = RecordingIndex.parse(text)
         progress = {
             "done": 0, "total": len(index.frames), "phase": "add", "received": 0, "there": 0,
-            "refused": 0, "recording": index.outline.model_dump(mode="json"),
+            "refused": 0, "largest": 0, "recording": index.outline.model_dump(mode="json"),
         }  # fmt: skip
         with self._store.blobs.incoming() as blob:
             blob.write(text)
@@ -97,19 +98,18 @@ class RecordingImporter:
     ) -> SliceResult:  # fmt: skip
         topic, frames, progress = index.topic, index.frames, dict(task.progress)
         items = list[dict[str, Any]]()
-        largest = _BYTES_AT_ONCE  # sizes are unknown until a frame is read, so begin with one
 
         def upload(frame: dict[str, Any]) -> Upload:
-            nonlocal largest
             if topic is None:
                 raise UnreadableArchive("The recording has no topic of frames.")
             meta = FrameMeta.model_validate(frame["meta"])
             data = decoder.frame(topic, frame["place"])
-            largest = max(len(data), largest if items else 1)
+            progress["largest"] = max(len(data), progress["largest"])
             return Upload(data, meta, options.priority, options.if_novel)
 
         while progress["done"] < len(frames) and (not items or not is_over()):
-            count = max(1, min(_AT_ONCE, _BYTES_AT_ONCE // largest))
+            # sizes are unknown until a frame is read, so the first block has one
+            count = max(1, min(_AT_ONCE, _BYTES_AT_ONCE // (progress["largest"] or _BYTES_AT_ONCE)))
             block = frames[progress["done"] :][:count]
             reads = [(str(one["name"]), partial(upload, one)) for one in block]
             for item in add_block(self._uploads, task, reads):

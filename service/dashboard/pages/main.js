@@ -158,5 +158,16 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault(); // its `#main` would be taken for an address
   main.focus();
 });
+// files dropped on any page: a page that takes them has prevented it; else the browser would leave for the file
+const isFiles = (event) => event.dataTransfer?.types.includes("Files");
+document.addEventListener("dragover", (event) => { if (isFiles(event)) event.preventDefault(); });
+window.addEventListener("drop", async (event) => {
+  if (!isFiles(event) || event.defaultPrevented || event.dataTransfer === null) return;
+  event.preventDefault();
+  const { items, files: [...alone] } = event.dataTransfer; // gone after the event
+  const entries = [...items].map((item) => item.webkitGetAsEntry()).filter(Boolean);
+  const { handOver } = await import(new URL("frames/handover.js", PAGES).href);
+  await handOver({ entries, files: alone }, parse(location.hash), go, turn.signal);
+});
 keepPresses();
 show();

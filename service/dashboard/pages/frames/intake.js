@@ -22,12 +22,13 @@ export function dropped(transfer) {
   return entries.length ? walk(entries) : chosen(transfer.files);
 }
 
-/** Files of a file input, of which one for folders tells the paths. @param {FileList} files */
+/** Files of a file input, of which one for folders tells the paths. @param {Iterable<File>} files */
 export async function* chosen(files) {
   for (const file of [...files]) yield { file, path: file.webkitRelativePath || file.name };
 }
 
-async function* walk(entries) {
+/** Files of entries of a drop, folders walked through. @param {any[]} entries @returns {AsyncGenerator<Dropped>} */
+export async function* walk(entries) {
   for (const entry of entries) {
     if (entry.name.startsWith(".")) continue;
     if (entry.isFile) {
@@ -92,9 +93,13 @@ export async function taken(files, signal) {
   return { found, fields, left, faults };
 }
 
-function isImport({ kind }) {
-  return kind === "archive" || kind === "map";
+/** Whether a file becomes many frames, which the service reads from it. @param {import("./kinds.js").Source} source */
+export function isImport({ kind }) {
+  return kind === "archive" || kind === "map" || kind === "recording";
 }
+
+/** What was dropped on another page, by map: the page Upload takes it. @type {Map<string, Dropped[]>} */
+export const handed = new Map();
 
 function nearest(beside, { path, source }) {
   const kind = source.kind === "cloud" ? "clouds" : "camera";

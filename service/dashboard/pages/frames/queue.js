@@ -2,8 +2,9 @@
 // the page that shows it, so that one may look around while it works.
 import { at, get, send } from "../lib/api.js";
 import { isPending } from "./badge.js";
-import { folderOf, labelsOf, namesOf } from "./intake.js";
+import { folderOf, isImport, labelsOf, namesOf } from "./intake.js";
 import { poseOf, stemOf } from "./kinds.js";
+import { measure, recordingParams } from "./recording.js";
 import { formOf, settings } from "./source.js";
 import { mapParams } from "./wholemap.js";
 
@@ -16,8 +17,10 @@ const ENDS_ALL = new Set([401, 403, 404, 507]);
 
 /** @typedef {import("./intake.js").Found & {id: number, state: string, share: number, label: {name: string, sequence?: number},
  *   frame_id: string | null, job: Object<string, any> | null, reason: string | null, problem: Error | null,
- *   isThere: boolean, tries: number, until: number, stop: AbortController | null, isMap: boolean}} Item
- *   isMap: whether it is a whole map, of which views are rendered
+ *   isThere: boolean, tries: number, until: number, stop: AbortController | null, isMap: boolean, topic?: string,
+ *   step?: string | null, coverage?: Object<string, any> | null}} Item
+ *   isMap: whether it is a whole map, of which views are rendered; topic: chosen among several of a recording;
+ *   step: what the map waits for after the import of a recording; coverage: its result
  *   state: ready, waiting, sending, sent, importing, imported, refused, cancelled, or a frame's */
 
 const queues = new Map();
@@ -129,7 +132,7 @@ export class Queue {
     try {
       // else the network would be blamed for it, and it asked again and again
       await item.file.slice(0, 1).arrayBuffer().catch(() => { throw new Error("The file can no longer be read: it was changed, moved or removed. Choose it again."); });
-      if (item.source.kind === "archive" || item.isMap) await this.sendImport(item);
+      if (isImport(item.source) || item.isMap) await this.sendImport(item);
       else await this.sendFrame(item);
     } catch (error) {
       this.refused(item, error);
@@ -170,13 +173,14 @@ export class Queue {
   }
 
   async sendImport(item) {
-    const own = this.given;
+    const own = this.given, isBag = item.source.kind === "recording";
+    if (item.source.format === "rosbag2") throw new Error(`A rosbag2 database is read where it is, with its folder. Run \`sceneprint upload ${this.map} FOLDER\` there.`);
     const stem = stemOf(item.file.name.replace(/\.tar\.\w+$/, ".tar"));
-    // a map's format may be told by the ending of its name alone
-    const name = item.isMap ? item.file.name.slice(-64) : stem.slice(0, 64);
+    // a map's format may be told by the ending of its name alone, and a recording is called after its file
+    const name = item.isMap || isBag ? item.file.name.slice(-64) : stem.slice(0, 64);
     const params = { robot: own.robot.trim(), session: own.session.trim(), parent_frame: own.parent_frame.trim(),
       tags: own.tags.split(",").map((one) => one.trim()).filter(Boolean).join(","),
-      name: name.replace(/^\.+/, "") || "import", ...(item.isMap ? mapParams(own) : {}) };
+      name: name.replace(/^\.+/, "") || "import", ...(item.isMap ? mapParams(own) : isBag ? recordingParams({ ...own, bag_topic: item.topic ?? own.bag_topic }) : {}) };
     const { data } = await send("POST", at("maps", this.map, "imports"), {
       body: item.file, type: "application/octet-stream", params, signal: item.stop.signal,
       onprogress: (share) => this.change(item, { share }),
@@ -201,6 +205,8 @@ export class Queue {
       const items = over ? await get(at("maps", this.map, "imports", item.job.job_id, "items"), { params: { limit: 1000 } }).catch(() => null) : null;
       const refused = items?.items.filter((one) => one.problem) ?? [];
       this.change(item, { job, refused, reason: job.error, state: over ? (job.state === "succeeded" ? "imported" : job.state) : "importing" });
+      // a map that is left, or a key that is forgotten, ends it: the page Coverage has the rest
+      if (item.state === "imported" && item.source.kind === "recording") measure(this.map, item, (changes) => this.change(item, changes)).catch(() => this.change(item, { step: null }));
     }
   }
 

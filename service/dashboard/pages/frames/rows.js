@@ -4,6 +4,7 @@ import { bytes, count, percent, seconds, shortId } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { badge, isPending } from "./badge.js";
+import { measuredPlan, outlineOf } from "./recording.js";
 import { viewSwitch } from "./views.js";
 
 const GROUPS = [["all", "All"], ["ready", "Ready"], ["way", "In progress"], ["done", "Done"], ["refused", "Refused"]];
@@ -13,7 +14,7 @@ const IN_GROUP = {
 };
 // as many rows as anybody reads; more are a click away, and 5,000 files cost no more than 100
 const STEP = 100;
-const KIND = { depth: "Depth image", cloud: "Point cloud", archive: "Archive", map: "Whole map" };
+const KIND = { depth: "Depth image", cloud: "Point cloud", archive: "Archive", map: "Whole map", recording: "ROS recording" };
 const PHASES = { read: "Reading the file", choose: "Choosing viewpoints", render: "Rendering views", sign: "Signing views", test: "Looking up other views" };
 
 /** Which of the groups an item is in. @param {string} state */
@@ -57,7 +58,7 @@ export function rowsOf(queue, signal) {
     for (const [id, row] of rows) if (!ids.has(id)) { row.remove(); rows.delete(id); }
     shown.forEach((item, i) => {
       let row = rows.get(item.id);
-      if (!row) { row = rowOf(queue, item); rows.set(item.id, row); } else if (all || dirty.has(item)) row.show();
+      if (!row) { row = rowOf(queue, item, signal); rows.set(item.id, row); } else if (all || dirty.has(item)) row.show();
       if (list.children[i] !== row) list.insertBefore(row, list.children[i] ?? null);
     });
     dirty.clear();
@@ -78,7 +79,7 @@ export function rowsOf(queue, signal) {
   return element;
 }
 
-function rowOf(queue, item) {
+function rowOf(queue, item, signal) {
   const state = h("div", { class: "row-state" });
   const more = h("div", { class: "row-more" });
   const action = h("div", { class: "row-action" });
@@ -87,18 +88,24 @@ function rowOf(queue, item) {
     h("div", { class: "row-name" }, h("span", { title: item.path }, item.file.name), about), state, action, more), { show });
   /** @type {string | null} */
   let drawn = null;
+  /** @type {any} what was drawn of a recording */
+  let found = null;
   function show() {
     if (item.state === "sending" && drawn === "sending") { /** @type {HTMLProgressElement} */ (row.querySelector("progress")).value = item.share; return; }
     put(about, aboutOf(item)); // a cloud may have been marked as a map
-    if (item.state === drawn && item.state !== "importing" && item.state !== "waiting") return;
+    if (item.state === drawn && item.state !== "importing" && item.state !== "waiting" && item.step === undefined) return;
     drawn = item.state;
     row.dataset.state = item.state;
     put(state, stateOf(item));
     const had = action.contains(document.activeElement);
     put(action, actionOf(queue, item));
     if (had) /** @type {HTMLElement | null} */ (action.querySelector("button, a"))?.focus();
-    put(more, reasonOf(item));
-    if (item.state === "waiting" && item.until) setTimeout(() => { if (item.state === "waiting") put(more, reasonOf(item)); }, 1000);
+    // a plan is drawn once, and what is read or pressed is not drawn anew while a job goes on
+    const now = item.coverage ?? item.job?.progress?.recording?.span;
+    if (item.state === "importing" ? now && now === found : item.coverage && now === found) return;
+    found = now;
+    put(more, reasonOf(item, queue, signal));
+    if (item.state === "waiting" && item.until) setTimeout(() => { if (item.state === "waiting") put(more, reasonOf(item, queue, signal)); }, 1000);
   }
   show();
   return row;
@@ -121,10 +128,11 @@ function stateOf(item) {
   if (state === "cancelled") return badge("cancelled");
   if (state === "importing") {
     const { done, total, phase } = item.job.progress ?? {};
-    const words = phase ? PHASES[phase] : total ? `${count(done)} of ${count(total)} frames` : "Waiting for a worker";
+    const words = PHASES[phase] ? PHASES[phase] : total ? `${count(done)} of ${count(total)} frames` : item.source.kind === "recording" && item.job.state === "running" ? "Reading the recording" : "Waiting for a worker";
     return [h("progress", { max: 1, value: total ? done / total : null, "aria-label": `${item.file.name}, imported` }),
       h("span", { class: "muted number" }, words)];
   }
+  if (item.step) return h("span", { class: "muted number", role: "status" }, item.step);
   if (state === "imported") return h("span", { class: "badge", dataset: { kind: "good" } }, "imported");
   return badge(state);
 }
@@ -147,9 +155,16 @@ function wholeOf(queue, item) {
     h("span", {}, "Whole map"));
 }
 
-function reasonOf(item) {
-  const { problem, state } = item;
-  if (state === "imported") return item.isMap ? mapOf(item) : importOf(item);
+function reasonOf(item, queue, signal) {
+  const { problem, state, coverage } = item;
+  const recording = item.job?.progress?.recording;
+  const choose = (topic) => { Object.assign(item, { topic, job: null }); queue.again([item]); };
+  const outline = recording && outlineOf(recording, state === "failed" ? choose : null);
+  if (state === "imported") {
+    return [item.isMap ? [mapOf(item), h("p", {}, h("a", { href: link("maps", queue.map, "place") }, "See its plan"))] : importOf(item), coverage && measuredPlan(queue.map, coverage, signal),
+      coverage ? h("details", {}, h("summary", {}, "Topics and findings"), outline) : outline];
+  }
+  if (outline) return [state === "failed" && h("p", {}, coded(item.reason)), outline];
   if (problem) {
     const rest = Math.max(0, (item.until - Date.now()) / 1000);
     return [

@@ -8,7 +8,7 @@ const KEPT_AS = "sceneprint.source";
 const EMPTY = {
   fx: "", fy: "", cx: "", cy: "", width: "", height: "", distortion: "", depth_scale: "1000",
   depth_along_ray: false, viewpoint: "file", units_per_metre: "1",
-  robot: "", session: "", parent_frame: "", tags: "", map_up: "", map_units: "", map_heights: "", map_offset: "",
+  robot: "", session: "", parent_frame: "", tags: "", map_up: "", map_units: "", map_heights: "", map_offset: "", bag_topic: "",
 };
 const PRESETS = {
   "": { label: "Custom" },

@@ -6,16 +6,17 @@ import { link } from "../lib/router.js";
 import { may, me } from "../lib/session.js";
 import { empty } from "../lib/states.js";
 import { follow } from "./following.js";
-import { chosen, dropped, taken } from "./intake.js";
+import { chosen, dropped, handed, isImport, taken } from "./intake.js";
 import { ACCEPT, titlesOf } from "./kinds.js";
 import { queueOf } from "./queue.js";
+import { recordingFields } from "./recording.js";
 import { groupOf, rowsOf } from "./rows.js";
 import { cameraFields, hasCamera, remember } from "./source.js";
 import { mapFields } from "./wholemap.js";
 
 const ALOUD_MS = 5000;
 
-export const styles = ["frames/source.css", "frames/upload.css", "frames/frames.css"];
+export const styles = ["plan/plan.css", "coverage/coverage.css", "frames/source.css", "frames/upload.css", "frames/frames.css"];
 
 /** The page: #/maps/NAME/upload */
 export async function render(root, { params, signal, title, actions }) {
@@ -42,13 +43,13 @@ export async function render(root, { params, signal, title, actions }) {
   const place = dropZone((files) => take(files));
   put(root, h("div", { class: "upload" },
     h("div", { class: "upload-main" }, place, note, bar, aloud, said, rows),
-    h("aside", { class: "card upload-said", "aria-label": "Metadata of the files" }, whoFields(queue.given), fields, mapFields(queue.given))));
+    h("aside", { class: "card upload-said", "aria-label": "Metadata of the files" }, whoFields(queue.given), fields, mapFields(queue.given), recordingFields(queue.given))));
   actions(h("a", { class: "button", href: link("maps", params.map) }, "To the frames"));
 
   async function take(files) {
     put(note, "Reading the dropped files…");
     const { found, fields: told, left, faults } = await taken(files, signal);
-    if (signal.aborted) return;
+    if (signal.aborted) return [];
     for (const one of told) Object.assign(queue.given, one);
     if (told.length) { remember(queue.given); fields.refill(); }
     queue.add(found);
@@ -60,6 +61,7 @@ export async function render(root, { params, signal, title, actions }) {
     if (!found.length && !told.length && !left.length && !faults.length) words.push("It contains nothing readable.");
     put(note, words.join(" "));
     put(said);
+    return found;
   }
 
   function begin() {
@@ -134,14 +136,20 @@ export async function render(root, { params, signal, title, actions }) {
     telling ??= setTimeout(() => { telling = null; put(aloud, toTell); }, ALOUD_MS);
   }
 
-  // a drop that misses its zone would have the browser leave the page for the file
-  const isFiles = (event) => event.dataTransfer?.types.includes("Files");
-  document.addEventListener("dragover", (event) => { if (isFiles(event)) event.preventDefault(); }, { signal });
-  document.addEventListener("drop", (event) => {
-    if (!isFiles(event) || event.defaultPrevented) return;
+  document.addEventListener("drop", (event) => { // that misses its zone
+    if (!event.dataTransfer?.types.includes("Files") || event.defaultPrevented) return;
     event.preventDefault();
     take(dropped(/** @type {DataTransfer} */ (event.dataTransfer)));
   }, { signal });
+  const given = handed.get(params.map);
+  handed.delete(params.map);
+  // a recording or a map says by itself what it is; frames may need a camera
+  if (given) take(given).then((found) => {
+    // one cloud for a map without frames is hardly one scan; whoever looks at it can say otherwise
+    const isEmpty = Object.values(map.frames).every((n) => n === 0);
+    if (isEmpty && found.length === 1 && found[0].source.kind === "cloud") queue.change(queue.items.at(-1), { isMap: true });
+    else if (found.length > 0 && found.every((one) => isImport(one.source))) begin();
+  });
   queue.listeners.add(show);
   signal.addEventListener("abort", () => { queue.listeners.delete(show); clearTimeout(timer); clearTimeout(telling); }, { once: true });
   sum();
@@ -159,8 +167,8 @@ function dropZone(take) {
     onChange: (event) => { take(chosen(event.target.files)); event.target.value = ""; } });
   const [files, folder] = [pick({ accept: ACCEPT, name: "files" }), pick({ webkitdirectory: true, name: "folder" })];
   const zone = h("div", { class: "drop" }, files, folder,
-    h("strong", {}, "Drop frames, folders, archives or a whole map here"),
-    h("p", { class: "muted" }, `Depth images (${titlesOf("depth")}), point clouds (${titlesOf("cloud")}), or archives (${titlesOf("archive")}). A file of ${titlesOf("map")}, or a cloud marked as a whole map, becomes the map. An intrinsics.json, clouds.json or NAME.pose.txt beside them is read.`),
+    h("strong", {}, "Drop a recording, frames, folders, archives or a whole map here"),
+    h("p", { class: "muted" }, `Recordings (MCAP, ROS 1), depth images (${titlesOf("depth")}), point clouds (${titlesOf("cloud")}), or archives (${titlesOf("archive")}). A file of ${titlesOf("map")}, or a cloud marked as a whole map, becomes the map. An intrinsics.json, clouds.json or NAME.pose.txt beside them is read.`),
     h("div", { class: "toolbar" },
       h("button", { class: "button", type: "button", onClick: () => files.click() }, "Choose files"),
       h("button", { class: "button", type: "button", onClick: () => folder.click() }, "Choose a folder")));

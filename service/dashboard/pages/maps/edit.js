@@ -14,12 +14,13 @@ const FOR = {
 };
 
 /** Ask for a name, a title and a model, and make a map of them. @param {(hash: string) => void} go
- * @param {AbortSignal} signal */
-export async function createMap(go, signal) {
+ * @param {AbortSignal} signal @param {{name?: string, model?: string, created?: (name: string) => void}} [how]
+ *   name, model: chosen at first; created: what is done in place of showing the map */
+export async function createMap(go, signal, { name: first = "", model: wanted = "depth", created } = {}) {
   const { items } = await get("models", { signal });
-  const name = h("input", { id: "new-name", name: "name", class: "mono", autocomplete: "off", spellcheck: "false", maxlength: 63 });
+  const name = h("input", { id: "new-name", name: "name", class: "mono", autocomplete: "off", spellcheck: "false", maxlength: 63, value: first });
   const title = h("input", { id: "new-title", name: "title", autocomplete: "off", maxlength: 200 });
-  const models = items.filter((one) => one.preset).map((one, i) => choice(one, i === 0));
+  const models = items.filter((one) => one.preset).map((one) => choice(one, one.name === wanted));
   await form({
     title: "New map", action: "Create map",
     children: [
@@ -33,7 +34,8 @@ export async function createMap(go, signal) {
       const json = { name: name.value.trim(), title: title.value.trim() || null, model };
       const { status, data } = await send("POST", "maps", { json });
       toast(status === 201 ? `${data.name} was created.` : `${data.name} already exists with these settings.`);
-      if (dialog.open) go(link("maps", data.name)); // else it was left meanwhile
+      if (created) created(data.name);
+      else if (dialog.open) go(link("maps", data.name)); // else it was left meanwhile
     },
     place: (problem) => (problem.type === "map-exists" ? "name" : null),
   });
