@@ -33,6 +33,15 @@ def transform(x: float, y: float, z: float, *quaternion: float) -> Floats:
     return T
 
 
+#: Packages and definitions of the messages of Livox.
+LIVOX = ("livox_ros_driver", "livox_ros_driver2")
+LIVOX_POINT = (
+    "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line"
+)
+LIVOX_SCAN = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+    "CustomPoint[] points"
+)
 #: Pose of a camera that looks ahead and slightly down, in front of the base and above it.
 T_BASE_CAMERA = transform(0.21, -0.05, 0.93, -0.53, 0.49, -0.47, 0.51)
 
@@ -46,6 +55,9 @@ class BagWriter:
         if ros1:  # rosbags supports it only for ROS 2
             of_tf = "geometry_msgs/TransformStamped[] transforms"
             self.types.register(get_types_from_msg(of_tf, "tf2_msgs/msg/TFMessage"))
+        for package in LIVOX:
+            self.types.register(get_types_from_msg(LIVOX_POINT, f"{package}/msg/CustomPoint"))
+            self.types.register(get_types_from_msg(LIVOX_SCAN, f"{package}/msg/CustomMsg"))
         self.connections: dict[str, Any] = {}
         self.late = 0.0  #: seconds from the stamp of a message to its recording
 
@@ -232,6 +244,33 @@ class BagWriter:
         )  # fmt: skip
         self.write(topic, "sensor_msgs/msg/PointCloud2", t, message)
 
+    def livox_message(
+        self, t: float, points: np.ndarray, seconds: np.ndarray, tags: Any = 0, *,
+        package: str = LIVOX[1], frame: str = "livox_frame",
+    ) -> Any:  # fmt: skip
+        """Return a CustomMsg of points (N, 3) with their times after the stamp."""
+        rows = zip(points, seconds, np.broadcast_to(tags, len(points)), strict=True)
+        return self.make(
+            f"{package}/msg/CustomMsg",
+            header=self.header(t, frame), timebase=(START + round(t)) * 10**9,
+            point_num=len(points), lidar_id=1, rsvd=np.zeros(3, np.uint8),
+            points=[
+                self.make(
+                    f"{package}/msg/CustomPoint", offset_time=round(s * 1e9), x=float(x),
+                    y=float(y), z=float(z), reflectivity=7, tag=int(tag), line=2,
+                )
+                for (x, y, z), s, tag in rows
+            ],
+        )  # fmt: skip
+
+    def livox(
+        self, t: float, points: np.ndarray, seconds: np.ndarray, tags: Any = 0,
+        topic: str = "/livox/lidar", *, package: str = LIVOX[1], frame: str = "livox_frame",
+    ) -> None:  # fmt: skip
+        """Write a CustomMsg."""
+        message = self.livox_message(t, points, seconds, tags, package=package, frame=frame)
+        self.write(topic, f"{package}/msg/CustomMsg", t, message)
+
 
 @contextmanager
 def open_writer(folder: Path, container: str, name: str, compression: str) -> Iterator[BagWriter]:
@@ -271,14 +310,15 @@ def write(
 
 
 class MessageWriter(BagWriter):
-    """Writer that serialises and decodes ROS 2 messages without a bag."""
+    """Writer that serialises and decodes messages without a bag."""
 
-    def __init__(self) -> None:
-        super().__init__(None, ros1=False)
+    def __init__(self, *, ros1: bool = False) -> None:
+        super().__init__(None, ros1=ros1)
         self.written: list[tuple[str, str, Any]] = []  #: topic, type, message
 
     def raw(self, topic: str, name: str, t: float, data: bytes) -> None:
-        self.written.append((topic, name, self.types.deserialize_cdr(data, name)))
+        read = self.types.deserialize_ros1 if self.ros1 else self.types.deserialize_cdr
+        self.written.append((topic, name, read(data, name)))
 
     def last(self) -> Any:
         """Return the last message."""

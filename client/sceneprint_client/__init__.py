@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sceneprint_client.client import AsyncClient, Client, Status
     from sceneprint_client.frame_files import FrameFile, meta_of
+    from sceneprint_client.joiner import Joiner
     from sceneprint_client.spool import Spool
     from sceneprint_client.tracker import AsyncTracker, State, Tracker
 
@@ -25,6 +26,7 @@ __all__ = [
     "AsyncTracker",
     "Client",
     "FrameFile",
+    "Joiner",
     "Spool",
     "State",
     "Status",
@@ -38,6 +40,7 @@ _HOME = {
     "AsyncTracker": "tracker",
     "Client": "client",
     "FrameFile": "frame_files",
+    "Joiner": "joiner",
     "Spool": "spool",
     "State": "tracker",
     "Status": "client",

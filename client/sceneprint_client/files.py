@@ -2,7 +2,7 @@
 
 path  --read_bytes | read_text | read_object-->  content
 bytes  --npy_header-->  NpyHeader: type, shape, order, offset of the numbers
-bytes  --read_point_cloud-->  SerializedCloud
+bytes  --read_point_cloud | read_livox_scan-->  SerializedCloud
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, NamedTuple
 
 import numpy as np
 
@@ -227,6 +227,20 @@ class SerializedField:
     count: int
 
 
+class SerializedStamp(NamedTuple):
+    """A builtin_interfaces/Time."""
+
+    sec: int
+    nanosec: int
+
+
+class SerializedHeader(NamedTuple):
+    """A std_msgs/Header."""
+
+    stamp: SerializedStamp
+    frame_id: str
+
+
 @dataclass(frozen=True, eq=False)
 class SerializedCloud:
     """A sensor_msgs/PointCloud2 whose data is a view of the serialised bytes.
@@ -235,14 +249,12 @@ class SerializedCloud:
 
     Parameters
     ----------
-    stamp_ns : nanoseconds
-    frame_id : frame of the sensor
+    header : stamp and frame of the sensor
     height, width, point_step, row_step, is_bigendian, fields, data : as in the message, without a
         check that they are consistent
     """
 
-    stamp_ns: int
-    frame_id: str
+    header: SerializedHeader
     height: int
     width: int
     fields: tuple[SerializedField, ...]
@@ -265,7 +277,8 @@ def read_point_cloud(data: bytes) -> SerializedCloud:
             "output of rclpy.serialization.serialize_message."
         )
     reader = _Reader(data)
-    stamp_ns, frame_id, height, width = _read_header(reader)
+    header = _read_header(reader)
+    height, width = reader.word(), reader.word()
     fields = _read_fields(reader)
     is_bigendian = reader.byte() != 0
     point_step, row_step, size = reader.word(), reader.word(), reader.word()
@@ -277,7 +290,58 @@ def read_point_cloud(data: bytes) -> SerializedCloud:
             "another type. Serialise it again."
         )
     return SerializedCloud(
-        stamp_ns, frame_id, height, width, fields, is_bigendian, point_step, row_step, points
+        header, height, width, fields, is_bigendian, point_step, row_step, points
+    )
+
+
+#: Fields of a point of a CustomMsg that are read, and its length without padding, bytes.
+_LIVOX_FIELDS = (
+    SerializedField("offset_time", 0, 6, 1),
+    SerializedField("x", 4, 7, 1),
+    SerializedField("y", 8, 7, 1),
+    SerializedField("z", 12, 7, 1),
+    SerializedField("tag", 17, 2, 1),
+    SerializedField("line", 18, 2, 1),
+)
+_LIVOX_POINT = 19
+
+
+def read_livox_scan(data: bytes, *, ros1: bool = False) -> SerializedCloud:
+    """Return a serialised CustomMsg of livox_ros_driver or livox_ros_driver2 as a PointCloud2.
+
+    Parameters
+    ----------
+    data : message in the serialisation of ROS 2, or of ROS 1
+    ros1 : whether ROS 1 serialised the message
+
+    Raises
+    ------
+    UnreadableCloud : If the bytes are not such a message, are truncated, or have trailing data.
+    """
+    if not ros1 and not _is_encapsulated(data):
+        raise UnreadableCloud(
+            "This is not a serialised CustomMsg: it does not start with a CDR header. Send the "
+            "output of rclpy.serialization.serialize_message."
+        )
+    reader = _Reader(data, ros1=ros1)
+    header = _read_header(reader)
+    reader.align(8)
+    reader.bytes(8)  # timebase, which the stamp of the header repeats
+    declared = reader.word()
+    reader.bytes(4)  # lidar_id and rsvd
+    count = reader.word()
+    # CDR pads a point to whole words, except the last one.
+    step = _LIVOX_POINT if ros1 else _LIVOX_POINT + 1
+    points = reader.bytes(max(count * step - (not ros1), 0))
+    if count != declared or reader.left > _MOST_PADDING:
+        raise UnreadableCloud(
+            f"The CustomMsg declares {declared} points, but holds {count}, and {reader.left} bytes "
+            "follow. It is damaged or has another type. Record it again."
+        )
+    if count and not ros1:
+        points = memoryview(bytes(points) + b"\0")
+    return SerializedCloud(
+        header, 1, count, _LIVOX_FIELDS, reader.is_bigendian, step, count * step, points
     )
 
 
@@ -286,15 +350,16 @@ def _is_encapsulated(data: bytes) -> bool:
     return len(data) >= _HEAD and data[0] == 0 and data[1] <= 1 and data[2] == 0 and data[3] <= 3
 
 
-def _read_header(reader: _Reader) -> tuple[int, str, int, int]:
-    """Return stamp in nanoseconds, frame, height and width."""
+def _read_header(reader: _Reader) -> SerializedHeader:
+    if reader.is_ros1:
+        reader.word()  # seq
     seconds, nanoseconds = reader.word(), reader.word()
     if nanoseconds >= 1_000_000_000:
         raise UnreadableCloud(
-            f"The stamp of the PointCloud2 has {nanoseconds} nanoseconds, so it is damaged or has "
+            f"The stamp of the message has {nanoseconds} nanoseconds, so it is damaged or has "
             "another type. Serialise it again."
         )
-    return seconds * 1_000_000_000 + nanoseconds, reader.text(), reader.word(), reader.word()
+    return SerializedHeader(SerializedStamp(seconds, nanoseconds), reader.text())
 
 
 def _read_fields(reader: _Reader) -> tuple[SerializedField, ...]:
@@ -313,10 +378,11 @@ def _read_fields(reader: _Reader) -> tuple[SerializedField, ...]:
 class _Reader:
     """Reader of the values of a message; raises UnreadableCloud at a premature end."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, *, ros1: bool = False) -> None:
+        self.is_ros1, self.is_bigendian = ros1, not ros1 and not data[1] & 1
         self._data = memoryview(data)
-        self._word = struct.Struct("<I" if data[1] & 1 else ">I")
-        self._at = _HEAD
+        self._word = struct.Struct(">I" if self.is_bigendian else "<I")
+        self._at = 0 if ros1 else _HEAD
 
     @property
     def left(self) -> int:
@@ -327,7 +393,7 @@ class _Reader:
         """Return the next bytes."""
         if count > self.left:
             raise UnreadableCloud(
-                f"The PointCloud2 is truncated: {count} bytes are expected at byte {self._at}, but "
+                f"The message is truncated: {count} bytes are expected at byte {self._at}, but "
                 f"only {self.left} follow. Serialise it again."
             )
         self._at += count
@@ -337,9 +403,13 @@ class _Reader:
         """Return the next byte."""
         return self.bytes(1)[0]
 
+    def align(self, size: int) -> None:
+        """Skip padding before a number of `size` bytes; ROS 1 has none."""
+        self.bytes(0 if self.is_ros1 else (_HEAD - self._at) % size)
+
     def word(self) -> int:
         """Return the next number of four bytes, after alignment."""
-        self.bytes(-self._at % 4)
+        self.align(4)
         (value,) = self._word.unpack(self.bytes(4))
         return int(value)
 
@@ -348,7 +418,7 @@ class _Reader:
         length = self.word()
         if length > _LONGEST_NAME + 1:
             raise UnreadableCloud(
-                f"A name in the PointCloud2 has {length} bytes; the limit is {_LONGEST_NAME}. "
+                f"A name in the message has {length} bytes; the limit is {_LONGEST_NAME}. "
                 "Serialise it again."
             )
         return bytes(self.bytes(length)).rstrip(b"\0").decode("utf-8", "replace")

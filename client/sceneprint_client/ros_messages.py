@@ -1,7 +1,7 @@
 """Contents of decoded ROS messages: depth, points, cameras and poses.
 
 Image  --depth_samples-->  (H, W);  CompressedImage  --compressed_depth-->  CompressedDepth
-PointCloud2  --cloud_points-->  (N, 3)
+PointCloud2  --cloud_points-->  (N, 3);  PointCloud2  --timed_points-->  (N, 3), seconds (N,)
 CameraInfo  --camera_intrinsics-->  Intrinsics
 Transform | Pose  --transform_row | pose_row-->  x y z, quaternion
 
@@ -310,6 +310,19 @@ def _numbers(info: Any, name: str, count: int) -> list[float] | None:
 
 #: NumPy types by the type number of sensor_msgs/PointField.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+#: Fields of a PointCloud2 with the time of a point. Whole numbers are nanoseconds, others seconds.
+#: They count from the stamp, but those of `timestamp` from the epoch of the stamp's clock.
+TIME_FIELDS = (
+    "offset_time",  # CustomMsg of Livox
+    "t",  # Ouster
+    "time",  # Velodyne
+    "timestamp",  # Hesai and RoboSense in seconds; PointCloud2 of Livox in nanoseconds
+)
+#: Longest time from the first to the last point of a scan, seconds; longer times are ignored.
+LONGEST_SCAN_S = 1.0
+#: Bits of the field `tag` of Livox from which a point is noise, as FAST-LIO reads them: a third or
+#: later return (Avia, Horizon), or low confidence (Mid-360).
+_NOISE = 0x20
 #: Greatest number of points of a message.
 MOST_POINTS = 20_000_000
 #: Number of points in one block of a conversion.
@@ -338,8 +351,45 @@ def cloud_points(message: Any) -> NDArray[np.float32]:
     return np.concatenate(found) if found else np.empty((0, 3), np.float32)
 
 
+def timed_points(message: Any) -> tuple[Floats, Floats | None]:
+    """Return the valid points (N, 3) of a message, metres, and their times after its stamp (N,).
+
+    The times, in seconds, are None if the points have none that belong to one scan. If they are of
+    another clock than the stamp, the first point is assigned to the stamp. The parameter and the
+    errors are those of `cloud_points`.
+    """
+    table = cloud_table(message)
+    points = np.concatenate([np.empty((0, 3)), *cloud_blocks(table)])
+    with np.errstate(all="ignore"):  # coordinates that overflow count as missing
+        is_valid = np.isfinite(points.astype(np.float32)).all(axis=1)
+    name = time_field(table)
+    if name is None or not is_valid.any():
+        return points[is_valid], None
+    times = table[name].reshape(-1)[is_valid].astype(np.float64)
+    unit = 1.0 if table.dtype[name].kind == "f" else 1e-9
+    if name == "timestamp":
+        stamp_ns = stamp_of(message.header)
+        by_unit = [times - stamp_ns * 1e-9, (times - stamp_ns) * 1e-9]
+        seconds = min(by_unit, key=lambda one: abs(float(one[0])))
+    else:
+        seconds = times * unit
+    if not np.ptp(seconds) <= LONGEST_SCAN_S:
+        return points[is_valid], None
+    if np.abs(seconds).max() > LONGEST_SCAN_S:
+        seconds = seconds - seconds.min()
+    return points[is_valid], seconds
+
+
+def time_field(table: NDArray[np.void]) -> str | None:
+    """Return the field of a `cloud_table` with the time of each point; None without one."""
+    return next((name for name in TIME_FIELDS if name in (table.dtype.names or ())), None)
+
+
 def cloud_table(message: Any) -> NDArray[np.void]:
-    """Return x, y and z of a PointCloud2 (rows, columns) as a view; see `cloud_points`."""
+    """Return the fields of a PointCloud2 that are read (rows, columns) as a view.
+
+    They are x, y, z, the time, and the tag of Livox; see `cloud_points`.
+    """
     width, height = int(message.width), int(message.height)
     step, row = int(message.point_step), int(message.row_step)
     data = memoryview(message.data).cast("B")
@@ -363,7 +413,7 @@ def cloud_table(message: Any) -> NDArray[np.void]:
 
 
 def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:
-    """Yield blocks of points (n, 3) in order, with NaN for points at the sensor's origin."""
+    """Yield blocks of points (n, 3) in order, with NaN for noise and the sensor's origin."""
     height, width = table.shape
     rows = max(1, _BLOCK // max(width, 1))
     for first in range(0, height, rows):
@@ -373,31 +423,37 @@ def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:
             for axis, name in enumerate("xyz"):
                 block[:, axis] = part[name].reshape(-1)
             block[~block.any(axis=1)] = np.nan
+            if "tag" in (table.dtype.names or ()):
+                block[(part["tag"].reshape(-1) & _NOISE) != 0] = np.nan
             yield block
 
 
 def _point_type(message: Any, step: int) -> np.dtype[Any]:
-    """Return the type of x, y and z in a point of `step` bytes."""
+    """Return the type of the fields that are read, in a point of `step` bytes."""
     order = ">" if message.is_bigendian else "<"
-    found = {}
+    found: dict[str, tuple[str, int]] = {}
     for field in message.fields:
         kind = _TYPES.get(int(field.datatype))
-        if field.name in ("x", "y", "z") and kind is not None and int(field.count) in (0, 1):
+        if kind is not None and int(field.count) in (0, 1):
             found[str(field.name)] = (order + kind, int(field.offset))
-    if len(found) != 3:
-        names = ", ".join(str(field.name) for field in message.fields[:20])
+    names = list("xyz")
+    if not found.keys() >= set(names):
+        listed = ", ".join(str(field.name) for field in message.fields[:20])
         raise UnreadableCloud(
-            f"The cloud has the fields {printable(names[:120]) or 'none'}, but x, y and z are "
+            f"The cloud has the fields {printable(listed[:120]) or 'none'}, but x, y and z are "
             "required. Specify the topic of the points."
         )
-    if any(offset + np.dtype(kind).itemsize > step for kind, offset in found.values()):
+    names += [name for name in TIME_FIELDS if name in found][:1]
+    if "line" in found and found.get("tag", ("", 0))[0].endswith("u1"):
+        names.append("tag")
+    if any(found[name][1] + np.dtype(found[name][0]).itemsize > step for name in names):
         raise UnreadableCloud(
             f"The fields of the cloud do not fit into its points of {step} bytes. Record it again."
         )
     layout: Any = {
-        "names": list(found),
-        "formats": [kind for kind, _ in found.values()],
-        "offsets": [offset for _, offset in found.values()],
+        "names": names,
+        "formats": [found[name][0] for name in names],
+        "offsets": [found[name][1] for name in names],
         "itemsize": step,
     }
     points: np.dtype[Any] = np.dtype(layout)

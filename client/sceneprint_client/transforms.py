@@ -177,6 +177,24 @@ class TransformTree:
                     del edge.stamps_ns[:old], edge.samples[: 7 * old]
                     self._count -= old
 
+    def excerpt(self, first_ns: int, last_ns: int) -> TransformTree:
+        """Return a tree for stamps from `first_ns` to `last_ns`, with the samples around them."""
+        part = TransformTree()
+        margin_ns = round((LONGEST_GAP_S + _BACK_S) * 1e9)
+        part._origin_ns = first_ns
+        for child, edges in self._edges.items():
+            for parent, edge in edges.items():
+                stamps = np.frombuffer(edge.stamps_ns, np.int64)
+                rows = np.frombuffer(edge.samples, np.float64).reshape(-1, 7)
+                near = (stamps >= first_ns - margin_ns) & (stamps <= last_ns + margin_ns)
+                is_fixed = self._is_fixed(parent, child)
+                part._edges.setdefault(child, {})[parent] = _Edge(
+                    is_fixed,
+                    array("q", [] if is_fixed else stamps[near]),
+                    array("d", rows[-1] if is_fixed else rows[near].ravel()),
+                )
+        return part
+
     def frames(self) -> list[str]:
         """Return the names of all frames."""
         parents = {one for edges in self._edges.values() for one in edges}

@@ -1,0 +1,159 @@
+"""Join the scans of the last metres of a drive to one cloud, corrected for motion.
+
+points (N, 3), seconds (N,)  --Joiner.add-->  Joiner.cloud: points (M, 3) in the newest scan's axes
+
+Scanners with a narrow view or few rings see too little of a place in one scan. The odometry relates
+the scans, and moves each point to the position of the sensor at the scan's stamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneprint_client.poses import Floats
+from sceneprint_client.transforms import FASTEST
+
+#: Length of the way whose scans are joined, metres.
+JOIN_M = 2.0
+#: Edge of the voxels in which a joined cloud has one point, metres.
+VOXEL_M = 0.1
+#: Greatest number of scans in a cloud: 5 s at 10 Hz, also of a robot that stands still.
+MOST_SCANS = 50
+#: Longest interval between two poses of a scan, seconds. Within it, each point moves along a line;
+#: at 180 degrees a second, the line is 0.1 mm from the arc at a distance of 100 m.
+_STEP_S = 0.002
+
+#: Function from stamps, nanoseconds, to poses T_odom_sensor (4, 4); None where a pose is unknown.
+Odometry = Callable[[Sequence[int]], Sequence[Floats | None]]
+
+
+@dataclass(frozen=True, eq=False)
+class _JoinedScan:
+    """Scan in the sensor's axes at its stamp."""
+
+    stamp_ns: int
+    points: NDArray[np.float32]
+    T_odom_sensor: Floats
+
+
+class Joiner:
+    """Scans of the last metres of a drive.
+
+    Each point is moved to the sensor's position at the stamp of its scan if its time is known. A
+    scan is left out if the odometry does not cover its duration, or implies more than 50 m/s
+    within it. If the odometry jumps between two scans, or the stamps go back, the joiner forgets
+    the earlier scans.
+
+    Parameters
+    ----------
+    odometry : function that returns interpolated poses of the sensor, such as
+        `partial(tree.poses, "odom", "lidar")` of a TransformTree
+    metres : length of the way whose scans are joined, at most `MOST_SCANS`
+    voxel_m : edge of the voxels; the newest point in each remains
+    """
+
+    def __init__(
+        self, odometry: Odometry, metres: float = JOIN_M, *, voxel_m: float = VOXEL_M
+    ) -> None:
+        #: Numbers of scans: all, without sufficient odometry, without times of the points (joined
+        #: as if all points were measured at the stamp), and after which earlier ones are forgotten.
+        self.counts = {"scans": 0, "without_odometry": 0, "untimed": 0, "restarts": 0}
+        self._odometry, self._metres, self._voxel_m = odometry, metres, voxel_m
+        self._scans: list[_JoinedScan] = []
+
+    def __len__(self) -> int:
+        """Return the number of scans in the cloud."""
+        return len(self._scans)
+
+    def add(self, stamp_ns: int, points: Floats, seconds: Floats | None = None) -> bool:
+        """Add the next scan; return False if it is left out.
+
+        Parameters
+        ----------
+        stamp_ns : stamp of the scan, nanoseconds
+        points : (N, 3) in the sensor's axes at the time of each point, metres
+        seconds : (N,) time of each point after the stamp; None if unknown
+        """
+        self.counts["scans"] += 1
+        self.counts["untimed"] += seconds is None
+        times = np.zeros(1)
+        if seconds is not None and len(seconds):
+            first, last = min(0.0, float(seconds.min())), max(0.0, float(seconds.max()))
+            # multiples of the step include the stamp itself
+            times = _STEP_S * np.arange(np.floor(first / _STEP_S), np.ceil(last / _STEP_S) + 1)
+            times = np.unique(np.clip(times, first, last))
+        poses = self._odometry([stamp_ns + round(1e9 * one) for one in times])
+        known = [pose for pose in poses if pose is not None]
+        if len(known) < len(times) or _is_jump(np.array(known)[:, :3, 3], times):
+            self.counts["without_odometry"] += 1
+            return False
+        T_odom_sensor = known[int(np.argmin(np.abs(times)))]
+        if len(times) > 1 and seconds is not None:
+            back = np.linalg.inv(T_odom_sensor).astype(np.float64) @ np.array(known)
+            points = _moved_points(points, seconds, times, back)
+        last_scan = self._scans[-1] if self._scans else None
+        if last_scan is not None and (
+            stamp_ns <= last_scan.stamp_ns
+            or _is_jump(
+                np.array([last_scan.T_odom_sensor[:3, 3], T_odom_sensor[:3, 3]]),
+                np.array([last_scan.stamp_ns, stamp_ns]) * 1e-9,
+            )
+        ):
+            self.counts["restarts"] += 1
+            self._scans.clear()
+        thinned = _first_in_voxels(points.astype(np.float32), self._voxel_m)
+        self._scans.append(_JoinedScan(stamp_ns, thinned, T_odom_sensor))
+        positions = np.array([one.T_odom_sensor[:3, 3] for one in self._scans])
+        del self._scans[: window_start(positions, self._metres)]
+        return True
+
+    def cloud(self) -> NDArray[np.float32]:
+        """Return the joined points (M, 3) in the sensor's axes at the stamp of the newest scan."""
+        parts = [np.empty((0, 3))]
+        for scan in reversed(self._scans):
+            T = np.linalg.inv(self._scans[-1].T_odom_sensor) @ scan.T_odom_sensor
+            parts.append(scan.points @ T[:3, :3].T + T[:3, 3])
+        return _first_in_voxels(np.concatenate(parts).astype(np.float32), self._voxel_m)
+
+
+def window_start(positions: Floats, metres: float) -> int:
+    """Return the index of the first of N scans that are joined with the last one.
+
+    Parameters
+    ----------
+    positions : (N, 3) positions of the sensor in order of time
+    metres : longest way from the first to the last position
+    """
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    way_to_last = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
+    return max(int(np.argmax(way_to_last <= metres)), len(positions) - MOST_SCANS)
+
+
+def _is_jump(positions: Floats, seconds: Floats) -> bool:
+    """Return whether consecutive positions (N, 3) imply an impossible speed."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return bool((steps > FASTEST * np.diff(seconds)).any())
+
+
+def _moved_points(points: Floats, seconds: Floats, times: Floats, poses: Floats) -> Floats:
+    """Return points (N, 3) moved by the pose at the time of each, between poses (K, 4, 4)."""
+    before = np.clip(np.searchsorted(times, seconds, "right") - 1, 0, len(times) - 2)
+    share = ((seconds - times[before]) / (times[before + 1] - times[before]))[:, None]
+    ends = [
+        np.einsum("nij,nj->ni", poses[k, :3, :3], points) + poses[k, :3, 3]
+        for k in (before, before + 1)
+    ]
+    moved: Floats = ends[0] + share * (ends[1] - ends[0])
+    return moved
+
+
+def _first_in_voxels(points: NDArray[np.float32], edge: float) -> NDArray[np.float32]:
+    """Return the first point of each voxel, in order."""
+    cells = np.floor(points / edge).astype(np.int64) & 0x1FFFFF
+    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+    _, first = np.unique(keys, return_index=True)
+    return points[np.sort(first)]
