@@ -49,6 +49,9 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
          "or minimum rotation between frames (default: 15)"),
         ("--keyframe-s", _DEFAULT.keyframe_s, "SECONDS",
          "minimum time between frames without poses (default: 0.5)"),
+        ("--join-m", _DEFAULT.join_m, "METRES",
+         "join the scans of this way by odometry, corrected for motion, such as 2 for a Livox "
+         "(default: 0, each scan alone)"),
     ):  # fmt: skip
         group.add_argument(option, type=_from_zero, default=default, metavar=metavar, help=text)
 
@@ -62,7 +65,7 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
     """Yield the options for recordings, and show a progress bar while a recording is read."""
     names = (
         "topic", "camera_info", "pose_frame", "keyframe_m", "keyframe_deg", "keyframe_s",
-        "sensor_frame", "depth_scale",
+        "join_m", "sensor_frame", "depth_scale",
     )  # fmt: skip
     with progress_bar("read recording", "message", delay=0.5, leave=False) as progress:
         fields = {name: getattr(options, name) for name in names}

@@ -19,8 +19,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sceneprint.errors import DatasetError, MissingDependency, SceneprintError
+from sceneprint.errors import DatasetError, MissingDependency, SceneprintError, UnreadableCloud
 from sceneprint_client.errors import printable
+from sceneprint_client.files import read_livox_scan
 from sceneprint_client.formats import format_named
 
 if TYPE_CHECKING:
@@ -39,6 +40,9 @@ MAXIMUM_MESSAGE_BYTES = 256 << 20
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 POINTS = "sensor_msgs/msg/PointCloud2"
+#: Own messages of the drivers of Livox, and all messages with points.
+LIVOX = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+CLOUDS = (POINTS, *LIVOX)
 CAMERA = "sensor_msgs/msg/CameraInfo"
 IMU = "sensor_msgs/msg/Imu"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -47,7 +51,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 OLD_TRANSFORMS = "tf/msg/tfMessage"
 _TRANSFORMS_FIELDS = "geometry_msgs/TransformStamped[] transforms"
 #: Types of messages that `Bag.decode` supports.
-TYPES = (IMAGE, COMPRESSED, POINTS, CAMERA, IMU, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+TYPES = (IMAGE, COMPRESSED, *CLOUDS, CAMERA, IMU, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 
 
 def is_recording(path: Path) -> bool:
@@ -196,6 +200,11 @@ class Bag:
         ------
         DatasetError : If the bytes are not a message of this type.
         """
+        if kind in LIVOX:
+            try:
+                return read_livox_scan(message.data, ros1=self.is_ros1)
+            except UnreadableCloud as cause:
+                raise DatasetError(f"{self.path}, {message.topic}: {cause}") from cause
         type_name = TRANSFORMS if kind == OLD_TRANSFORMS else kind
         with _dataset_errors(self.path, f"a message of {message.topic} does not decode"):
             if self.is_ros1:

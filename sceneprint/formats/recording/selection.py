@@ -18,6 +18,7 @@ from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset.frame_reference import FrameReference, FrameSequence, Layout
 from sceneprint.formats.recording.bag import CAMERA, Bag, BagTopic
 from sceneprint.formats.recording.scan import BagPart, BagScan, Progress, scan_bag
+from sceneprint.formats.recording.scan_window import ScanWindow, scan_seconds, scan_windows
 from sceneprint.formats.recording.topics import (
     BagSource,
     FrameTopic,
@@ -94,6 +95,7 @@ class RecordingOptions:
     keyframe_m, keyframe_deg : minimum distance or angle from the previous keyframe; 0 selects every
         frame
     keyframe_s : minimum time after the previous keyframe, if there are no poses
+    join_m : length of the way whose scans are joined to one frame, metres; 0 takes each scan alone
     sensor_frame : frame of the sensor, if points are in another frame
     depth_scale : stored units per metre of 16-bit depth; default: that of an intrinsics.json, or
         1000
@@ -106,6 +108,7 @@ class RecordingOptions:
     keyframe_m: float = 0.3
     keyframe_deg: float = 15.0
     keyframe_s: float = 0.5
+    join_m: float = 0.0
     sensor_frame: str | None = None
     depth_scale: float | None = None
     progress: Progress | None = None
@@ -151,14 +154,25 @@ def sequences_of(
             f"{bag.path}: {frames.topic.name} has {frames.encoding or 'points'} in metres, so a "
             "depth scale does not apply. Omit --depth-scale."
         )
+    if options.join_m and frames.encoding is not None:
+        raise DatasetError(
+            f"{bag.path}: {frames.topic.name} has depth images, and only scans are joined. Omit "
+            "--join-m."
+        )
     info = None if frames.encoding is None else camera_topic(bag, frames, options.camera_info)
     scan = scan_bag(bag, frames.topic, info, options.progress)
     cameras = (
         {} if frames.encoding is None else _cameras(bag, frames, info, scan, options.depth_scale)
     )
     sensor = _sensor(bag, scan, frames, options)
-    motions = _motions(bag, scan, frames, sensor, options)
+    seconds = scan_seconds(bag, frames.topic) if options.join_m and sensor == frames.frame else None
+    motions = _motions(bag, scan, frames, sensor, options, seconds or 0.0)
     note = _note(frames, scan, motions)
+    counts = [one.scans for motion in motions for one in motion.windows.values()]
+    if counts:
+        note += f"; each frame joins the scans of {options.join_m:g} m ({np.median(counts):g} "
+        note += "of them in the median), "
+        note += "without correction for motion" if seconds is None else "corrected for motion"
     if sensor != frames.frame:
         note += f"; points are transformed from {frames.frame} to their sensor, {sensor}"
     lenses = {camera.intrinsics for camera in cameras.values()}
@@ -254,6 +268,7 @@ class _Motion:
     cloud_poses : T_cloud_sensor of frames whose points are not in the axes of the sensor
     keyframes : indices of the keyframes
     unknown : reasons why frames have no pose
+    windows : scans that are joined to the keyframes
     remarks : remarks for users on the transforms above the sensor
     is_broken : whether one of these transforms is ignored
     """
@@ -266,6 +281,7 @@ class _Motion:
     cloud_poses: dict[int, Floats] = field(default_factory=dict)
     keyframes: list[int] = field(default_factory=list)
     unknown: dict[int, UnknownTransform] = field(default_factory=dict)
+    windows: dict[int, ScanWindow] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     is_broken: bool = False
 
@@ -276,9 +292,10 @@ class _Motion:
 
 
 def _motions(
-    bag: Bag, scan: BagScan, frames: FrameTopic, sensor: str, options: RecordingOptions
-) -> list[_Motion]:
-    """Return the motion in each part with frames."""
+    bag: Bag, scan: BagScan, frames: FrameTopic, sensor: str, options: RecordingOptions,
+    scan_s: float,
+) -> list[_Motion]:  # fmt: skip
+    """Return the motion in each part with frames; `scan_s` is the duration of a scan."""
     parts = [
         (part, range(part.first, end))
         for part, end in zip(scan.parts, scan.ends, strict=True)
@@ -292,19 +309,32 @@ def _motions(
             f"{bag.path}: There are no transforms from {sensor or 'the sensor'} to "
             f"{world!r:.100}. Frames above it are {', '.join(above) or 'none'}."
         )
-    motions = [_motion(part, places, scan, (sensor, frames.frame), world) for part, places in parts]
+    motions = [
+        _motion(part, places, scan, (sensor, frames.frame), world, scan_s) for part, places in parts
+    ]
     with_poses = any(motion.poses for motion in motions)
+    if options.join_m and not with_poses:
+        raise DatasetError(
+            f"{bag.path}: {_note(frames, scan, motions)}. Scans are joined by odometry: omit "
+            "--join-m, or record /tf or odometry."
+        )
     is_elsewhere = sensor != frames.frame
     if not with_poses and (is_elsewhere or any(motion.is_disputed for motion in motions)):
         return motions  # the caller reports the contradictory transforms
     for (part, places), motion in zip(parts, motions, strict=True):
         _choose(motion, part, places, scan, sensor, options, with_poses=with_poses)
+        if options.join_m:
+            names = motion.world or "", sensor, frames.frame
+            motion.windows = scan_windows(
+                scan, part.tree, motion.poses, motion.keyframes, names, options.join_m
+            )
     return motions
 
 
 def _motion(
-    part: BagPart, places: range, scan: BagScan, names: tuple[str, str], pose_frame: str | None
-) -> _Motion:
+    part: BagPart, places: range, scan: BagScan, names: tuple[str, str], pose_frame: str | None,
+    scan_s: float,
+) -> _Motion:  # fmt: skip
     """Return the poses and mountings of a sensor in one part, without keyframes."""
     tree, (sensor, frame) = part.tree, names
     stamps = [scan.stamps_ns[place] for place in places]
@@ -322,9 +352,15 @@ def _motion(
                 f"{parent} -> {child} is normalised: its quaternion has the length {length:.3g}"
             )
     if world is not None:
-        for place, pose in zip(places, tree.lookup(world, sensor, stamps), strict=True):
+        poses = tree.lookup(world, sensor, stamps)
+        ends = poses
+        if scan_s:
+            ends = tree.lookup(world, sensor, [stamp + round(scan_s * 1e9) for stamp in stamps])
+        for place, pose, end in zip(places, poses, ends, strict=True):
             if isinstance(pose, UnknownTransform):
                 motion.unknown[place] = pose
+            elif isinstance(end, UnknownTransform):
+                motion.unknown[place] = end
             else:
                 motion.poses[place] = pose
     if sensor != frame:
@@ -401,7 +437,13 @@ def _reference(
         scan.stamps_ns[place] * 1e-9,
         motion.poses.get(place),
         CloudSource(up=direction) if camera is None else None,
-        source=BagSource(bag, frames.topic, *scan.places[place], motion.cloud_poses.get(place)),
+        source=BagSource(
+            bag,
+            frames.topic,
+            *scan.places[place],
+            motion.cloud_poses.get(place),
+            motion.windows.get(place),
+        ),
         base=base,
         original=f"{frames.topic.name}/{_seconds(scan.stamps_ns[place])}",
         sequence=place,

@@ -2,7 +2,7 @@
 
 Bag  --choose_topic-->  FrameTopic  --camera_topic-->  topic of its camera
 Image | CompressedImage  --depth_file-->  bytes of a PNG or NPY file
-PointCloud2  --cloud_file-->  bytes of an NPY file (N, 3)
+PointCloud2 | CustomMsg  --cloud_file-->  bytes of an NPY file (N, 3)
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from sceneprint.formats.dataset.frame_names import OMITTED_IMAGES, is_beside_dep
 from sceneprint.formats.depth_file import decode_png, encode_npy, encode_png
 from sceneprint.formats.recording.bag import (
     CAMERA,
+    CLOUDS,
     COMPRESSED,
     IMAGE,
-    POINTS,
     Bag,
     BagTopic,
     shared_bag,
 )
+from sceneprint.formats.recording.scan_window import ScanWindow
 from sceneprint.types import Floats
 from sceneprint_client.errors import printable
 from sceneprint_client.files import naming
@@ -133,6 +134,7 @@ class BagSource:
     topic : topic of the message
     log_ns, occurrence : time of recording, and index among the messages with the same time
     T_cloud_sensor : (4, 4) transform with which points are converted to the sensor's axes, or None
+    window : scans that are joined to the frame, or None
     """
 
     bag: Bag
@@ -140,6 +142,7 @@ class BagSource:
     log_ns: int
     occurrence: int
     T_cloud_sensor: Floats | None = None
+    window: ScanWindow | None = None
 
     def read_bytes(self) -> bytes:
         """Return the message as the bytes of a PNG or NPY file.
@@ -149,8 +152,11 @@ class BagSource:
         UnreadableFrame, UnreadableCloud : If the message has no depth, or is damaged.
         DatasetError : If the bag is damaged.
         """
+        if self.window is not None:
+            with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
+                return encode_npy(self.window.cloud(self.bag, self.topic, self.log_ns))
         message = self.bag.at(self.topic.name, self.log_ns, self.occurrence)
-        is_cloud = self.topic.type == POINTS
+        is_cloud = self.topic.type in CLOUDS
         with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
             try:
                 fields = self.bag.decode(message, self.topic.type)
@@ -162,7 +168,7 @@ class BagSource:
             return depth_file(fields, compressed=self.topic.type == COMPRESSED)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        place = self.log_ns, self.occurrence, self.T_cloud_sensor
+        place = self.log_ns, self.occurrence, self.T_cloud_sensor, self.window
         return _source_in, (self.bag.path, self.topic, *place)
 
 
@@ -180,7 +186,7 @@ def frame_topics(bag: Bag) -> list[FrameTopic]:
     If an image topic exists both raw and compressed, the raw one is returned.
     """
     topics = []
-    for topic in bag.of_type(IMAGE, COMPRESSED, POINTS):
+    for topic in bag.of_type(IMAGE, COMPRESSED, *CLOUDS):
         one = _frame_topic(bag, topic)
         if one is not None:
             topics.append(one)
@@ -202,7 +208,7 @@ def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
     if fields is None:
         return None
     encoding = None
-    if topic.type != POINTS:
+    if topic.type not in CLOUDS:
         encoding = image_encoding(fields, compressed=topic.type == COMPRESSED)
         if encoding is None:
             return None
@@ -230,7 +236,7 @@ def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
                 f"{listed(one.topic for one in candidates)}; `sceneprint bag` lists all topics."
             )
         frames = next((one for one in candidates if one.topic.name == name), None)
-        if frames is None and named[0].type in (IMAGE, COMPRESSED, POINTS):
+        if frames is None and named[0].type in (IMAGE, COMPRESSED, *CLOUDS):
             frames = _frame_topic(bag, named[0])
         if frames is None:
             raise DatasetError(
@@ -243,8 +249,8 @@ def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
     if not candidates:
         raise DatasetError(
             f"{bag.path}: There is no topic of depth images ({_SUPPORTED}; not {OMITTED_IMAGES}) "
-            f"or of points (PointCloud2). Images are {_encodings(bag)}. `sceneprint bag` lists all "
-            "topics; --topic selects one."
+            f"or of points (PointCloud2, CustomMsg). Images are {_encodings(bag)}. `sceneprint "
+            "bag` lists all topics; --topic selects one."
         )
     if len(candidates) > 1:
         raise DatasetError(

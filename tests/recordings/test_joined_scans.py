@@ -1,0 +1,203 @@
+"""Tests of scans of a recording that are joined by odometry, from messages to poses."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sceneprint.errors import DatasetError, UnreadableCloud
+from sceneprint.formats.dataset import FrameSequence, find_sequences
+from sceneprint.formats.recording import RecordingOptions
+from sceneprint.types import Floats
+from sceneprint_client import Client, Tracker
+from sceneprint_client.frame_files import meta_of
+from sceneprint_lab.synth.dataset import premises_and_rng
+from sceneprint_lab.synth.sensors import Rosette, scan
+from sceneprint_lab.synth.trajectories import walk
+
+JOINED = RecordingOptions(join_m=2.05, keyframe_m=0.5)
+#: Interval of scans, of which each takes the whole interval, and of odometry, seconds.
+SCAN_S, ODOMETRY_S = 0.1, 0.01
+
+
+def pose(t: float, phase: float = 0.0, side: float = 0.0) -> Floats:
+    """A drive along x at 1 m/s that turns to both sides by up to 34 degrees a second."""
+    yaw = 0.4 * np.sin(1.5 * t + phase)
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T[:3, 3] = t, side, 0
+    return T
+
+
+def skewed(points: Floats, t: float, seconds: Floats, **drive: float) -> Floats:
+    """Return points (N, 3) of the world as a moving sensor measures them, each at its time."""
+    measured = np.empty_like(points)
+    for i, moment in enumerate(t + seconds):
+        T = np.linalg.inv(pose(moment, **drive))
+        measured[i] = T[:3, :3] @ points[i] + T[:3, 3]
+    return measured
+
+
+def write_odometry(writer: Any, count: int, **drive: float) -> None:
+    writer.transforms(0.0, {("base_link", "livox_frame"): np.eye(4)}, "/tf_static")
+    for k in range(10 * count + 11):
+        t = ODOMETRY_S * k
+        writer.transforms(t, {("odom", "base_link"): pose(t, **drive)})
+
+
+def wall(number: int) -> Floats:
+    """Twenty points of the world that scan `number` sees, each in a voxel of its own."""
+    return np.array([[12.05, 0.5 * i - 5 + 0.05, 0.1 * number + 0.05] for i in range(20)])
+
+
+def write_walls(writer: Any, kind: str) -> None:
+    seconds = np.linspace(0.0, 0.0999, 20)
+    write_odometry(writer, 30)
+    for number in range(30):
+        t = SCAN_S * number
+        points = skewed(wall(number), t, seconds)
+        if kind == "livox_ros_driver" or kind == "livox_ros_driver2":
+            writer.livox(t, points, seconds, package=kind)
+            continue
+        names = ["x", "y", "z", *([] if kind == "untimed" else [kind])]
+        rows = np.zeros(20, [(name, "<u4" if name == "t" else "<f4") for name in names])
+        for axis, name in enumerate("xyz"):
+            rows[name] = points[:, axis]
+        if kind != "untimed":
+            rows[kind] = np.round(seconds * (1e9 if kind == "t" else 1), 9)
+        writer.points(t, rows, "/livox/lidar", frame="livox_frame")
+
+
+def check_walls(sequence: FrameSequence, tolerance: float) -> None:
+    """Each frame has the walls of its scans, in the axes of the newest."""
+    for one in sequence.frames:
+        assert one.sequence is not None
+        scans = range(one.sequence, max(one.sequence - 21, -1), -1)
+        world = np.concatenate([wall(number) for number in scans])
+        T = np.linalg.inv(one.pose)
+        found = one.read().points
+        assert len(found) == len(world)
+        assert np.abs(found - (world @ T[:3, :3].T + T[:3, 3])).max() < tolerance
+
+
+@pytest.mark.parametrize(
+    ("kind", "container"),
+    [
+        ("livox_ros_driver", "ros1"),
+        ("livox_ros_driver2", "mcap"),
+        ("livox_ros_driver2", "sqlite3"),
+        ("t", "mcap"),
+        ("time", "ros1"),
+    ],
+)
+def test_scans_are_joined_without_their_motion(
+    kind: str, container: str, tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    path = ros.write(tmp_path, lambda writer: write_walls(writer, kind), container)
+    (sequence,) = find_sequences(path, JOINED)
+    median = np.median([min(one.sequence + 1, 21) for one in sequence.frames])
+    assert sequence.note == (
+        f"{len(sequence.frames)} of 30 frames of /livox/lidar taken, poses of 30 of 30 frames in "
+        f"odom; skipped: {30 - len(sequence.frames)} between keyframes; each frame joins the scans "
+        f"of 2.05 m ({median:g} of them in the median), corrected for motion"
+    )
+    check_walls(sequence, 1e-3)
+    travelled = pickle.loads(pickle.dumps(sequence.frames[-1]))
+    assert travelled.read_bytes() == sequence.frames[-1].read_bytes()
+
+
+def test_untimed_scans_keep_their_motion(tmp_path: Path, ros: SimpleNamespace) -> None:
+    path = ros.write(tmp_path, lambda writer: write_walls(writer, "untimed"))
+    (sequence,) = find_sequences(path, JOINED)
+    assert sequence.note.endswith(", without correction for motion")
+    with pytest.raises(AssertionError):
+        check_walls(sequence, 0.05)  # 3.4 degrees in a scan move points at 12 m by 0.7 m
+    check_walls(sequence, 1.0)
+
+
+def test_single_scans_of_a_livox_are_read_as_they_are(tmp_path: Path, ros: SimpleNamespace) -> None:
+    path = ros.write(tmp_path, lambda writer: write_walls(writer, "livox_ros_driver2"))
+    (sequence,) = find_sequences(path, RecordingOptions(keyframe_m=0))
+    assert len(sequence.frames) == 30
+    measured = skewed(wall(7), 0.7, np.linspace(0.0, 0.0999, 20))
+    np.testing.assert_allclose(sequence.frames[7].read().points, measured, atol=1e-6)
+
+
+def test_what_cannot_be_joined_is_refused(tmp_path: Path, ros: SimpleNamespace) -> None:
+    def alone(writer: Any) -> None:
+        writer.livox(0.0, wall(0), np.zeros(20))
+
+    with pytest.raises(DatasetError, match="Scans are joined by odometry: omit --join-m"):
+        find_sequences(ros.write(tmp_path / "alone", alone), JOINED)
+
+    def images(writer: Any) -> None:
+        writer.camera_info(0.0)
+        writer.image(0.0, np.full((60, 80), 2000))
+
+    with pytest.raises(DatasetError, match="has depth images, and only scans are joined"):
+        find_sequences(ros.write(tmp_path / "images", images), JOINED)
+
+
+def test_a_damaged_scan_is_left_out(tmp_path: Path, ros: SimpleNamespace) -> None:
+    def fill(writer: Any) -> None:
+        write_odometry(writer, 3)
+        name = "livox_ros_driver2/msg/CustomMsg"
+        for number in range(3):
+            writer.livox(SCAN_S * number, wall(number), np.zeros(20))
+            if number == 1:  # recorded again without its end, and with the same stamp
+                data = writer.serialized(name, writer.livox_message(0.15, wall(1), np.zeros(20)))
+                writer.raw("/livox/lidar", name, 0.15, data[:-40])
+
+    path = ros.write(tmp_path, fill)
+    (sequence,) = find_sequences(path, RecordingOptions(join_m=2.0, keyframe_m=0))
+    assert [len(one.read().points) for one in (*sequence.frames[:2], sequence.frames[3])] == [
+        20, 40, 60
+    ]  # fmt: skip
+    with pytest.raises(UnreadableCloud, match="The scan is damaged, or its odometry has a gap"):
+        sequence.frames[2].read()
+
+
+def write_drive(writer: Any, count: int, seed: int, **drive: float) -> None:
+    """Write scans of a Livox in a hall, and odometry whose origin is that of the hall."""
+    premises, rng = premises_and_rng(4200, 0, "hall")
+    start = walk(premises, 1, rng)[0]
+    own = np.random.default_rng(seed)
+    write_odometry(writer, count, **drive)
+    for number in range(count):
+        t = SCAN_S * number
+        T = pose(t, **drive)
+        points = scan(premises.caster, start @ T, Rosette(firings=4000), own).astype(np.float64)
+        seconds = np.linspace(0.0, 0.0999, len(points))
+        writer.livox(t, skewed(points @ T[:3, :3].T + T[:3, 3], t, seconds, **drive), seconds)
+
+
+def test_from_a_bag_with_scans_of_a_livox_to_poses(tmp_path: Path, ros: SimpleNamespace) -> None:
+    """One drive is mapped; on the next one, 40 cm beside it, each answer and the tracker agree."""
+    mapped = ros.write(tmp_path, lambda writer: write_drive(writer, 30, 1), "ros1", "mapped")
+    later = ros.write(
+        tmp_path, lambda writer: write_drive(writer, 16, 2, phase=1.0, side=0.4), "mcap", "later"
+    )
+    (sequence,) = find_sequences(mapped, RecordingOptions(join_m=2.0, keyframe_m=0.5))
+    queries = find_sequences(later, RecordingOptions(join_m=2.0, keyframe_m=0.5))[0].frames
+    with Client.embedded(tmp_path / "data") as client:
+        client.create_map("hall", model="lidar")
+        added = [
+            client.upload("hall", one, meta_of(one, session="s", parent_frame="hall"))
+            for one in sequence.frames
+        ]
+        client.wait([one.job_id for one in added])
+        tracker = Tracker(client, "hall")
+        states = [tracker.update(one, one.pose, stamp=one.timestamp) for one in queries]
+        answer = client.localize("hall", queries[-1], meta_of(queries[-1], with_pose=False))
+    assert answer.status == "found"
+    assert answer.pose is not None
+    truth = pose(SCAN_S * (queries[-1].sequence or 0), phase=1.0, side=0.4)
+    assert np.linalg.norm(np.array(answer.pose.matrix)[:3, 3] - truth[:3, 3]) < 0.15
+    assert states[-1].status == "tracking"
+    assert states[-1].T_map_odom is not None
+    np.testing.assert_allclose(states[-1].T_map_odom[:3, 3], 0, atol=0.15)
