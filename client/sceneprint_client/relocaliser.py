@@ -1,6 +1,7 @@
 """Localization of a robot from ROS messages: the logic of the ROS 2 node, without ROS.
 
 Image | CompressedImage | PointCloud2  --Relocaliser.take_frame-->  queries to a service
+CustomMsg, serialised  --Relocaliser.take_livox_scan-->  queries to a service
 CameraInfo, TFMessage, Odometry, Imu  --Relocaliser.take_...-->  camera, poses, up
 stamp  --Relocaliser.report-->  Report  --write_pose | write_transform-->  messages
 
@@ -13,12 +14,15 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sceneprint_client.api.base import CameraIntrinsics
 from sceneprint_client.errors import SceneprintError
+from sceneprint_client.files import read_livox_scan
+from sceneprint_client.joiner import Joiner
 from sceneprint_client.poses import (
     WINDOW_S,
     Accelerations,
@@ -33,12 +37,13 @@ from sceneprint_client.ros_messages import (
     is_calibrated,
     pose_row,
     stamp_of,
+    timed_points,
     transform_row,
     vector_row,
 )
 from sceneprint_client.tracker import AsyncTracker, State, Tracker
 from sceneprint_client.tracker_core import inverse, shifted_covariance
-from sceneprint_client.transforms import TransformTree, frame_name
+from sceneprint_client.transforms import TOLERANCE_S, TransformTree, frame_name
 
 if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput
@@ -67,6 +72,7 @@ class RelocaliserParameters:
         first fix. A fix in another parent frame is not reported, since no transform relates them
     rectified : whether depth images are rectified, so that their camera is P of the camera info
     interval_s : shortest time between two queried frames, seconds
+    join_m : length of the way whose scans are joined to one frame, metres; 0: each scan alone
     wait_s : longest wait of a frame for its transforms, by the stamps of later frames, seconds
     stale_s : age of the last frame from which no pose is reported, seconds
     planar : whether the robot drives on the plane z = 0 of the map; `T_map_odom` then keeps only
@@ -78,6 +84,7 @@ class RelocaliserParameters:
     parent_frame: str = ""
     rectified: bool = False
     interval_s: float = 0.5
+    join_m: float = 0.0
     wait_s: float = 0.5
     stale_s: float = 2.0
     planar: bool = False
@@ -138,6 +145,23 @@ class _Place:
     T_odom_base: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class _Arrival:
+    """Message that waits for its transforms, with the points of a scan that is to be joined."""
+
+    stamp_ns: int
+    message: Any
+    scan: tuple[Floats, Floats | None] | None
+
+    @property
+    def covered_ns(self) -> int:
+        """Time whose pose is known once odometry after the last point has arrived."""
+        if self.scan is None or self.scan[1] is None:
+            return self.stamp_ns
+        last_s = max(float(self.scan[1].max()), 0.0)
+        return self.stamp_ns + round(1e9 * (last_s + TOLERANCE_S))
+
+
 class Relocaliser:
     """Consumer of ROS messages that queries a service in its own thread.
 
@@ -157,7 +181,8 @@ class Relocaliser:
         self._edges_of_tf: set[tuple[str, str]] = set()
         self._imu: tuple[str, Accelerations] | None = None
         self._info: Any = None
-        self._waiting: deque[tuple[int, Any]] = deque()
+        self._waiting: deque[_Arrival] = deque()
+        self._joiner: tuple[str, Joiner] | None = None  #: frame of the sensor, and its scans
         self._newest_ns = self._unswept = 0
         self._last: _Place | None = None
         self._queried_ns: int | None = None
@@ -209,17 +234,34 @@ class Relocaliser:
         """
         stamp = stamp_of(message.header)
         self.counts["frames"] += 1
-        if stamp <= 0:
+        scan = None
+        try:
+            if stamp <= 0:
+                raise SceneprintError("A frame has no stamp. Check the clock of its driver.")
+            if self.parameters.join_m > 0 and hasattr(message, "point_step"):
+                scan = timed_points(message)
+        except SceneprintError as error:
             self.counts["unreadable"] += 1
-            self._note(SceneprintError("A frame has no stamp. Check the clock of its driver."))
+            self._note(error)
             return
         if self._newest_ns - stamp > _JUMP_S * 1e9:
             self._restart("the clock jumped back")
         self._newest_ns = max(self._newest_ns, stamp)
-        self._waiting.append((stamp, message))
+        self._waiting.append(_Arrival(stamp, message, scan))
         if len(self._waiting) > _MOST_WAITING:
             self._waiting.popleft()
             self.counts["without_transform"] += 1
+
+    def take_livox_scan(self, data: bytes) -> None:
+        """Take a CustomMsg of livox_ros_driver2 as ROS 2 serialised it."""
+        try:
+            message = read_livox_scan(data)
+        except SceneprintError as error:
+            self.counts["frames"] += 1
+            self.counts["unreadable"] += 1
+            self._note(error)
+        else:
+            self.take_frame(message)
 
     def relocalise(self, reason: str = "relocalisation was requested") -> None:
         """Forget the pose; the next frame is queried immediately, without a prior."""
@@ -230,15 +272,19 @@ class Relocaliser:
         """Process frames whose transforms have arrived, and return their number."""
         done = 0
         while self._waiting:
-            stamp, message = self._waiting[0]
-            place = self._place(stamp, frame_name(message.header.frame_id))
-            if place is None and self._newest_ns - stamp <= self.parameters.wait_s * 1e9:
+            arrival = self._waiting[0]
+            sensor = frame_name(arrival.message.header.frame_id)
+            place = end = self._place(arrival.stamp_ns, sensor)
+            if arrival.covered_ns > arrival.stamp_ns:
+                end = self._place(arrival.covered_ns, sensor)
+            is_recent = self._newest_ns - arrival.stamp_ns <= self.parameters.wait_s * 1e9
+            if (place is None or end is None) and is_recent:
                 break
             self._waiting.popleft()
             if place is None:
                 self.counts["without_transform"] += 1
-            elif stamp > self._last_ns:
-                self._process_frame(place, message)
+            elif arrival.stamp_ns > self._last_ns:
+                self._process_frame(place, arrival)
                 done += 1
         return done
 
@@ -272,7 +318,7 @@ class Relocaliser:
     def _restart(self, reason: str) -> None:
         """Start again with another clock; fixed transforms remain."""
         self._tree.forget_moving()
-        self._imu, self._last = None, None
+        self._imu, self._last, self._joiner = None, None, None
         self._waiting.clear()
         self._newest_ns = 0
         self.relocalise(reason)
@@ -287,10 +333,14 @@ class Relocaliser:
             return None
         return _Place(stamp_ns, T_odom_sensor, T_odom_base)
 
-    def _process_frame(self, place: _Place, message: Any) -> None:
+    def _process_frame(self, place: _Place, arrival: _Arrival) -> None:
         """Move the tracker to a frame, and query the frame if the interval has passed."""
-        self._last = place
+        self._last, message = place, arrival.message
         stamp = place.stamp_ns * 1e-9
+        if not self._join(arrival):
+            self.counts["without_transform"] += 1
+            self._tracker.move(place.T_odom_sensor, stamp)
+            return
         previous = self._queried_ns
         if previous is not None and place.stamp_ns - previous < self.parameters.interval_s * 1e9:
             self._tracker.move(place.T_odom_sensor, stamp)
@@ -311,8 +361,20 @@ class Relocaliser:
             self._queried_ns = place.stamp_ns
             self.counts["asked"] += 1
 
+    def _join(self, arrival: _Arrival) -> bool:
+        """Join a scan to the earlier ones; return False if the odometry does not cover it."""
+        if arrival.scan is None:
+            return True
+        sensor = frame_name(arrival.message.header.frame_id)
+        if self._joiner is None or self._joiner[0] != sensor:
+            odometry = partial(self._tree.poses, self.parameters.odom_frame, sensor)
+            self._joiner = sensor, Joiner(odometry, self.parameters.join_m)
+        return self._joiner[1].add(arrival.stamp_ns, *arrival.scan)
+
     def _frame(self, message: Any) -> tuple[FrameInput, CameraIntrinsics | None]:
         """Return frame and camera of a message for the query."""
+        if self._joiner is not None:
+            return self._joiner[1].cloud(), None
         if hasattr(message, "point_step"):
             return cloud_points(message), None
         if self._info is None:
@@ -401,7 +463,9 @@ class Relocaliser:
             return _NOTHING
         if self._last is not None and not self._waiting:
             return f"no frame has arrived for {silent_s:.1f} s"
-        sensor = frame_name(self._waiting[-1][1].header.frame_id) if self._waiting else "the sensor"
+        sensor = (
+            frame_name(self._waiting[-1].message.header.frame_id) if self._waiting else "the sensor"
+        )
         return f"no transforms from {p.odom_frame} to {sensor} and {p.base_frame} at its stamps"
 
     def _values(self, state: State) -> dict[str, str]:

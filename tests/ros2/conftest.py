@@ -154,9 +154,14 @@ class StubNode:
         return self.on_activate(None)  # type: ignore[attr-defined]
 
     def create_subscription(
-        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: object
-    ) -> str:
-        self.bus.callbacks[topic], self.bus.kinds[topic] = callback, kind.ros_name
+        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: object, *,
+        raw: bool = False,
+    ) -> str:  # fmt: skip
+        def serialized(message: Any) -> None:
+            callback(bytes(self.types.serialize_cdr(message, kind.ros_name)))
+
+        self.bus.callbacks[topic] = serialized if raw else callback
+        self.bus.kinds[topic] = kind.ros_name
         self.bus.qos[topic] = qos
         return topic
 
@@ -278,6 +283,7 @@ def bus(ros: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Bus:
     module("std_srvs.srv", Trigger=SimpleNamespace(ros_name="std_srvs/srv/Trigger"))
     for package, names in {
         "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
+        "livox_ros_driver2": ("CustomMsg",),
         "geometry_msgs": ("PoseWithCovarianceStamped", "TransformStamped"),
         "nav_msgs": ("Odometry",),
         "sensor_msgs": ("CameraInfo", "CompressedImage", "Image", "Imu", "PointCloud2"),

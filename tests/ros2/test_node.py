@@ -164,6 +164,25 @@ def test_a_manager_starts_and_stops_a_node(bus: Any, node_module: ModuleType, dr
     node.destroy_node()
 
 
+def test_a_node_with_scans_of_a_livox(
+    bus: Any, node_module: ModuleType, ros: SimpleNamespace
+) -> None:
+    bus.parameters = {"map": "m", "topic": "/livox/lidar", "kind": "livox", "join_m": 2.0,
+                      "url": "http://127.0.0.1:9"}  # fmt: skip
+    node = node_module.RelocaliserNode()
+    writer = ros.messages()
+    writer.transforms(0.0, {("base_link", "livox_frame"): np.eye(4)}, "/tf_static")
+    for i in range(3):
+        writer.livox(0.2 * i, np.full((20, 3), 5.0), np.linspace(0, 0.1, 20))
+    for t in (0.0, 0.2, 0.4, 0.6):
+        writer.transforms(t, {("odom", "base_link"): ros.transform(t, 0, 0)})
+    play(node, bus, writer.written)
+    assert node._core.counts["frames"] == 3
+    assert node._core.counts["asked"] == 1  # in half a second
+    assert len(node._core._joiner[1]) == 3
+    node.destroy_node()
+
+
 @pytest.mark.parametrize(
     "wrong", [{"map": ""}, {"topic": ""}, {"kind": "colour"}, {"url": "no address"}]
 )
@@ -257,7 +276,7 @@ def test_the_package_names_what_it_is_made_of() -> None:
             elif isinstance(one, ast.Import):
                 imported |= {name.name.partition(".")[0] for name in one.names}
     ours = {"sceneprint_client", "setuptools", "__future__", "os", "sys", "dataclasses", "pathlib",
-            "functools", "collections", "types",
+            "functools", "collections", "importlib", "types",
             "typing"}  # fmt: skip
     assert imported - ours <= needed
     setup = (PACKAGE / "setup.py").read_text()

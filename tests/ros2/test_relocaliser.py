@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -380,3 +381,65 @@ def test_messages_of_ros_are_filled_as_rosbags_reads_them(ros: SimpleNamespace) 
     pose = writer.last().pose.pose
     write_pose(pose, T)
     np.testing.assert_allclose((pose.position.x, pose.orientation.w), (1, turn.w))
+
+
+def turning_scans(ros: SimpleNamespace, *, every: float = 0.2) -> list[Any]:
+    """Scans of four points on a wall at x = 10, taken while the robot drives and turns."""
+    writer = ros.messages()
+    writer.transforms(0.0, {("base_link", "lidar"): ros.transform(0, 0, 1)}, "/tf_static")
+    wall = np.array([[10.0, y, 1.0] for y in (-3.0, -1.0, 1.0, 3.0)])
+    seconds = np.array([0.0, 0.02, 0.06, 0.095])
+
+    def pose(t: float) -> np.ndarray:
+        return np.asarray(ros.transform(2 * t, 0, 0, 0, 0, np.sin(0.3 * t), np.cos(0.3 * t)))
+
+    for scan in range(3):
+        points = np.empty((4, 3))
+        for i, s in enumerate(seconds):
+            T = np.linalg.inv(pose(every * scan + s) @ ros.transform(0, 0, 1))
+            points[i] = T[:3, :3] @ (wall[i] + [0, 0.3 * scan, 0]) + T[:3, 3]
+        rows = np.zeros(4, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
+        for axis, name in enumerate("xyz"):
+            rows[name] = points[:, axis]
+        rows["time"] = seconds
+        writer.points(every * scan, rows)
+        for k in range(11):  # odometry at 100 Hz arrives after the scan
+            t = every * scan + 0.01 * k
+            writer.transforms(t, {("odom", "base_link"): pose(t)})
+    return list(writer.written)
+
+
+def test_scans_of_a_drive_are_joined_without_their_motion(ros: SimpleNamespace) -> None:
+    with scripted(join_m=0.5, interval_s=0.0) as (core, client):
+        assert len(run(core, turning_scans(ros))) == 3
+    # the last query joins the scans at 0.4 and 0.8 m, but not that at 0 m
+    data = client.asked[-1]["frame"]
+    points = np.load(io.BytesIO(data)) if isinstance(data, bytes) else data
+    T_odom_sensor = ros.transform(0.8, 0, 1, 0, 0, np.sin(0.12), np.cos(0.12))
+    in_odom = points @ T_odom_sensor[:3, :3].T + T_odom_sensor[:3, 3]
+    expected = [[10, y + 0.3 * scan, 1] for scan in (2, 1) for y in (-3, -1, 1, 3)]
+    np.testing.assert_allclose(in_odom, expected, atol=1e-3)
+
+
+def test_a_scan_waits_for_the_odometry_of_its_last_point(ros: SimpleNamespace) -> None:
+    arrived = turning_scans(ros)[:13]  # the mounting, a scan, and odometry of 0 to 0.1 s
+    with scripted(join_m=0.5) as (core, client):
+        steps = []
+        for one in arrived:
+            take(core, *one)
+            steps.append(core.step())
+        assert core.wait(PATIENCE_S)
+    assert steps == [0] * 12 + [1]
+    assert len(client.asked) == 1
+
+
+def test_a_scan_without_odometry_to_its_end_is_left_out(ros: SimpleNamespace) -> None:
+    arrived = turning_scans(ros, every=1.0)
+    del arrived[6:13]  # odometry from 0.04 to 0.1 s
+    with scripted(join_m=0.5, interval_s=0.0, wait_s=0.1) as (core, client):
+        for one in arrived:
+            take(core, *one)
+            core.step()
+            assert core.wait(PATIENCE_S)
+        assert core.counts["without_transform"] == 1
+    assert len(client.asked) == 2

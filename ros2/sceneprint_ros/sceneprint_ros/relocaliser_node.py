@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
@@ -42,6 +43,8 @@ from sceneprint_client.tracker import TrackerParameters
 
 #: Message types of the topic of frames, by the parameter `kind`.
 KINDS = {"depth": Image, "compressed_depth": CompressedImage, "points": PointCloud2}
+#: Further kind: CustomMsg of livox_ros_driver2, a package that other robots need not install.
+LIVOX = "livox"
 
 
 T = TypeVar("T")
@@ -69,6 +72,7 @@ class NodeParameters:
     base_frame: str = described("base_link", "frame of the robot")
     parent_frame: str = described("", "parent frame that equals map_frame; empty: the first fix's")
     interval_s: float = described(0.5, "minimum time between two queries, seconds")
+    join_m: float = described(0.0, "length of the way whose scans are joined, metres; 0: none")
     wait_s: float = described(0.5, "maximum time that a frame waits for its transforms, seconds")
     stale_s: float = described(2.0, "time without frames after which nothing is published, seconds")
     planar: bool = described(False, "whether the robot drives on the plane z = 0 of the map")
@@ -131,11 +135,11 @@ class RelocaliserNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type
     def _open(self) -> None:
         self._p = NodeParameters(**self._values(NodeParameters))
         tracking = TrackerParameters(**self._values(TrackerParameters, "tracker."))
-        if not self._p.map or not self._p.topic or self._p.kind not in KINDS:
+        if not self._p.map or not self._p.topic or self._p.kind not in (*KINDS, LIVOX):
             raise InvalidRequest(
                 f"The parameters map = {self._p.map!r}, topic = {self._p.topic!r} and kind = "
                 f"{self._p.kind!r} are not valid: map and topic must not be empty, and kind must "
-                f"be one of {', '.join(KINDS)}. Set them in the launch file or with -p."
+                f"be one of {', '.join((*KINDS, LIVOX))}. Set them in the launch file or with -p."
             )
         client = Client(self._p.url, self._p.key or os.environ.get("SCENEPRINT_KEY") or None)
         self._closing.append(client.close)
@@ -177,8 +181,11 @@ class RelocaliserNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type
         self._closing.append(partial(self.destroy_publisher, publisher))
         return publisher
 
-    def _listen(self, kind: Any, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
-        subscription = self.create_subscription(kind, topic, callback, qos)
+    def _listen(
+        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: Any, *,
+        raw: bool = False,
+    ) -> None:  # fmt: skip
+        subscription = self.create_subscription(kind, topic, callback, qos, raw=raw)
         self._closing.append(partial(self.destroy_subscription, subscription))
 
     def _subscribe(self) -> None:
@@ -187,8 +194,12 @@ class RelocaliserNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type
         take = self._core.take_transforms
         self._listen(TFMessage, "/tf", partial(take, fixed=False), 100)
         self._listen(TFMessage, "/tf_static", partial(take, fixed=True), fixed)
-        self._listen(KINDS[p.kind], p.topic, self._take_frame, sensor)
-        if p.kind != "points":
+        if p.kind == LIVOX:
+            kind = import_module("livox_ros_driver2.msg").CustomMsg
+            self._listen(kind, p.topic, self._take_frame, sensor, raw=True)
+        else:
+            self._listen(KINDS[p.kind], p.topic, self._take_frame, sensor)
+        if p.kind not in ("points", LIVOX):
             beside = topic_without_transport(p.topic).rpartition("/")[0] + "/camera_info"
             info = p.camera_info_topic or beside
             self._listen(CameraInfo, info, self._core.take_camera_info, sensor)
@@ -198,7 +209,9 @@ class RelocaliserNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type
             self._listen(Odometry, p.odometry_topic, self._core.take_odometry, sensor)
 
     def _take_frame(self, message: Any) -> None:
-        if self._is_active:
+        if self._is_active and isinstance(message, bytes):
+            self._core.take_livox_scan(message)
+        elif self._is_active:
             self._core.take_frame(message)
 
     # Publishers.
