@@ -95,10 +95,10 @@ class RecordingOptions:
     keyframe_m, keyframe_deg : minimum distance or angle from the previous keyframe; 0 selects every
         frame
     keyframe_s : minimum time after the previous keyframe, if there are no poses
-    join_m : length of the way whose scans are joined to one frame, metres; 0 takes each scan alone
     sensor_frame : frame of the sensor, if points are in another frame
     depth_scale : stored units per metre of 16-bit depth; default: that of an intrinsics.json, or
         1000
+    join_m : length of the way whose scans are joined to one frame, metres; 0 takes each scan alone
     progress : function that is called while the bag is read
     """
 
@@ -108,9 +108,9 @@ class RecordingOptions:
     keyframe_m: float = 0.3
     keyframe_deg: float = 15.0
     keyframe_s: float = 0.5
-    join_m: float = 0.0
     sensor_frame: str | None = None
     depth_scale: float | None = None
+    join_m: float = 0.0
     progress: Progress | None = None
 
 
