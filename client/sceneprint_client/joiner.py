@@ -95,16 +95,12 @@ class Joiner:
         if len(times) > 1 and seconds is not None:
             back = np.linalg.inv(T_odom_sensor).astype(np.float64) @ np.array(known)
             points = _moved_points(points, seconds, times, back)
-        last_scan = self._scans[-1] if self._scans else None
-        if last_scan is not None and (
-            stamp_ns <= last_scan.stamp_ns
-            or _is_jump(
-                np.array([last_scan.T_odom_sensor[:3, 3], T_odom_sensor[:3, 3]]),
-                np.array([last_scan.stamp_ns, stamp_ns]) * 1e-9,
-            )
-        ):
-            self.counts["restarts"] += 1
-            self._scans.clear()
+        if self._scans:
+            last = self._scans[-1]
+            ends = np.array([last.T_odom_sensor[:3, 3], T_odom_sensor[:3, 3]])
+            if _is_jump(ends, np.array([0.0, (stamp_ns - last.stamp_ns) * 1e-9])):
+                self.counts["restarts"] += 1
+                self._scans.clear()
         thinned = _first_in_voxels(points.astype(np.float32), self._voxel_m)
         self._scans.append(_JoinedScan(stamp_ns, thinned, T_odom_sensor))
         positions = np.array([one.T_odom_sensor[:3, 3] for one in self._scans])
@@ -134,7 +130,7 @@ def window_start(positions: Floats, metres: float) -> int:
 
 
 def _is_jump(positions: Floats, seconds: Floats) -> bool:
-    """Return whether consecutive positions (N, 3) imply an impossible speed."""
+    """Return whether consecutive positions (N, 3) imply an impossible speed, or time goes back."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return bool((steps > FASTEST * np.diff(seconds)).any())
 

@@ -111,6 +111,24 @@ def test_scans_are_joined_without_their_motion(
     assert travelled.read_bytes() == sequence.frames[-1].read_bytes()
 
 
+def test_registered_scans_are_joined_as_they_are(tmp_path: Path, ros: SimpleNamespace) -> None:
+    """Points in the world frame, as of FAST-LIO, whose times would move them twice."""
+
+    def fill(writer: Any) -> None:
+        for number in range(30):
+            t = SCAN_S * number
+            writer.transforms(t, {("camera_init", "body"): pose(t)})
+            rows = np.zeros(20, [(name, "<f4") for name in ("x", "y", "z", "time")])
+            for axis, name in enumerate("xyz"):
+                rows[name] = wall(number)[:, axis]
+            rows["time"] = np.linspace(0.0, 0.0999, 20)
+            writer.points(t, rows, "/cloud_registered", frame="camera_init")
+
+    (sequence,) = find_sequences(ros.write(tmp_path, fill), JOINED)
+    assert sequence.frames[-1].sequence == 25
+    check_walls(sequence, 1e-3)
+
+
 def test_untimed_scans_keep_their_motion(tmp_path: Path, ros: SimpleNamespace) -> None:
     path = ros.write(tmp_path, lambda writer: write_walls(writer, "untimed"))
     (sequence,) = find_sequences(path, JOINED)
