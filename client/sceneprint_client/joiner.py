@@ -96,9 +96,9 @@ class Joiner:
             back = np.linalg.inv(T_odom_sensor).astype(np.float64) @ np.array(known)
             points = _moved_points(points, seconds, times, back)
         if self._scans:
-            last = self._scans[-1]
-            ends = np.array([last.T_odom_sensor[:3, 3], T_odom_sensor[:3, 3]])
-            if _is_jump(ends, np.array([0.0, (stamp_ns - last.stamp_ns) * 1e-9])):
+            newest = self._scans[-1]
+            ends = np.array([newest.T_odom_sensor[:3, 3], T_odom_sensor[:3, 3]])
+            if _is_jump(ends, np.array([0.0, (stamp_ns - newest.stamp_ns) * 1e-9])):
                 self.counts["restarts"] += 1
                 self._scans.clear()
         thinned = _first_in_voxels(points.astype(np.float32), self._voxel_m)
