@@ -169,7 +169,7 @@ def test_a_node_with_scans_of_a_livox(
 ) -> None:
     bus.parameters = {"map": "m", "topic": "/livox/lidar", "kind": "livox", "join_m": 2.0,
                       "url": "http://127.0.0.1:9"}  # fmt: skip
-    node = node_module.RelocaliserNode()
+    node = started(node_module)
     writer = ros.messages()
     writer.transforms(0.0, {("base_link", "livox_frame"): np.eye(4)}, "/tf_static")
     for i in range(3):
