@@ -88,10 +88,9 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
         document = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes
         )
-        template = "#/components/schemas/{model}"
         _, own = models_json_schema(
             [*((one, "validation") for one in PARSED), (Problem, "serialization")],
-            ref_template=template,
+            ref_template="#/components/schemas/{model}",
         )
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
         for name, schema in own["$defs"].items():

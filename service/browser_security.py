@@ -18,20 +18,16 @@ _ALWAYS: Headers = [
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-resource-policy", b"same-origin"),
+    # If a browser displays a response as a page, the page cannot load or run anything.
+    (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
+    (b"cache-control", b"no-store"),  # maps change, and responses depend on the key
 ]
-#: Responses are data. If a browser displays one as a page, the page cannot load or run anything.
-_NOTHING = b"default-src 'none'; frame-ancestors 'none'"
 
 
 def security_headers(headers: Headers) -> Headers:
     """Return the security headers that a response lacks."""
     present = {name.lower() for name, _ in headers}
-    wanted = [
-        *_ALWAYS,
-        (b"content-security-policy", _NOTHING),
-        (b"cache-control", b"no-store"),  # maps change, and responses depend on the key
-    ]
-    return [(name, value) for name, value in wanted if name not in present]
+    return [(name, value) for name, value in _ALWAYS if name not in present]
 
 
 # Checks of requests to a service that serves only its own machine.
