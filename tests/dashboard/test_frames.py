@@ -331,6 +331,9 @@ def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
     page.get_by_role("dialog").get_by_role("button", name="Delete").click()
     expect(page.get_by_role("heading", name="No frames yet")).to_be_visible()
     assert station.client.get(mine).json()["state"] == "deleted"
+    toast = page.locator(".toast").bounding_box()
+    assert toast is not None
+    assert toast["x"] + toast["width"] <= 200  # in the rail, where it covers no control
     page.get_by_role("button", name="Undo", exact=True).click()
     expect(page.locator(".toast", has_text="Restored 1 frame.")).to_be_visible()
     restored = station.client.get(mine).json()

@@ -34,7 +34,7 @@ export async function renderTab(root, { signal, actions }) {
   }
 
   await first();
-  actions(h("button", { class: "button primary", type: "button", onClick: () => newKey(signal, first) }, "Create a key"));
+  actions(h("button", { class: "button primary", type: "button", onClick: () => newKey(signal, first, found.length === 0) }, "Create a key"));
   put(root, card, none, more);
 }
 

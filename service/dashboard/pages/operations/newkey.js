@@ -10,13 +10,14 @@ const SCOPES = [["read", "read: view and query"], ["write", "write: also upload 
  * Ask for a name and grants, and make the key.
  * @param {AbortSignal} signal
  * @param {() => Promise<void>} made
+ * @param {boolean} isFirst it creates the others, so that it is offered all maps and everything
  */
-export async function newKey(signal, made) {
+export async function newKey(signal, made, isFirst) {
   const names = (await get("maps", { signal })).items.map((one) => one.name);
   const name = h("input", { required: true, maxlength: "128", autocomplete: "off", spellcheck: "false", placeholder: "robot-7" });
   const expires = h("input", { type: "datetime-local" });
   const lines = h("div", { class: "grants" });
-  const add = (map) => lines.append(grantLine(map));
+  const add = (map, scope = "read") => lines.append(grantLine(map, scope));
   const why = h("p", { class: "field-error", role: "alert" });
   const button = h("button", { class: "button primary", type: "submit" }, "Create key");
   const dialog = sheet({ title: "Create a key", buttons: button, children: [
@@ -27,7 +28,7 @@ export async function newKey(signal, made) {
       h("button", { class: "button quiet", type: "button", onClick: () => add("") }, "Another map")),
     h("label", { class: "field" }, h("span", {}, "Expires (never, if empty)"), expires), why,
   ] });
-  add(names[0] ?? "*");
+  if (isFirst) add("*", "admin"); else add(names[0] ?? "*");
   dialog.querySelector("form").addEventListener("submit", async (event) => {
     event.preventDefault();
     const grants = {};
@@ -52,10 +53,10 @@ export async function newKey(signal, made) {
   });
 }
 
-function grantLine(map) {
+function grantLine(map, scope) {
   const line = h("div", { class: "joined" },
     h("input", { class: "mono", "aria-label": "Map", list: "key-maps", value: map, autocomplete: "off", spellcheck: "false", placeholder: "name of a map, or *" }),
-    h("select", { "aria-label": "Scope" }, SCOPES.map(([value, text]) => h("option", { value }, text))),
+    h("select", { "aria-label": "Scope" }, SCOPES.map(([value, text]) => h("option", { value, selected: value === scope }, text))),
     h("button", { class: "button quiet", type: "button", "aria-label": "Remove this map", onClick: () => { if (line.parentElement && line.parentElement.children.length > 1) line.remove(); } }, "×"));
   return line;
 }
