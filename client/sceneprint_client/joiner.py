@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client.poses import Floats
+from sceneprint_client.ros_messages import LONGEST_SCAN_S
 from sceneprint_client.transforms import FASTEST
 
 #: Length of the way whose scans are joined, metres.
@@ -77,12 +78,21 @@ class Joiner:
         stamp_ns : stamp of the scan, nanoseconds
         points : (N, 3) in the sensor's axes at the time of each point, metres
         seconds : (N,) time of each point after the stamp; None if unknown
+
+        Raises
+        ------
+        ValueError : If a time is not finite or more than a second from the stamp.
         """
         self.counts["scans"] += 1
         self.counts["untimed"] += seconds is None
         times = np.zeros(1)
         if seconds is not None and len(seconds):
             first, last = min(0.0, float(seconds.min())), max(0.0, float(seconds.max()))
+            if not float(np.abs(seconds).max()) <= LONGEST_SCAN_S:
+                raise ValueError(
+                    f"A point was measured {float(np.abs(seconds).max()):g} s from the stamp of "
+                    "its scan. Pass finite seconds after the stamp, at most 1."
+                )
             # multiples of the step include the stamp itself
             times = _STEP_S * np.arange(np.floor(first / _STEP_S), np.ceil(last / _STEP_S) + 1)
             times = np.unique(np.clip(times, first, last))

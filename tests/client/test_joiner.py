@@ -123,6 +123,15 @@ def test_scans_that_the_odometry_does_not_cover_are_left_out() -> None:
     assert joiner.counts == {"scans": 6, "without_odometry": 4, "untimed": 0, "restarts": 1}
 
 
+@pytest.mark.parametrize("last", [1.5, -1.5, 1e9, np.nan, np.inf])
+def test_times_that_are_not_seconds_of_one_scan_are_refused(last: float) -> None:
+    joiner = along_x(1.0)
+    with pytest.raises(ValueError, match="from the stamp of its scan"):
+        joiner.add(0, np.ones((2, 3)), np.array([0.0, last]))
+    assert joiner.add(0, np.ones((2, 3)), np.array([0.0, 1.0]))
+    assert len(joiner) == 1
+
+
 def test_a_jump_within_a_scan_of_other_odometry_is_found() -> None:
     def odometry(stamps_ns: Sequence[int]) -> list[Floats | None]:
         return [pose(0.0 if ns < SECOND // 20 else 1.0) for ns in stamps_ns]
