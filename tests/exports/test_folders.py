@@ -295,12 +295,12 @@ def test_depth_as_openexr_is_refused_with_the_export_to_choose(tmp_path: Path) -
         find_sequences(tmp_path)
 
 
-def test_without_lzfse_the_extra_is_named(
+def test_without_lzfse_the_package_is_named(
     room: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     [sequence] = find_sequences(record3d(tmp_path / "a", room))
     monkeypatch.setitem(__import__("sys").modules, "lzfse", None)
-    with pytest.raises(MissingDependency, match=r"sceneprint\[record3d\]"):
+    with pytest.raises(MissingDependency, match=r"pip install .lzfse"):
         sequence.frames[0].read()
 
 
