@@ -4,7 +4,7 @@
     refused request  --record_refusal-->  a line of the audit log
 
 Dependencies that do not block run in the event loop, because a thread may become free only after a
-wait under load. A map that the caller may not read gets the same response, word for word, as a map
+wait under load. A map that the caller cannot read gets the same response, word for word, as a map
 that does not exist.
 """
 
@@ -108,7 +108,7 @@ class Caller:
         return allows(self.grants, scope, map_name)
 
     def require(self, map_name: str, scope: Scope) -> None:
-        """Check that the caller may use a map in this scope. Raise UnknownMap if it may not read
+        """Check that the caller may use a map in this scope. Raise UnknownMap if it cannot read
         the map, and Forbidden if it may only read it.
         """
         if not self.may("read", map_name):
@@ -117,7 +117,7 @@ class Caller:
             raise _forbidden(self, scope, f"map {map_name!r:.80}")
 
     def require_new(self, map_name: str) -> None:
-        """Raise Forbidden if the caller may not create a map of this name, existing or not."""
+        """Raise Forbidden if the caller cannot create a map of this name, existing or not."""
         if not self.may("admin", map_name):
             raise _forbidden(self, "admin", f"a map named {map_name!r:.80}")
 
@@ -127,7 +127,7 @@ class Caller:
             raise _forbidden(self, scope, "all maps")
 
     def require_job(self, job: Job, scope: Scope = "read") -> Job:
-        """Return the job if the caller may use it in this scope. Raise UnknownJob if it may not see
+        """Return the job if the caller may use it in this scope. Raise UnknownJob if it cannot see
         the job, and Forbidden if it may only see it.
         """
         of = EVERY if job.map is None else job.map
@@ -150,7 +150,7 @@ class Caller:
 
 def require_readable(query_id: str, here: Service, caller: Caller) -> QueryRow:
     """Return the row of a query. Raise UnknownQuery, with the same text, if its answer is not
-    stored or the caller may not read all maps that it names.
+    stored or the caller cannot read all maps that it names.
     """
     row = here.context.query_log.find_row(query_id)
     maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
@@ -313,22 +313,22 @@ _REFUSED_KEY = (
 
 
 async def may_read(map_name: str, caller: Sender) -> None:
-    """Raise UnknownMap if the caller may not read the map."""
+    """Raise UnknownMap if the caller cannot read the map."""
     caller.require(map_name, "read")
 
 
 async def may_write(map_name: str, caller: Sender) -> None:
-    """Raise UnknownMap or Forbidden if the caller may not change the content of the map."""
+    """Raise UnknownMap or Forbidden if the caller cannot change the content of the map."""
     caller.require(map_name, "write")
 
 
 async def may_admin(map_name: str, caller: Sender) -> None:
-    """Raise UnknownMap or Forbidden if the caller may not change the map itself."""
+    """Raise UnknownMap or Forbidden if the caller cannot change the map itself."""
     caller.require(map_name, "admin")
 
 
 async def reads_every(caller: Sender) -> None:
-    """Raise Forbidden if the caller may not read all maps."""
+    """Raise Forbidden if the caller cannot read all maps."""
     caller.require_every("read")
 
 

@@ -46,7 +46,7 @@ def embedded_settings(path: Path) -> Settings:
         queued_requests=_MOST_WAITING, queue_timeout_s=_LONGEST_WAIT_S,
         max_event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip
-    # This exceeds the maximum of the setting; it is the limit of the decoders.
+    # This exceeds the setting's maximum; it is the limit of the decoders.
     return settings.model_copy(update={"max_upload_bytes": _MOST_BYTES})
 
 

@@ -29,7 +29,7 @@ from service.limits import Holdings, share
 
 log = logging.getLogger(__name__)
 
-#: Pause between two polls of the database, seconds (half of it after new events), and the pause
+#: Pause between polls of the database, seconds (half of it after new events), and the pause
 #: after an error.
 POLL_S, TROUBLE_S = 0.1, 1.0
 #: Interval of keep-alive messages on a silent stream, seconds.

@@ -31,7 +31,7 @@ from sceneprint_client.api import Answer, FrameState, JobState
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two samples.
+#: Seconds between samples.
 EVERY_S = 10.0
 
 

@@ -56,7 +56,7 @@ class Front:
         await self.app(scope, receive, send)
 
     def _is_harmless(self, scope: Scope) -> bool:
-        """Return whether a request is for `/healthz` and does not come from a foreign web page."""
+        """Return whether a request is for `/healthz` and is not sent by another site."""
         asks = scope["path"] == "/healthz" and scope["method"] in ("GET", "HEAD")
         headers = scope["headers"]
         if not asks or any(name == b"origin" for name, _ in headers):

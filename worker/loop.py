@@ -28,7 +28,7 @@ from sceneprint.store.wakeup import Listening, process_name
 
 log = logging.getLogger(__name__)
 
-#: Minimum and maximum pause between two reads of an empty queue, seconds. Wake-ups usually end the
+#: Minimum and maximum pause between reads of an empty queue, seconds. Wake-ups usually end the
 #: pause earlier, but not for jobs that another machine has queued.
 SHORTEST_S, LONGEST_S = 0.05, 2.0
 #: Interval of housekeeping, and the pause after a lack of memory, seconds.

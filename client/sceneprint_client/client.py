@@ -40,7 +40,7 @@ class Status(ApiRecord):
         "read all maps."
     )
     jobs: dict[str, int] | None = Field(
-        description="Number of jobs in each state; None if the key may not read all maps."
+        description="Number of jobs in each state; None if the key cannot read all maps."
     )
     read_only: bool = Field(default=False, description="Whether the service rejects all changes.")
 

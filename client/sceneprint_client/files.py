@@ -32,7 +32,7 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
     Parameters
     ----------
     path : path of the file
-    limit : greatest accepted size, bytes; a larger file is rejected unread
+    limit : maximum accepted size, bytes; a larger file is rejected unread
     error : class of the error to raise
 
     Raises
@@ -112,7 +112,7 @@ def data_lines(text: str) -> Iterator[tuple[int, str]]:
             yield number, content
 
 
-#: Greatest size of a file of a depth image and of a file of points, bytes.
+#: Maximum sizes of a depth image file and of a point file, bytes.
 MAXIMUM_IMAGE_BYTES = 8 * MAXIMUM_SAMPLES + 65_536
 MAXIMUM_CLOUD_BYTES = 512 << 20
 
@@ -211,9 +211,9 @@ LAS_SIGNATURE = b"LASF"
 
 #: Length of the encapsulation header, bytes; alignment counts from its end.
 _HEAD = 4
-#: Greatest length of a frame's or field's name, bytes, and greatest number of fields of a point.
+#: Maximum length of a frame's or field's name, bytes, and maximum number of fields of a point.
 _LONGEST_NAME, _MOST_FIELDS = 255, 64
-#: Greatest number of bytes after the message: middleware pads to whole words.
+#: Maximum number of bytes after the message: middleware pads to whole words.
 _MOST_PADDING = 7
 
 

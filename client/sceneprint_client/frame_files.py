@@ -430,7 +430,7 @@ def library_array(frame: Any) -> NDArray[Any] | None:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-#: Greatest sample of a 16-bit image.
+#: Maximum sample of a 16-bit image.
 _MAXIMUM_UNITS = 65_535
 
 
@@ -564,7 +564,7 @@ def rows_as_npy(data: bytes, row: tuple[str, ...]) -> bytes:
     return _npy(rows[:, [row.index(axis) for axis in "xyz"]])
 
 
-#: Greatest rounding error of coordinates in float32, metres; large ones such as UTM need float64.
+#: Maximum rounding error of coordinates in float32, metres; large ones such as UTM need float64.
 _ROUNDING_M = 1e-4
 
 

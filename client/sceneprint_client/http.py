@@ -701,7 +701,7 @@ async def _lines(response: httpx.Response) -> AsyncIterator[str]:
             yield line
 
 
-#: First and longest pause between two checks of a job, seconds.
+#: First and longest pause between checks of a job, seconds.
 _PAUSES_S = (0.02, 0.5)
 
 

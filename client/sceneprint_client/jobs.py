@@ -327,13 +327,16 @@ class JobMethods(ServiceConnection):
         self, product: _Product, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> _Product:  # fmt: skip
-        """Wait until a product has ended, and return it.
+        """Wait until a product has ended or the time is over, and return its latest state.
+
+        Check `state.over`: the end of the time raises no error.
 
         Parameters
         ----------
         product : product to wait for
         timeout_s : longest wait, seconds
-        progress : function that is called with the number of finished steps and the total
+        progress : function that is called after each poll with the number of finished steps and
+            the total, if the latter is known
         """
         pauses = growing_pauses(time.monotonic() + timeout_s)
         while True:

@@ -22,7 +22,7 @@ from sceneprint_client.transforms import FASTEST
 JOIN_M = 2.0
 #: Edge of the voxels in which a joined cloud has one point, metres.
 VOXEL_M = 0.1
-#: Greatest number of scans in a cloud: 5 s at 10 Hz, also of a robot that stands still.
+#: Maximum number of scans in a cloud: 5 s at 10 Hz, also of a robot that stands still.
 MOST_SCANS = 50
 #: Longest interval between two poses of a scan, seconds. Within it, each point moves along a line;
 #: at 180 degrees a second, the line is 0.1 mm from the arc at a distance of 100 m.
@@ -131,7 +131,7 @@ def window_start(positions: Floats, metres: float) -> int:
 
     Parameters
     ----------
-    positions : (N, 3) positions of the sensor in order of time
+    positions : (N, 3) positions of the sensor in chronological order
     metres : longest way from the first to the last position
     """
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)

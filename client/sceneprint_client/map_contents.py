@@ -412,7 +412,7 @@ class MapMethods(ServiceConnection):
         captured_after, captured_before : start and end of the capture time, with a time zone
         clock : time stamps: "captured" (`captured_at`), "sequence", or "received" (every frame has
             it); "taken": `captured_at`, or `sequence` if no frame has one
-        most : greatest number of poses, evenly spaced; `posed` is the number of all poses
+        most : maximum number of poses, evenly spaced; `posed` is the number of all poses
 
         Raises
         ------
@@ -466,7 +466,7 @@ class MapMethods(ServiceConnection):
         Parameters
         ----------
         map_name, frame_id, within : see `cloud`
-        limit : greatest number of points; a larger cloud always yields the same subset
+        limit : maximum number of points; a larger cloud always yields the same subset
         """
         from sceneprint_client.surface_encoding import decode_points  # loads numpy
 

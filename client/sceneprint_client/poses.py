@@ -97,7 +97,7 @@ def interpolate(
     trajectory : trajectory of N poses
     stamps : M stamps in any order, seconds
     longest_gap : longest interval between two poses in which to interpolate, seconds
-    tolerance : greatest distance to a pose, seconds, that replaces a missing interpolation
+    tolerance : maximum distance to a pose, seconds, that replaces a missing interpolation
 
     Returns
     -------
@@ -215,7 +215,7 @@ def _up(rows: Floats) -> Floats | None:
     return up
 
 
-TOLERANCE = 1e-2  #: greatest error of a rotation matrix, and of the length of a unit vector
+TOLERANCE = 1e-2  #: maximum error of a rotation matrix, and of the length of a unit vector
 
 
 def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput, MetaInput
     from sceneprint_client.surface_encoding import SurfacePoints
 
-#: Greatest number of frames with pairwise similarities.
+#: Maximum number of frames with pairwise similarities.
 _MOST_ALIKE = 200
 
 

@@ -54,7 +54,7 @@ _MEMORY_S = 10.0
 _SWEEP_INTERVAL = 512
 #: A frame that is older than the last one by this indicates a jump of the clock, seconds.
 _JUMP_S = 1.0
-#: Greatest number of frames that wait for their transforms.
+#: Maximum number of frames that wait for their transforms.
 _MOST_WAITING = 64
 #: Message of a report before the first frame.
 _NOTHING = "no frame has arrived"

@@ -37,7 +37,7 @@ ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 DEPTH_SCALE = 1000.0
 #: Length of the header of a compressedDepth message, bytes: a format, and two floats a and b.
 TRANSPORT_BYTES = 12
-#: Greatest offset of the PNG, bytes.
+#: Maximum offset of the PNG, bytes.
 _MOST_BEFORE_PNG = 64
 #: Length of the head of a PNG up to bit depth and colour type, bytes.
 _PNG_HEAD = 26
@@ -323,7 +323,7 @@ LONGEST_SCAN_S = 1.0
 #: Bits of the field `tag` of Livox from which a point is noise, as FAST-LIO reads them: a third or
 #: later return (Avia, Horizon), or low confidence (Mid-360).
 _NOISE = 0x20
-#: Greatest number of points of a message.
+#: Maximum number of points of a message.
 MOST_POINTS = 20_000_000
 #: Number of points in one block of a conversion.
 _BLOCK = 1 << 16

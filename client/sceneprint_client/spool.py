@@ -50,7 +50,7 @@ T = TypeVar("T")
 MOST_BYTES = 1 << 30
 #: Metres, degrees and seconds that count as one unit of separation.
 METRES, DEGREES, SECONDS = 1.0, 30.0, 60.0
-#: Greatest size of the frames in one request, bytes; a larger frame is sent alone.
+#: Maximum size of the frames in one request, bytes; a larger frame is sent alone.
 BATCH_BYTES = 4 << 20
 #: Delay before the next request to a busy service that does not specify one, seconds.
 _PAUSE_S = 1.0

@@ -25,7 +25,7 @@ POINT = np.dtype(
 NORMALS, PATCHES, RESIDUALS = 1, 2, 4
 #: Index of points that lie on no validation patch.
 NO_PATCH = 65535
-#: Greatest coordinate of a point within its bounding box.
+#: Maximum coordinate of a point within its bounding box.
 _STEPS = 65535.0
 
 

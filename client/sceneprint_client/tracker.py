@@ -50,7 +50,7 @@ __all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters
 
 #: Errors after which a later query may succeed.
 _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited, errors.StoreAway, errors.StoreLocked)
-#: Greatest age of earlier frames in a query, seconds.
+#: Maximum age of earlier frames in a query, seconds.
 _MAXIMUM_AGE_S = 30.0
 #: Lowest HTTP status that is a fault of the service or of a proxy.
 _FIRST_FAULT = 500
@@ -238,7 +238,7 @@ class AsyncTracker:
     """
 
     def __init__(self, tracker: Tracker) -> None:
-        self.dropped = 0  #: number of frames that a later frame replaced
+        self.dropped = 0  #: number of frames that were replaced by a later frame
         self.answered = 0  #: number of queries that ended without an error
         self._tracker = tracker
         self._waiting: dict[str, Any] | None = None

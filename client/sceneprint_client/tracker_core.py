@@ -35,7 +35,7 @@ _ANSWER_M, _ANSWER_RAD = 0.03, math.radians(1.0)
 _PRIOR_FACTOR = 2.0
 #: Number of odometry poses stored; limits how late an answer can arrive.
 _MOST_MARKS = 4096
-#: Smallest motion between two views of one query, of which either is sufficient.
+#: Minimum motion between two views of one query; either value is sufficient.
 _SPACING_M, _SPACING_RAD = 0.1, math.radians(6.0)
 #: Longest path and largest turn back to an earlier view of a query: beyond them odometry may be
 #: off by centimetres, and a larger step is a jump.
@@ -51,7 +51,7 @@ class TrackerParameters:
     drift : drift of the odometry, as a fraction of the travelled distance
     turn_drift : drift of the odometry, as a fraction of the turned angle
     heading_drift_deg : drift of the heading, degrees per travelled metre
-    gate_m, gate_deg : greatest difference of two poses of one place, in addition to drift
+    gate_m, gate_deg : maximum difference between two poses of one place, in addition to drift
     apart_m, apart_deg : smallest motion, of which either is sufficient, between two independent
         views
     strong_weight, weak_weight : weights of an answer `found` with strong matches from at least two
@@ -131,7 +131,7 @@ class Observation:
     poses : pose of the answer, or its alternatives if it is ambiguous
     strong : whether strong matches from at least two viewpoints support the pose
     by_prior : whether the prior decided between several poses
-    reason : reason of the answer
+    reason : reason for the answer
     earlier : (4, 4) T_odom_sensor of each earlier frame of the query
     """
 
@@ -180,7 +180,7 @@ class State:
     T_map_sensor : (4, 4) T_map_odom @ T_odom_sensor, or None
     covariance : (6, 6) of T_map_sensor, errors (x, y, z, rx, ry, rz) in the order of ROS, or None
     age : time since an answer without a prior confirmed the place, seconds, or None
-    reason : reason of the status
+    reason : reason for the status
     """
 
     status: TrackerStatus
@@ -595,7 +595,7 @@ def spaced_views(poses: Sequence[Array], most: int) -> list[int]:
     Parameters
     ----------
     poses : (4, 4) T_odom_sensor of each view, in order of capture
-    most : greatest number of views, including the last
+    most : maximum number of views, including the last
 
     Returns
     -------

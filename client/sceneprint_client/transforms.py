@@ -30,9 +30,9 @@ from sceneprint_client.poses import (
 LONGEST_GAP_S = 0.5
 #: Longest extrapolation before the first and after the last sample, seconds.
 TOLERANCE_S = 0.02
-#: Greatest number of samples of moving transforms: hours of odometry.
+#: Maximum number of samples of moving transforms: hours of odometry.
 MOST_SAMPLES = 5_000_000
-#: Greatest deviation of the length of a recorded quaternion from 1, without and with normalisation.
+#: Maximum deviation of the length of a recorded quaternion from 1, without and with normalisation.
 _UNIT, _NEAR_UNIT = 1e-2, 0.1
 #: Longest plausible translation, metres.
 _FARTHEST_M = 1e7

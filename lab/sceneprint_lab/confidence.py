@@ -81,7 +81,7 @@ def fit(
     ----------
     samples : queries with their candidate poses
     shares : share of queries at places of each kind: confidences are probabilities for this
-        mixture of queries, whatever the numbers of samples
+        mixture of queries, regardless of the numbers of samples
     ridge : weight of the squared differences of steps from `USUAL_STEP`
     lone : minimum step of the penalty of a pose that only one view suggests
 

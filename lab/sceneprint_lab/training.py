@@ -122,7 +122,9 @@ _SCAN_NOISE: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_dep
 
 
 def _lidar() -> ModelParameters:
-    """Return the parameters of `paper` with five-fold lengths, and a scanner's range and noise.
+    """Return the parameters of `paper` with five-fold lengths, and those that scanners require.
+
+    The latter are range, noise, angles of samples, numbers of patches and seeds, and thresholds.
 
     The radius of patches' neighbourhoods and the equal weights of large and small patches were
     tuned on synthetic halls that are not in the training data (docs/evaluation.md). The noise of a

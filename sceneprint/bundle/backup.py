@@ -72,7 +72,7 @@ B = TypeVar("B")
 
 #: Reason why a blob is not in a bundle.
 Loss = Literal["missing", "damaged"]
-#: Entry in a bundle's list of blobs: digest, size in bytes, and reason of a loss.
+#: Entry in a bundle's list of blobs: digest, size in bytes, and reason for its loss, if any.
 ListedBlob = tuple[str, int, Loss | None]
 
 

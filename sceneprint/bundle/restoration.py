@@ -1,4 +1,4 @@
-"""Verification of bundles, and their restoration into an empty store.
+"""Verify bundles, and restore them into an empty store.
 
     bundle  --verify_bundle-->  Bundle
     bundle  --restore_to_folder-->  data folder with SQLite

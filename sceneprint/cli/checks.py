@@ -20,7 +20,7 @@ Verdict = Literal["ok", "note", "WRONG"]
 
 #: Free space below which uploads are soon refused, and below which a note appears, bytes.
 LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
-#: Maximum difference of clocks without a note, seconds.
+#: Maximum difference between clocks without a note, seconds.
 APART_S = 2.0
 
 
@@ -50,7 +50,7 @@ def disk_check(subject: str, free: int) -> Check:
 
 
 def seconds_apart(before: float, there: float, after: float) -> float:
-    """Return the minimum difference of two clocks, seconds.
+    """Return the minimum difference between two clocks, seconds.
 
     Parameters
     ----------
@@ -139,7 +139,10 @@ def store_check(stats: Stats) -> Check:
 
 
 def scrub_check(stats: Stats) -> Check:
-    """Report the progress of the scrub, which reads all stored bytes."""
+    """Report the progress of the scrub, which reads all stored bytes.
+
+    The result is a note if nothing was verified yet or data is damaged, and otherwise ok.
+    """
     seen = stats.scrub
     if seen is None:
         return Check("note", "scrub", "no stored data has been verified yet")

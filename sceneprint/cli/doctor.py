@@ -156,7 +156,10 @@ def _wrong(text: str) -> Check:
 
 
 def object_stores(settings: Settings) -> Iterator[Check]:
-    """Yield checks of the configured object stores of blobs and of indexes."""
+    """Yield a check of each configured object store, of blobs and of indexes.
+
+    The check writes, reads and deletes an object.
+    """
     from sceneprint.store.blobs.object_client import VARIABLES, check_objects, open_objects
 
     blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()

@@ -90,7 +90,7 @@ def waiting_reason(stats: Stats | None, own: int = 0) -> str:
 
     Parameters
     ----------
-    stats : statistics of the service; None if the key may not read them
+    stats : statistics of the service; None if the key cannot read them
     own : number of the caller's waiting jobs; all other waiting jobs are ahead of them
     """
     if stats is None or not stats.workers:

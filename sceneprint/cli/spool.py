@@ -20,7 +20,7 @@ from sceneprint_client.spool import MOST_BYTES, Spool, SyncReport
 
 
 def add_spool(command: argparse.ArgumentParser) -> None:
-    """Add the options of `sceneprint spool`."""
+    """Add the arguments of `sceneprint spool`, and the function that runs it."""
     command.add_argument("spool", type=Path, metavar="FILE", help="file of the spool")
     command.add_argument(
         "paths", nargs="*", type=Path, metavar="PATH",

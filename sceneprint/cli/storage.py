@@ -85,7 +85,7 @@ def _revisions(database: Database) -> tuple[str | None, bool]:
 
 
 def add_fsck(command: argparse.ArgumentParser) -> None:
-    """Add the options of `sceneprint fsck`."""
+    """Add the options of `sceneprint fsck`, and the function that runs it."""
     add_data_option(command)
     command.add_argument("--map", metavar="MAP", help="check only this map")
     how = command.add_mutually_exclusive_group()

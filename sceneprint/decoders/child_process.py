@@ -104,7 +104,12 @@ def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None)
 def _run_task(
     tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap
 ) -> dict[str, Any]:
-    """Run a task and return its reply, or the error of the upload."""
+    """Run a task on the first `bytes` of `shared`, and return its reply or error.
+
+    The arrays of the result replace the upload in `shared`, one after another. The reply has
+    `error` and `text` for an error of the upload, `memory` if memory ran out, and `broke` for any
+    other error.
+    """
     try:
         reply, arrays = tasks[request["task"]](shared[: request["bytes"]], request)
         if arrays is None:
@@ -183,7 +188,10 @@ def array_samples() -> list[tuple[bytes, Any]]:
 
 
 def text_samples() -> list[tuple[bytes, Any]]:
-    """Return small PCD and PLY files, with their formats; their readers are compiled."""
+    """Return small PCD and PLY files of all encodings, with their formats.
+
+    The first read of each compiles its reader.
+    """
     row = b"1 2 3\n"
     head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"
     head += b"POINTS 12\nDATA "

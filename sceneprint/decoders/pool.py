@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 PROGRAM = "sceneprint.decoders.child_process"
 #: Formats with compiled readers, whose process takes 1 s longer to start and 140 MB more memory.
 _COMPILED = ("ply", "pcd")
-#: Errors of an upload that a decoder may report, by name.
+#: Upload errors that a decoder may report, by name.
 _ERRORS = {
     one.__name__: one
     for one in (

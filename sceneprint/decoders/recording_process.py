@@ -85,7 +85,11 @@ class _MappedPath(type(Path())):  # type: ignore[misc]  # the class of paths of 
 
 
 def _outline(path: Path, request: dict[str, Any]) -> Reply:
-    """Return the outline of the recording and the selected frames as JSON."""
+    """Return the outline of the recording and the selected frames as JSON; see `RecordingIndex`.
+
+    `request["options"]` contains ImportOptions. Raise UnreadableArchive if more than `MOST_FRAMES`
+    frames are selected.
+    """
     options = ImportOptions.model_validate(request["options"])
     choice = RecordingOptions(
         options.topic, options.camera_info, options.pose_frame, options.keyframe_m,

@@ -30,9 +30,9 @@ from sceneprint.models import PRESETS, read_model
 _LAST = {"signing": pair_features._count, "validation": icp.refine_in_place, "clouds": plan._add}
 #: Parts that a service for depth images needs, and those that a service for clouds needs.
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
-#: Seconds between two checks of the processes.
+#: Seconds between checks of the processes.
 _LOOK_S = 0.05
-#: Seconds between two reports of progress.
+#: Seconds between reports of progress.
 _REPORT_S = 5.0
 #: Held during compilation, so that other threads wait.
 _compiling = threading.Lock()

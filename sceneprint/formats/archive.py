@@ -706,9 +706,9 @@ def _is_hidden(parts: tuple[str, ...]) -> bool:
 
 
 def _omitted_folder(parts: tuple[str, ...]) -> tuple[str, ...] | None:
-    """Return the path of a member's folder whose name indicates colour, infrared or the like.
+    """Return the path of a member's first folder whose name indicates colour or infrared.
 
-    The first folder may be the packed data set, whose name is arbitrary.
+    The topmost folder may be the packed data set, whose name is arbitrary.
     """
     ends = (end for end in range(2, len(parts)) if is_beside_depth(parts[end - 1]))
     end = next(ends, None)

@@ -220,7 +220,7 @@ def unpack_image(
     ----------
     packed : (h, w, 3) uint16; pixels whose first number is 0 are invalid
     scale : inverse depth (pinhole) or range (sphere) that 1 represents
-    most : greatest number of a packed normal, as it was passed to `pack_image`
+    most : maximum number of a packed normal, as it was passed to `pack_image`
     """
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)

@@ -106,7 +106,7 @@ def robot_path(poses: Floats, parents: Ints64) -> RobotPath:
 
     Parameters
     ----------
-    poses : (m, 4, 4) T_parent_sensor in order of time; NaN if unknown
+    poses : (m, 4, 4) T_parent_sensor in chronological order; NaN if unknown
     parents : (m,) identifiers of the parent frames; odometry has a gap at each change
     """
     known = np.isfinite(poses).all(axis=(1, 2))

@@ -242,7 +242,7 @@ def current_revision(connection: Connection) -> str | None:
 
     Raises
     ------
-    NewerSchema : If a later version of sceneprint wrote the database, and this one may not use it.
+    NewerSchema : If a later version of sceneprint wrote the database, and this one cannot use it.
     """
     stored, (head, known) = schema_range_of(connection), known_revisions()
     if stored is None:

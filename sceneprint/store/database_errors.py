@@ -233,7 +233,7 @@ T = TypeVar("T")
 
 #: Seconds that a starting process waits for its server.
 PATIENCE_S = 60.0
-#: Seconds between two attempts to connect.
+#: Seconds between attempts to connect.
 AGAIN_S = 1.0
 
 

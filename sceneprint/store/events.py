@@ -419,7 +419,11 @@ MOST_FORMER = 10_000
 
 
 def record_former_map(connection: Connection, row: MapRow) -> None:
-    """Record a removed map after its last event."""
+    """Record the quotas and the last event of a removed map, after that event was recorded.
+
+    The record replaces an earlier one of the same name. Of the records without quotas, only the
+    newest `MOST_FORMER` are kept.
+    """
     last = select(func.max(events.c.number)).where(events.c.map == row.name)
     connection.execute(delete(former_maps).where(former_maps.c.name == row.name))
     connection.execute(

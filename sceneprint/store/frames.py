@@ -54,7 +54,7 @@ def renew_upload(
     Parameters
     ----------
     blob, size : digest and size of the new upload
-    reason : new reason of the frame's state
+    reason : new reason for the frame's state
     """
     _update_usage(connection, number, None, size)
     connection.execute(

@@ -251,11 +251,11 @@ class IdempotentRequest:
     fingerprint: str
 
     def stored_result(self, connection: Connection) -> dict[str, Any] | None:
-        """Return the stored result of the same request; None if there is none.
+        """Return the result of the same request of this actor within `RESULT_S`; None without one.
 
         Raises
         ------
-        IdempotencyConflict : If the key was used for another request.
+        IdempotencyConflict : If the actor used the key for another request within that time.
         """
         row = connection.execute(
             select(idempotency.c.fingerprint, idempotency.c.data).where(

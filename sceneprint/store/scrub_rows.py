@@ -14,7 +14,7 @@ from sqlalchemy import Connection, insert, select, update
 from sceneprint.store.queue import read_clock
 from sceneprint.store.tables import frames, scrubs
 
-#: Seconds between two slices, and minimum seconds between the starts of two passes.
+#: Seconds between slices, and minimum seconds between the starts of two passes.
 SLICE_S, PASS_S = 4.0, 86_400.0
 
 

@@ -64,7 +64,7 @@ class StoredSignature:
 
 @dataclass(frozen=True)
 class SignatureChange:
-    """Change of a frame that was indexed, or is no longer searched.
+    """Change of a frame: it was indexed, or is no longer searched.
 
     `vector` is None if the frame is not searched, or if its signature is damaged. `deleted` is True
     for deleted frames, and for frames that a new model of the map has rejected.

@@ -109,7 +109,7 @@ class ReadOnlyFile:
 
 #: Seconds that a writer waits for another writer, and after another writer has timed out.
 BUSY_S, HELD_S = 10.0, 0.1
-#: Seconds between two attempts to take the lock, and maximum seconds in the line for it.
+#: Seconds between attempts to take the lock, and maximum seconds in the line for it.
 LOOK_S, LINE_S = 0.0005, 1.0
 #: Seconds that emptying the log waits for readers; writers wait in the meantime.
 SHRINKING_S = 0.5

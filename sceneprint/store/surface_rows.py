@@ -516,7 +516,7 @@ def add_touches(connection: Connection, touches: Iterable[tuple[int, int]]) -> N
 def frames_touching(
     connection: Connection, tiles: Sequence[int], after: int, limit: int
 ) -> list[int]:
-    """Return the numbers of frames that touch any of the tiles, in order, after a number."""
+    """Return, in order, the numbers above `after` of frames that touch any of the tiles."""
     c = surface_touches.c
     statement = (
         select(c.frame_number)

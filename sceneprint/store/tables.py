@@ -418,7 +418,7 @@ former_maps = Table(
     Index(None, "number"),
 )
 
-#: Queries and their outcomes, which are stored for some time, and their answers while space
+#: Queries and their outcomes, which are stored for a limited time, and their answers while space
 #: permits.
 queries = Table(
     "queries",

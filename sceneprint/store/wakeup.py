@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import psycopg
 
 
-#: Seconds after which an abandoned FIFO is removed, and interval at which used FIFOs are touched.
+#: Seconds after which an abandoned FIFO is removed, and interval at which FIFOs in use are touched.
 STALE_S, ALIVE_S = 300.0, 60.0
 #: Longest wait of a worker without a FIFO, seconds.
 DEAF_S = 0.25
@@ -192,11 +192,11 @@ log = logging.getLogger(__name__)
 CHANNEL = "sceneprint"
 #: Prefix of the names of listening connections, before the name of the process.
 LISTENS = "sceneprint "
-#: Minimum seconds between two rings, since one ring suffices for many uploads.
+#: Minimum seconds between rings, since one ring suffices for many uploads.
 REST_S = 0.02
 #: Maximum seconds that `close` waits for a ring in progress, since the server may not answer.
 CLOSING_S = 2.0
-#: Seconds between two attempts to connect.
+#: Seconds between attempts to connect.
 AGAIN_S = 2.0
 
 

@@ -63,10 +63,10 @@ class Readiness(Health):
 
     read_only: bool
     frames: dict[str, int] | None = Field(
-        description="Number of frames in each state; null if your key may not read all maps."
+        description="Number of frames in each state; null if your key cannot read all maps."
     )
     jobs: dict[str, int] | None = Field(
-        description="Number of jobs in each state; null if your key may not read all maps."
+        description="Number of jobs in each state; null if your key cannot read all maps."
     )
 
 
@@ -231,7 +231,7 @@ def stats(
     caller: Sender,
     map_name: Annotated[
         str | None,
-        Query(alias="map", description="Only this map; required if the key may not read all maps."),
+        Query(alias="map", description="Only this map; required if the key cannot read all maps."),
     ] = None,
     minutes: Annotated[int, Query(ge=1, le=60, description="Length of the history, minutes.")] = 60,
 ) -> Stats:

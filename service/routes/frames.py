@@ -73,7 +73,7 @@ def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
 
 #: Longest time to wait for a worker, seconds.
 LONGEST_WAIT_S = 200.0
-#: Pause between two reads of the state, seconds. It starts short: most frames are signed at once.
+#: Pause between reads of the state, seconds. It starts short: most frames are signed at once.
 FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.03, 0.5, 1.5
 
 _PRIORITY = {

@@ -246,7 +246,7 @@ async def get_graph(
 ) -> Response:
     """Return the pose graph of an association that has succeeded, for an optimiser.
 
-    The vertices are all frames of the sessions, run by run in the order of time, numbered from 0.
+    The vertices are all frames of the sessions, run by run in chronological order, numbered from 0.
     Their poses are in one coordinate frame if the sessions are joined. By default, edges that no
     other edge supports are omitted, because two frames of different places may look alike. With
     `format=json`, each vertex has the id of its frame.

@@ -144,7 +144,7 @@ def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
     properties = {
         "frame": {
             "type": "array", "minItems": 2, "maxItems": most, "items": bodies.FILE,
-            "description": "One `frame` part for each frame, in the order of time.",
+            "description": "One `frame` part for each frame, in chronological order.",
         },
         "metas": {
             "type": "array", "items": bodies.META,
@@ -333,7 +333,7 @@ async def localize_sequence(
     """Find the pose of a robot in a map from its most recent frames. The pose is that of the last
     frame.
 
-    Send 2 to 10 frames in the order of time, each with its odometry as `pose`, in the same parent
+    Send 2 to 10 frames in chronological order, each with its odometry as `pose`, in the same parent
     frame. Each frame is queried, and all frames vote for the pose of the last one.
     """
     since, at = time.perf_counter(), time.time()

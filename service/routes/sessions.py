@@ -91,7 +91,7 @@ async def patch_session(
 async def get_trajectory(
     map_name: str, request: Request, here: Here, run: Annotated[Run, Query()]
 ) -> Response:
-    """Return the sensor poses of a run in the order of time, in metres.
+    """Return the sensor poses of a run in chronological order, in metres.
 
     A response has at most 100,000 frames. For a longer run, request intervals of time, or limit the
     number of frames with `most`, which selects frames evenly spaced along the run.

@@ -59,7 +59,7 @@ class PosedRun:
     ----------
     name : display name
     map_name, parent_frame : map and parent frame of the frames
-    frame_ids : ids in order of time
+    frame_ids : ids in chronological order
     poses : (4, 4) T_parent_sensor of each frame
     cameras : whether the frames are depth images
     """

@@ -90,7 +90,7 @@ class QueryRecord(ApiRecord):
     milliseconds: float
     kind: Kind | None = Field(description="Kind of the frame; null if the frame was not read.")
     frame: FrameName | None = Field(
-        description="Stored frame of the query; null for an upload, or if you may not read the map "
+        description="Stored frame of the query; null for an upload, or if you cannot read the map "
         "of the frame."
     )
     stored: bool = Field(description="Whether the answer is still stored.")

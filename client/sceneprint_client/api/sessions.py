@@ -39,7 +39,7 @@ class NewAssociation(Given):
         ge=1,
         le=1_000_000,
         description="For one session: minimum number of frames between the two frames of an edge, "
-        f"in the order of time; default: {APART}, or 1 with `not_within_s`.",
+        f"in chronological order; default: {APART}, or 1 with `not_within_s`.",
     )
     not_within_s: float | None = Field(
         default=None,

@@ -89,7 +89,7 @@ def _write_room(folder: Path, number: int) -> None:
 
 #: Without split files: fractions of each sequence for the map, and for the gap after it.
 DATABASE_SHARE, GAP_SHARE = 0.60, 0.05
-#: Greatest number of database and query frames, evenly spread, so that the demo takes minutes.
+#: Maximum number of database and query frames, evenly spread, so that the demo takes minutes.
 MOST_DATABASE, MOST_QUERIES = 300, 180
 
 
@@ -334,7 +334,10 @@ def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> No
 
 
 def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the rows as text lines; figures as `answer_rows` returns them."""
+    """Return a header and a line for each row of `_NAMES`, all of which `rows` must contain.
+
+    The figures are those of `answer_rows`; median distances are printed in centimetres.
+    """
     lines = [
         f"{'first answer within':26}{'5cm/5deg':>10}{'10cm/10deg':>12}{'median cm':>11}{'deg':>7}"
         f"{'first five: m from the query':>32}"

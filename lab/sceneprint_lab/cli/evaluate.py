@@ -210,7 +210,7 @@ def _check_writable(file: Path | None) -> None:
 
 
 def _settings_of(options: argparse.Namespace, model_id: str, *keys: str) -> dict[str, Any]:
-    """Return options and versions that are needed to repeat the evaluation."""
+    """Return the options and versions with which the evaluation can be repeated."""
     from sceneprint import __version__
 
     def plain(value: Any) -> Any:
@@ -304,7 +304,7 @@ def _watch(items: Iterable[T], stage: str, total: int) -> Iterable[T]:
     return tqdm(items, desc=stage, total=total, disable=None)
 
 
-#: Greatest number of frames of a scene, since the overlap of all pairs is computed.
+#: Maximum number of frames of a scene, since the overlap of all pairs is computed.
 _MOST = 2000
 _PAIR_EXAMPLES = """\
 pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes are
@@ -325,7 +325,7 @@ def add_evaluate_pairs(command: argparse.ArgumentParser) -> None:
     _add_judging(command)
     command.add_argument(
         "--right", nargs=2, type=_limit, default=[0.1, 10.0], metavar=("METRES", "DEGREES"),
-        help="greatest errors of a correct transform (default: 0.1 10)",
+        help="maximum errors of a correct transform (default: 0.1 10)",
     )  # fmt: skip
     command.add_argument(
         "--baselines",

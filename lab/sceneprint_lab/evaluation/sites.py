@@ -27,7 +27,7 @@ from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
 
 #: Minimum overlap (smaller direction) of a frame by which a query can be answered.
 ANSWERABLE = 0.3
-#: Maximum distance of a scan by which a scanner's query can be answered, metres.
+#: Maximum distance to a scan that can answer a scanner's query, metres.
 ANSWERABLE_M = 10.0
 #: Standard deviations of a prior, metres and degrees; the latter is its maximum rotation too.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0

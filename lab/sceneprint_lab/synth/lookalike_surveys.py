@@ -478,7 +478,10 @@ def _is_second_variant(index: int) -> bool:
 
 
 def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
-    """Omit one of some equal rows, with queries that visibly differ from all of the map."""
+    """Map all but one of some similar rows of street blocks or bays, and take queries in the last.
+
+    The queries are those stops, of three times as many, that differ most from the mapped rows.
+    """
     street = _is_second_variant(index)
     unit = block(rng) if street else bay(rng)
     rows, count = (2, int(rng.integers(4, 7))) if street else (3, int(rng.integers(2, 4)))

@@ -376,7 +376,7 @@ class Rosette:
     grazing: float = 0.1
 
     def rays(self, rng: np.random.Generator) -> Floats32:
-        """Return unit directions (firings, 3) in order of time, different in every scan."""
+        """Return unit directions (firings, 3) in chronological order, different in every scan."""
         start = rng.uniform(-math.pi, math.pi, 2)
         turned = np.arange(self.firings)[:, None] / self.firings * (2 * math.pi) * self.turns
         waves: NDArray[np.complex128] = np.exp(1j * (turned + start))

@@ -113,7 +113,7 @@ def missed(place: int) -> EventRow:
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two removals of old events, and maximum number of events in one.
+#: Seconds between removals of old events, and maximum number of events in one.
 TIDY_S = 60.0
 AT_MOST = 20_000
 #: Maximum number of prefixes of kinds in a request.
@@ -221,7 +221,7 @@ def event_record(seals: OpaqueIds, row: EventRow) -> Event:
     )  # fmt: skip
 
 
-#: Seconds between two removals of old lines of the audit log.
+#: Seconds between removals of old lines of the audit log.
 PRUNE_S = 3600.0
 #: Number of lines to read at once.
 _BLOCK = 1000

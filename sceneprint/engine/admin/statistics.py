@@ -53,7 +53,7 @@ from sceneprint_client.api.admin import (
 
 log = logging.getLogger(__name__)
 
-# State of the search indexes, and the events that are their anchors.
+# State of the search indexes, and the events that anchor them.
 
 #: Maximum number of maps to report: those that changed most often.
 MOST = 200

@@ -191,7 +191,7 @@ def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
 
 #: Kinds of the jobs that import archives, maps in one file, and recordings, by `as`.
 KINDS = {"frames": "import", "map": "import-map", "recording": "import-bag"}
-#: Seconds between two removals of archives of finished imports.
+#: Seconds between removals of archives of finished imports.
 TIDY_S = 5.0
 #: Maximum size of a compressed tar's content, relative to the largest accepted archive.
 _UNPACKED = 4

@@ -64,7 +64,7 @@ from sceneprint_client.api.frames import VIRTUAL, ImportOptions, MapImportResult
 
 #: Number of views to render and add in one commit.
 _AT_ONCE = 16
-#: Seconds between two checks whether all views are signed.
+#: Seconds between checks whether all views are signed.
 _PAUSE_S = 1.0
 #: Maximum units per metre of rendered depth images, and units of the farthest point.
 _DEPTH_SCALE, _FARTHEST = 1000.0, 65_000

@@ -57,7 +57,10 @@ class _Group(Generic[W]):
         self._led = False
 
     def _await(self, work: W) -> Any:
-        """Wait until this or another thread has performed a write, and return its result."""
+        """Add a write, wait until this or another thread has performed it, and return its result.
+
+        The error of the write is raised. An interrupted thread withdraws a write that waits.
+        """
         mine = _Waiting(work)
         with self._list:
             self._waiting.append(mine)

@@ -91,7 +91,11 @@ def record_job_event(connection: Connection, kind: str, work: Work) -> None:
 
 
 def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
-    """Reject a frame that cannot be signed, since another attempt would fail too."""
+    """Fail the job of a frame that cannot be signed, and reject the frame; return the job's state.
+
+    A frame that is signed again (`work.again`) keeps its state. If the map has another model by
+    now, the jobs of the frame start again. The result is None if the lease was lost.
+    """
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
         with store.database.write(map_number=work.map.number) as connection:

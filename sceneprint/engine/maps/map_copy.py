@@ -192,7 +192,7 @@ def pull_map(
 
     Raises
     ------
-    UnknownMap : If the map does not exist in the service, or the key may not read it.
+    UnknownMap : If the map does not exist in the service, or the key cannot read it.
     Conflict : If the map was replaced or lost artifacts meanwhile, or frames were uploaded into the
         copy.
     DamagedBlob : If the service sent damaged bytes.

@@ -351,7 +351,7 @@ class Output(Generic[T]):
     ----------
     tag : entity tag, which changes with the data
     make : function that computes the data, which takes at most about 100 ms
-    blob : digest of the blob if the data is stored instead
+    blob : digest of the blob, if the data is stored as a blob instead of in `data`
     """
 
     tag: str

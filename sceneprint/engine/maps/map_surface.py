@@ -169,7 +169,7 @@ class MapSurfaces:
 
         Raises
         ------
-        UnknownMap, NotFound : If the map does not have the tile any more.
+        UnknownMap, NotFound : If the map no longer has the tile.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
@@ -394,7 +394,7 @@ def remove_block(store: Store, row: MapRow) -> bool:
     return over
 
 
-#: Seconds between two checks of all maps, and maximum delay of a job while frames are arriving.
+#: Seconds between checks of all maps, and maximum delay of a job while frames are arriving.
 LOOK_S, LONGEST_S = 5.0, 60.0
 #: Replaces the time of the first change of a map whose changes have been handled.
 _DONE = math.inf

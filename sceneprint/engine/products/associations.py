@@ -71,7 +71,7 @@ def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
 
 
 def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> list[list[PathFrame]]:
-    """Return the frames of each session that pass the filter, in order of time.
+    """Return the frames of each session that pass the filter, in chronological order.
 
     Raises
     ------

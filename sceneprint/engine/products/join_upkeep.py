@@ -29,11 +29,11 @@ from sceneprint_client.api.sessions import NewAssociation
 
 log = logging.getLogger(__name__)
 
-#: Seconds between two checks of all maps.
+#: Seconds between checks of all maps.
 LOOK_S = 5.0
 #: Minimum number of frames in each session: a strong join has ten votes from five frames of each.
 LEAST_FRAMES = 5
-#: Growth factor of the number of frames after which two sessions are associated again.
+#: Factor by which the number of frames must grow before two sessions are associated again.
 GROWTH = 1.25
 #: Maximum number of a map's newest associations to consider.
 _JOBS = 200

@@ -36,7 +36,7 @@ class PoseGraph:
 
     Parameters
     ----------
-    stops : vertices: the frames of each run in order of time
+    stops : vertices: the frames of each run in chronological order
     poses : pose of each vertex; None if unknown
     frames : parent frame of each pose
     edges : edges between indexes of `stops`
@@ -58,7 +58,7 @@ def pose_graph(
 
     Parameters
     ----------
-    runs : frames of each session, in order of time
+    runs : frames of each session, in chronological order
     items : items of the edges, whose frames must be in `runs`
     joins : joins in the association's result
     odometry : whether to add edges between consecutive frames with poses

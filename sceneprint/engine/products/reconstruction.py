@@ -254,7 +254,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
         Raises
         ------
         InvalidRequest : If the answer lacks accepted matches or the requested frames.
-        UnknownMap : If the map does not exist any more.
+        UnknownMap : If the map no longer exists.
         """
         chosen = _matches_to_fuse(stored.answer.matches, request)
         views, own = [_view(match) for match in chosen], stored.answer.frame

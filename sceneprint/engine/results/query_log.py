@@ -69,17 +69,17 @@ log = logging.getLogger(__name__)
 
 #: Format of query ids.
 _ID = re.compile(r"[0-9a-f]{32}")
-#: Seconds between two commits of a process. The first query after a pause is written at once.
+#: Seconds between commits of a process. The first query after a pause is written at once.
 GATHER_S = 0.1
 #: Maximum number of queries in one commit, and of waiting queries and the bytes of their geometry.
 AT_ONCE, MOST_WAITING, MOST_WAITING_BYTES = 100, 10_000, 64 << 20
 #: Number of answers to store concurrently.
 AT_ONCE_PUT = 8
-#: Seconds between two attempts to write waiting queries, and maximum wait when the log is closed.
+#: Seconds between attempts to write waiting queries, and maximum wait when the log is closed.
 AGAIN_S, CLOSING_S = 2.0, 5.0
 #: Seconds that a reader waits until queries of this process are written.
 PATIENCE_S = 10.0
-#: Seconds between two removals, and maximum numbers of rows in one removal and in one commit.
+#: Seconds between removals, and maximum numbers of rows in one removal and in one commit.
 TIDY_S, TIDY_MOST, BLOCK = 60.0, 20_000, 100
 #: Maximum numbers of queries and of permanently stored answers of a map.
 MOST_QUERIES, MOST_KEPT = 100_000, 1000

@@ -92,7 +92,7 @@ class _Attempt:
     ----------
     searched : R of the frame
     selection : C; None if it was not requested
-    among, scales : distances within R, and parameters of the selection
+    among, scales : distances within R, and the parameters of the selection
     chosen : positions in R of the candidates: C, or the first frames of R
     checks : validations of the candidates that decide the pose, regardless of `k`
     rows : rows of the frames in the answer, by number

@@ -54,7 +54,7 @@ from sceneprint.store.tables import MapRow
 log = logging.getLogger(__name__)
 
 _FOLDER, _SWEPT, _USED = "index/", "index/.swept", ".used"
-#: Seconds between two checks for a newer index of a queried map, and after an error.
+#: Seconds between checks for a newer index of a queried map, and after an error.
 LOOK_S = 30.0
 #: Age in seconds above which unlisted parts are removed, since others may be fetching newer ones.
 GRACE_S = 600.0

@@ -216,7 +216,7 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
 
 #: Number of new frames above which a reader starts again with a newer index, if there is one.
 READ_MOST = 20_000
-#: Seconds between two checks for a newer version, and until a damaged or unreadable version is
+#: Seconds between checks for a newer version, and until a damaged or unreadable version is
 #: tried again.
 _LOOK_S, _AGAIN_S = 1.0, 60.0
 

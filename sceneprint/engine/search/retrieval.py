@@ -42,7 +42,7 @@ from sceneprint_client.api.frames import Kind
 
 #: Memory of all tails in bytes above which the readers of least recently queried maps are closed.
 HELD_BYTES = 1 << 30
-#: Seconds between two searches for readers of deleted maps.
+#: Seconds between searches for readers of deleted maps.
 _TIDY_S = 10.0
 
 

@@ -266,7 +266,11 @@ _LEAST_EIGENVALUE = 1e-12
 
 
 def _prior_covariance(prior: Prior) -> Floats:
-    """Return the covariance (6, 6) of a prior; raise InvalidRequest if it is not valid."""
+    """Return the covariance (6, 6) of a prior, metres before radians.
+
+    It is diagonal if only deviations are given. Raise InvalidRequest if it is not symmetric and
+    positive definite, or a deviation is out of range.
+    """
     if prior.covariance is None:
         metres, radians = prior.deviation_m, math.radians(prior.deviation_deg)
         return np.diag(np.square([metres] * 3 + [radians] * 3))

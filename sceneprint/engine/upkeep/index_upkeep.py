@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 STEP_S = 0.25
 #: Name of the file whose date is the start of the last round of any worker.
 _STAMP = ".scrubbed"
-#: Maximum seconds between two checks for old deletions that an index lacks.
+#: Maximum seconds between checks for old deletions that an index lacks.
 AGING_S = 3600.0
 #: Seconds until the next attempt after another host built an index, or an error of a shared one.
 ELSEWHERE_S = 30.0
@@ -169,7 +169,7 @@ class Upkeep:
 
         Raises
         ------
-        UnknownMap : If the map does not exist any more.
+        UnknownMap : If the map no longer exists.
         InvalidRequest : If the map has no indexed frame, or its model has no index.
         BusyIndex : If another process is building the index.
         OSError : If the index cannot be written; the former one remains.
@@ -198,7 +198,7 @@ class Upkeep:
 
         Raises
         ------
-        UnknownMap : If the map does not exist any more.
+        UnknownMap : If the map no longer exists.
         BusyIndex : If another process is building the index.
         """
         if row.next_model_id is None:
@@ -287,7 +287,7 @@ class Upkeep:
 
         Raises
         ------
-        UnknownMap : If the map does not exist any more; its index is removed soon.
+        UnknownMap : If the map no longer exists; its index is removed soon.
         BusyIndex : If another process is building the index, possibly with deleted frames.
         OSError, UnusableStore : If the index cannot be written; the former one remains.
         """

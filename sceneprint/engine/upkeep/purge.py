@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 AT_ONCE = 100
 #: Maximum duration of a call in seconds, since jobs wait in the meantime.
 TURN_S = 2.0
-#: Seconds between two checks after all old frames were deleted.
+#: Seconds between checks after all old frames were deleted.
 LOOK_S = 60.0
 #: Reason for the deletion, in events.
 REASON = "retention"

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 #: Priority of repair jobs, above that of new uploads.
 PRIORITY = 5
-#: Minimum seconds between two repairs of a frame, so that queries of an irreparable frame do not
+#: Minimum seconds between repairs of a frame, so that queries of an irreparable frame do not
 #: occupy the workers.
 PAUSE_S = 600.0
 #: Maximum number of frames that one query schedules for repair.

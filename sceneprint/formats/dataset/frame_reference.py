@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sceneprint_client.api import FrameMeta
     from sceneprint_client.api.frames import ImportOptions
 
-_TOLERANCE = 1e-2  #: maximum difference of the length of a quaternion from 1
+_TOLERANCE = 1e-2  #: maximum deviation of the length of a quaternion from 1
 _MAXIMUM_TRAJECTORY_BYTES = 2**26  #: size of an hour of poses at 200 Hz
 
 

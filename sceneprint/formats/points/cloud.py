@@ -106,7 +106,9 @@ def _column_spread(values: Floats32, length: int) -> float:
 
 
 def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """Return the points of an NPY file of shape (N, 3) or (N, 4), without the fourth column.
+    """Return the points, metres, of a float16, float32 or float64 NPY file, (N, 3) or (N, 4).
+
+    The fourth column is omitted. The blocks are read when they are iterated, once.
 
     Raises
     ------

@@ -50,7 +50,7 @@ AXES: dict[str, Floats] = {
 FAR_M = 1000.0
 _STL_HEADER, _STL_TRIANGLE = 84, 50  #: bytes
 _BLOCK = 1 << 18
-#: Coordinate beyond all places on Earth in any supported unit; its products are finite.
+#: Coordinate larger than that of any place on Earth in any supported unit; its products are finite.
 _MOST_UNITS = 1e15
 #: Usual range of the extent of a place, metres; other extents cause a note.
 _SMALL_M, _LARGE_M = 1.0, 5000.0
@@ -344,7 +344,20 @@ def _proper(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
 
 
 def _to_metres(points: Floats32, origin: Floats, units: float) -> Floats:
-    """Convert points to metres relative to an offset, in place, and return the offset (3,)."""
+    """Convert points in place to metres relative to an offset, and return the offset (3,), metres.
+
+    The offset is the middle of the points in whole metres if it is farther than `FAR_M`, else 0.
+
+    Parameters
+    ----------
+    points : (N, 3) relative to `origin`, in units of the file
+    origin : (3,) in units of the file
+    units : number of units per metre
+
+    Raises
+    ------
+    UnreadableCloud : If the points are more than `2 * FARTHEST_M` apart along an axis.
+    """
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     widest = float((high - low).max()) / units
     if not widest <= 2 * FARTHEST_M:

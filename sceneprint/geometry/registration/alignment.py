@@ -417,8 +417,8 @@ class AlignmentParameters:
     fine_stride: int = 4  #: stride of the pixels in this refinement
     violation_weight: float = 3.0  #: weight of a violation in the score of a hypothesis
     rank_violations: float = 1.0  #: weight of violations in the rank of a refined hypothesis
-    same_m: float = 0.1  #: maximum difference of equal hypotheses, metres
-    same_rad: float = math.radians(6.0)  #: maximum difference of equal hypotheses, radians
+    same_m: float = 0.1  #: maximum difference between equal hypotheses, metres
+    same_rad: float = math.radians(6.0)  #: maximum difference between equal hypotheses, radians
     coarse: RefinementParameters = COARSE
     fine: RefinementParameters = FINE
     lever: float = 1.0  #: length that counts as one radian in `stiffness`, metres

@@ -47,7 +47,7 @@ class PlanParameters:
 
     cell: float = 0.1  #: width of a cell of the plan image, metres
     side: int = 128  #: width of the plan image, cells
-    voxel: float = 0.08  #: width of the cubes, one point of which is drawn, metres
+    voxel: float = 0.08  #: width of the cubes, metres; one point of each is drawn
     tilt: float = math.radians(50.0)  #: maximum angle between up and the scanner's axis
     n_yaws: int = 72  #: number of yaws
     kept_yaws: int = 24  #: number of yaws whose plans are correlated
@@ -389,7 +389,8 @@ def _correlate_plans(
 def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> Floats:
     """Return transforms (n, 4, 4) T_target_source that align what is above the ground, best first.
 
-    A half turn of an image conjugates its Fourier transform, so each transform serves two yaws.
+    Only the `sliced_yaws` pairs of opposite yaws at which the plans agree best are tried. A half
+    turn of an image conjugates its spectrum, so one spectrum serves both yaws of a pair.
     """
     half = p.n_yaws // 2
     agreement = _yaw_agreement(source, target)

@@ -34,8 +34,8 @@ class SequenceParameters:
     n_neighbours: int = 12  #: number of nearest neighbours of a patch
     minimum_distance: float = 0.1  #: minimum distance of a neighbour, metres
     radius: float = 1.6  #: maximum distance of a neighbour, metres
-    length_scale: float = 0.35  #: difference of lengths that costs one half, metres
-    angle_scale: float = 1.0  #: difference of angles that costs one half, radians
+    length_scale: float = 0.35  #: difference between lengths that costs one half, metres
+    angle_scale: float = 1.0  #: difference between angles that costs one half, radians
     gap_cost: float = 0.5  #: cost of an inserted or omitted neighbour; a replacement costs 1
     swap_cost: float = 0.1  #: cost of a swap, without the costs of the differences
     n_sources: int = 100  #: number of sampled patches of the source

@@ -375,7 +375,7 @@ def kernel_matrix(to_query: Distances, among: Distances, sigma: float, omega: fl
 def diversify(
     to_query: Distances, among: Distances, k: int, p: DiversityParameters | None = None
 ) -> Selection:
-    """Select up to `k` members of a ranking by greedy maximisation of det L_C: Sec. III-D.
+    """Select up to `k` members of a ranking by greedily maximising det L_C (Sec. III-D).
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ _MOST_POINTS, _MOST_TRIANGLES = 1_000_000, 1_000_000
 #: Edges of the cells in which planes are fitted, as shares of the extent, and the minimum mean
 #: number of points per cell: the finest edge that reaches it is used.
 _EDGES, _CELL_POINTS = (1 / 256, 1 / 128, 1 / 64, 1 / 32, 1 / 16), 12.0
-#: Conditions of a plane: minimum number of points, minimum ratio of its second variance to its
+#: Conditions for a plane: minimum number of points, minimum ratio of its second variance to its
 #: first, and maximum ratio of the third variance to the second.
 _FEWEST, _NO_LINE, _FLAT = 6, 0.05, 0.1
 #: Number of directions on the hemisphere, and of pieces that vote for them.

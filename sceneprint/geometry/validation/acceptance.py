@@ -48,7 +48,7 @@ class AcceptanceParameters:
     """
 
     residual_m: float = 0.08  #: maximum residual of the composed directions: epsilon_val, metres
-    residual_rad: float = math.radians(5.0)  #: maximum residual of both directions, radians
+    residual_rad: float = math.radians(5.0)  #: maximum residual in either direction, radians
     violation_weight: float = 5.0  #: evidence = overlap - violation_weight * violations
     evidence: float = 0.2  #: minimum evidence
     plane_overlap: float = 0.15  #: minimum plane overlap

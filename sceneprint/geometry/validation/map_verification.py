@@ -56,10 +56,10 @@ class MapParameters:
     n_refining: int = 3  #: number of views with which a pose is refined
     n_noise: int = 4  #: number of map frames whose violations measure the noise
     least_noise: float = 0.02  #: violations of a pose above which noise is measured
-    same_m: float = 0.1  #: maximum difference of equal poses, metres
-    same_rad: float = math.radians(6.0)  #: maximum difference of equal poses, radians
-    place_m: float = 0.25  #: maximum difference of poses at one place, metres
-    place_rad: float = math.radians(15.0)  #: maximum difference of poses at one place, radians
+    same_m: float = 0.1  #: maximum difference between equal poses, metres
+    same_rad: float = math.radians(6.0)  #: maximum difference between equal poses, radians
+    place_m: float = 0.25  #: maximum difference between poses at one place, metres
+    place_rad: float = math.radians(15.0)  #: maximum difference between poses at one place, radians
     refinement: RefinementParameters = COARSE
     planes: PlaneParameters = field(default_factory=PlaneParameters)
 

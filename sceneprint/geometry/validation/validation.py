@@ -222,6 +222,9 @@ def validate(
 ) -> PairValidation:
     """Align a query with a candidate in both directions, and decide on acceptance: Sec. III-E.
 
+    If a frame has fewer than `p.minimum_patches` patches, or no transform is confirmed, the result
+    is a rejection with its reason and without a transform.
+
     Parameters
     ----------
     query, match : geometry artifacts of one model
@@ -230,7 +233,8 @@ def validate(
     matching : method of matching
     ups : (3,) unit vectors, up in the query's and in the match's coordinates, or None. If both are
         known, transforms that tilt are excluded; for scans, one of them helps too
-    other_axes : whether to consider scanners that did not stand upright, if `ups` are unknown
+    other_axes : for two scans, whether to consider scanners that were not upright, if `ups` are
+        unknown
 
     Raises
     ------

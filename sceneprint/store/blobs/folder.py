@@ -35,7 +35,7 @@ TURN_S, REMOVAL_S = 5.0, 25.0
 #: Seconds after which each removal has ended, even that of a dead process: it sends no request
 #: after REMOVAL_S, and each request ends within `object_client.TRIED_S` and `SMALL_S`.
 LONGEST_S = 90.0
-#: Seconds between two attempts to take the lock of a folder.
+#: Seconds between attempts to take the lock of a folder.
 _LOOK_S = 0.01
 
 
@@ -355,7 +355,7 @@ class Blobs(ABC):
 
         Raises
         ------
-        UnusableStore : If this user may not read the blob, or the storage is unreachable.
+        UnusableStore : If this user cannot read the blob, or the storage is unreachable.
         """
 
     @abstractmethod
@@ -530,7 +530,7 @@ class FolderBlobs(Blobs):
             return "missing"
         except PermissionError as error:
             raise UnusableStore(
-                f"{self.path(digest)}: This user may not read the blob. Run the command as the "
+                f"{self.path(digest)}: This user cannot read the blob. Run the command as the "
                 "user who owns the data folder."
             ) from error
         except OSError:  # a disk error, or a folder with the name of the blob

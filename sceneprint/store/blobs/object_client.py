@@ -141,7 +141,7 @@ class Objects:
         self._variables = variables
         #: URL for messages, without credentials.
         self.url = url
-        self._away = (0.0, "")  # end of the pause after a failure, and the reason of the failure
+        self._away = (0.0, "")  # end of the pause after a failure, and the reason for the failure
 
     def put(self, key: str, data: bytes, *, create: bool = False) -> bool:
         """Store bytes under a key, and return after the store has acknowledged them.
@@ -211,6 +211,8 @@ class Objects:
 
     def read_range(self, key: str, start: int, length: int) -> bytes:
         """Return a range of an object. Raise FileNotFoundError if it does not exist.
+
+        UnusableStore is raised if the object ends before the range.
 
         Parameters
         ----------

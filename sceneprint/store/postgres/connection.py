@@ -254,7 +254,7 @@ class SingleStatement:
 
         Raises
         ------
-        NewerSchema : If another version migrated the store, and this version may not write to it.
+        NewerSchema : If another version migrated the store, and this version cannot write to it.
         MapsInUse : If a map is in use for longer than `maps_wait_s`.
         ValueError : If a statement has already been executed.
         """
@@ -324,7 +324,7 @@ class KnownSchema:
 
     Parameters
     ----------
-    check : function that raises an error if this process may not write to a schema
+    check : function that raises an error if this process cannot write to a schema
     """
 
     def __init__(self, check: Callable[[Any], None]) -> None:
