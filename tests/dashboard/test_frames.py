@@ -80,6 +80,7 @@ def test_gallery_shows_and_filters_what_the_api_lists(
     expect(first.locator(".tile-who")).to_have_text("bob · room-1/bob")
     assert axe(page) == []
 
+    page.get_by_text("Filters", exact=True).click()
     page.get_by_label("Session").select_option("room-0/ann")
     settle(page)
     ann = listed(station, "building", order="desc", session="room-0/ann")
@@ -102,6 +103,7 @@ def test_gallery_shows_and_filters_what_the_api_lists(
     settle(page)
     assert len(ids(page)) == 16
 
+    page.get_by_text("Filters", exact=True).click()
     page.get_by_label("Tag").fill("door")
     page.get_by_label("Tag").blur()
     page.get_by_label("Taken from").fill("2026-11-20T09:01")
@@ -331,7 +333,7 @@ def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
     page.get_by_role("dialog").get_by_role("button", name="Delete").click()
     expect(page.get_by_role("heading", name="No frames yet")).to_be_visible()
     assert station.client.get(mine).json()["state"] == "deleted"
-    toast = page.locator(".toast").bounding_box()
+    toast = page.locator(".toast", has_text="Deleted 1 frame").bounding_box()
     assert toast is not None
     assert toast["x"] + toast["width"] <= 200  # in the rail, where it covers no control
     page.get_by_role("button", name="Undo", exact=True).click()
@@ -360,6 +362,7 @@ def test_frames_are_found_selected_changed_and_restored(
     # by name, by id, by session: one field
     page.goto(f"{station.home}#/maps/picked")
     settle(page)
+    page.get_by_text("Filters", exact=True).click()
     for text, found in (("n3", [came[3]]), (came[1], [came[1]]), ("mon", came[3::-1])):
         page.get_by_label("Find").fill(text)
         page.keyboard.press("Enter")

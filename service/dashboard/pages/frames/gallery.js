@@ -45,6 +45,7 @@ export async function render(root, { params, search, signal, go, title, actions 
   const order = h("select", { id: "order", "aria-label": "Order", onChange: () => turn({ order: order.value || null }) },
     h("option", { value: "" }, "Newest first"), h("option", { value: "asc" }, "Oldest first"));
   let bar = filterBar(wanted, [], turn);
+  const fold = h("details", { class: "filters-fold", open: FILTERS.some((one) => wanted.has(one)) }, h("summary", {}, "Filters"), bar);
   const clear = h("button", { class: "button quiet", type: "button", onClick: () => turn(Object.fromEntries(FILTERS.map((one) => [one, null]))) }, "Clear filters");
   // the tabs of the page and the filters are many steps of the keyboard before the first frame
   const past = h("a", { class: "skip", href: "#frames", onClick: (event) => {
@@ -55,7 +56,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     filter: () => filterOf(wanted), total: () => countOf(wanted, runs && !runs.next_cursor ? runs.items : null),
     changed: () => Promise.all([fetchList(), fetchRuns()]),
   }) : null;
-  put(root, past, bar, h("div", { class: "gallery-head" }, views, order, clear, over), selected, news, place, under);
+  put(root, past, h("div", { class: "gallery-head" }, views, order, fold, clear, over), selected, news, place, under);
 
   /** Another list begins at its first page. */
   function turn(asked) {
