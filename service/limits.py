@@ -340,8 +340,8 @@ def network_of(address: str) -> str:
     return str(found)
 
 
-#: Maximum pause within a body, seconds.
-IDLE_S = 10.0
+#: Maximum pause within a body, maximum wait for all of it, and more of that for each MiB, seconds.
+IDLE_S, BODY_S, S_PER_MIB = 10.0, 30.0, 4.0
 _IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
 #: Number of bytes of a body that stay in memory until they are read; the rest is spooled to disk.
 #: Tenants are charged for disk space in steps of this size.
@@ -392,7 +392,10 @@ class BodySpool:
 
 
 class RequestBody:
-    """The body of one request, read within a limit of size, without long pauses.
+    """The body of one request, read within limits of size and time.
+
+    The time limit grows with the received bytes, not with the announced length. Only the wait for
+    the client counts.
 
     Parameters
     ----------
@@ -401,7 +404,8 @@ class RequestBody:
     """
 
     def __init__(self, receive: Receive, most: int) -> None:
-        self._receive, self._most, self._bytes, self._whole = receive, most, 0, False
+        self._receive, self._most, self._waited_s, self._whole = receive, most, 0.0, False
+        self.received = 0  # bytes
         #: Why the body is not read further.
         self.fault: SceneprintError | None = None
         self._spool: BodySpool | None = None
@@ -417,32 +421,31 @@ class RequestBody:
             self._spool.give(self._tenant, self._charged)
             self._charged = 0
 
-    @property
-    def received(self) -> int:
-        """Number of received bytes."""
-        return self._bytes
-
     async def next(self) -> Message:
         """Return the next part, and after the last part any further message. Raise Broken with the
         reason in `fault`.
         """
         if self._whole:
             return await self._receive()
+        left_s = BODY_S + S_PER_MIB * self.received / (1 << 20) - self._waited_s
+        start = time.monotonic() - self._waited_s
         try:
-            async with asyncio.timeout(IDLE_S):
+            async with asyncio.timeout(min(IDLE_S, left_s)):
                 message = await self._receive()
         except TimeoutError:
             self.fault = SlowBody(
-                f"The body arrived too slowly: no data for {IDLE_S:g} s, after {self._bytes} "
-                "bytes. Send smaller bodies, or use a faster link."
+                f"The body arrived too slowly: {self.received} bytes in "
+                f"{time.monotonic() - start:.0f} s. It may take {BODY_S:g} s plus {S_PER_MIB:g} s "
+                f"for each MiB, and pause for {IDLE_S:g} s. Send less, or use a faster link."
             )
             raise Broken from None
-        self._bytes += len(message.get("body", b""))
+        self._waited_s = time.monotonic() - start
+        self.received += len(message.get("body", b""))
         self._whole = not message.get("more_body", False)
-        if self._bytes > self._most:
+        if self.received > self._most:
             self.fault = too_large(self._most)
             raise Broken
-        more = IN_MEMORY * math.ceil(self._bytes / IN_MEMORY - 1) - self._charged
+        more = IN_MEMORY * math.ceil(self.received / IN_MEMORY - 1) - self._charged
         if self._spool is not None and more > 0:
             try:
                 self._spool.take(self._tenant, more)

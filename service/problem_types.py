@@ -53,7 +53,7 @@ PROBLEM_TYPES = {
         406, "Omit `Accept`.", "`Accept` names no type that the operation returns."
     ),
     "SlowBody": ProblemType(
-        408, "Send the body without pauses of 10 s or more."
+        408, "Send the body faster: within 30 s plus 4 s for each MiB, without pauses of 10 s."
     ),
     "Conflict": ProblemType(409, "Compare the request with the stored object."),
     "MapExists": ProblemType(409, "Use the map as it is, or another name."),

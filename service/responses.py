@@ -209,11 +209,8 @@ def _requested_range(request: Request, tag: str, size: int) -> tuple[int, int]:
         return whole
     if not found[1]:  # a suffix range: the last bytes
         return (size - min(int(found[2]), size), size - 1) if int(found[2]) else (size, size - 1)
-    first = int(found[1])
-    last = min(int(found[2]), size - 1) if found[2] else size - 1
-    if found[2] and int(found[2]) < first:
-        return whole
-    return first, last
+    first, last = int(found[1]), int(found[2] or size - 1)
+    return whole if found[2] and last < first else (first, min(last, size - 1))
 
 
 def _chunks(file: BinaryIO, first: int, last: int) -> Iterator[bytes]:

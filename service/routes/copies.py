@@ -31,7 +31,8 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
     MB. To receive the remaining parts, repeat the request.
     """
     known = await read_record(request, CopyRequest, "The request")
-    return _response(await here.run(here.copies.bundle, map_name, frozenset(known.have)))
+    data = await here.run(here.copies.bundle, map_name, frozenset(known.have))
+    return Response(data, media_type=_BYTES)
 
 
 @router.get("/artifacts/{digest}", response_class=Response, responses=_responses(404, 422))
@@ -39,14 +40,10 @@ def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
     """Return the geometry that validation compares for an indexed frame."""
-    return _response(here.copies.artifact(map_name, digest))
+    return Response(here.copies.artifact(map_name, digest), media_type=_BYTES)
 
 
 @router.get("/model", response_class=Response, responses=_responses(404))
 def get_map_model(map_name: str, here: Here) -> Response:
     """Return the model file of a map."""
-    return _response(here.copies.model(map_name))
-
-
-def _response(data: bytes) -> Response:
-    return Response(data, media_type=_BYTES)
+    return Response(here.copies.model(map_name), media_type=_BYTES)

@@ -12,7 +12,7 @@ from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
 from sceneprint_client.api import Frame, Map, NewMap, Page
 from sceneprint_client.api.listing import OPERATORS
 from service.auth import Sender, may_admin, may_read, may_write, v1_router
-from service.bodies import json_body, read_json_object, read_record
+from service.bodies import json_body, query_parameter, read_json_object, read_record
 from service.problems import refusals
 from service.responses import expected_tags
 from service.running_service import Here
@@ -81,14 +81,11 @@ DryRun = Annotated[
 def _document(record: str) -> dict[str, Any]:
     """Return the request body and the header `If-Match`, which FastAPI cannot infer."""
     schema = {"schema": {"$ref": f"#/components/schemas/{record}"}}
-    if_match = {
-        "name": "If-Match",
-        "in": "header",
-        "required": False,
-        "schema": {"type": "string"},
-        "description": "The ETag of a previous response. If the object has been edited since, the "
-        "response is 412. Without the header, the last edit wins.",
-    }
+    text = (
+        "The ETag of a previous response. If the object has been edited since, the response is "
+        "412. Without the header, the last edit wins."
+    )
+    if_match = query_parameter("If-Match", {"type": "string"}, text) | {"in": "header"}
     body = {"required": True, "content": dict.fromkeys(_KINDS, schema)}
     return {"requestBody": body, "parameters": [if_match]}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated
 
 from fastapi import Depends, Query, Request, Response
@@ -57,8 +56,7 @@ def begin_surface(map_name: str, here: Here, response: Response) -> MapSurface:
     """
     surface, begun = here.surfaces.begin(map_name)
     response.headers["Location"] = f"/v1/maps/{map_name}/surface"
-    if not begun:
-        response.status_code = 200
+    response.status_code = 202 if begun else 200
     return surface
 
 
@@ -177,9 +175,7 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
-    if len(found) != count or not all(
-        math.isfinite(one) and abs(one) <= FARTHEST_M for one in found
-    ):
+    if len(found) != count or not all(abs(one) <= FARTHEST_M for one in found):  # NaN is not
         raise InvalidRequest(
             f"`{name}` is {text!r:.80}. Specify {count} numbers in metres, separated by commas.",
             ((name, f"not {count} numbers"),),
