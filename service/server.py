@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -87,6 +88,13 @@ class Connection(H11Protocol):
         """Note that the client has read enough."""
         super().resume_writing()
         self._unread_before = math.inf
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse a request that is not HTTP; abort the connection if its response has begun."""
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            super().send_400_response(msg)
+        else:
+            self.transport.abort()
 
     def shutdown(self) -> None:
         """Finish the response in progress, or close an idle connection."""

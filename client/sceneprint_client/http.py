@@ -553,6 +553,9 @@ def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
 
 #: Statuses of a proxy that cannot reach the service.
 _OF_PROXY = (502, 503, 504)
+#: Statuses without a problem document for a URL and headers that are too long, and the least number
+#: of bytes that some proxies refuse.
+_OF_LONG_HEADS, _LONG_HEAD = (400, 414, 431), 8 << 10
 
 
 def unreachable(url: str, error: Exception | None) -> errors.Unreachable:
@@ -619,12 +622,19 @@ def _error_of(response: httpx.Response) -> errors.SceneprintError:
                 f"{response.request.url} answered {response.status_code} {response.reason_phrase}: "
                 "a proxy in front of the service cannot reach a ready process. Try again later."
             )
-        return errors.Refused(
-            f"{response.request.url} answered {response.status_code} {response.reason_phrase} "
-            "without a reason, so it is probably not sceneprint. Check the address.",
-            response.status_code,
-            {},
-        )
+        request = response.request
+        answered = f"answered {response.status_code} {response.reason_phrase} without a reason"
+        lengths = [len(name) + len(value) for name, value in request.headers.raw]
+        length = len(request.url.raw_path) + sum(lengths)
+        if response.status_code in _OF_LONG_HEADS and length > _LONG_HEAD:
+            text = (
+                f"{request.url.copy_with(query=None)} {answered}, most likely because the URL and "
+                f"the headers of the request have {length} bytes. The service accepts 16 KiB, and "
+                "some proxies only 8 KiB. Send fewer or shorter tags or other options."
+            )
+        else:
+            text = f"{request.url} {answered}, so it is probably not sceneprint. Check the address."
+        return errors.Refused(text, response.status_code, {})
     kind = problem_kinds().get(problem.type.rstrip("/").rpartition("/")[2])
     if kind is None:
         return errors.Refused(problem.detail, response.status_code, problem.model_dump())

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from importlib.util import find_spec
+from io import BytesIO
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ import pytest
 from sceneprint import errors
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, http, meta_of
+from sceneprint_client.api.frames import ImportOptions
 from sceneprint_client.http import retry_after_s
 
 MAP = {
@@ -157,6 +159,15 @@ def test_another_kind_of_server(scripted: Make) -> None:
             client.map("m")
         with Client(server.url) as client:
             assert not client.healthy()
+
+
+def test_a_head_that_is_too_long(scripted: Make) -> None:
+    server = scripted([(400, {}, "Invalid HTTP request received.")])
+    options = ImportOptions(tags=["地" * 121] * 16)
+    with Client(server.url) as client, pytest.raises(errors.Refused, match="fewer or shorter tags"):
+        client.import_archive("m", BytesIO(b"PK"), options)
+    with Client(server.url) as client, pytest.raises(errors.Refused, match="Check the address"):
+        client.map("m")
 
 
 def test_pages_are_followed(scripted: Make) -> None:

@@ -10,8 +10,8 @@ import json
 import socket
 import ssl
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from typing import Any
 
@@ -317,7 +317,52 @@ def test_a_body_that_stops_is_refused(opened, sent):
     wire = opened(ask("/", "Content-Length: 9", method="POST") + sent)
     status, problem = refusal(rest(wire))
     assert (status, problem["type"]) == (408, "/problems/slow-body")
-    assert f" s, after {len(sent)} bytes" in problem["detail"]
+    assert f" {len(sent)} bytes in " in problem["detail"]
+
+
+def test_a_body_that_drips_is_refused_in_the_end(opened, monkeypatch):
+    monkeypatch.setattr(limits, "IDLE_S", 60)
+    monkeypatch.setattr(limits, "BODY_S", 1.0)
+    wire = opened(ask("/", "Content-Length: 99999", method="POST"))
+    with dripping(wire, b"a"):
+        status, problem = refusal(rest(wire))
+    assert (status, problem["type"]) == (408, "/problems/slow-body")
+
+
+def test_each_received_mebibyte_gives_more_time(monkeypatch):
+    """By hand: 30 s, and 4 s for each MiB; parts take 3 s; the 50 s between do not count."""
+    now, left = [0.0], []
+
+    @asynccontextmanager
+    async def timeout(seconds: float) -> AsyncIterator[None]:
+        left.append(seconds)
+        yield
+
+    async def receive() -> dict[str, Any]:
+        now[0] += 3
+        return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
+
+    async def read() -> None:
+        body = limits.RequestBody(receive, 1 << 30)
+        for _ in range(4):
+            await body.next()
+            now[0] += 50
+
+    monkeypatch.setattr(limits, "IDLE_S", 60)
+    monkeypatch.setattr(limits.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(limits.asyncio, "timeout", timeout)
+    asyncio.run(read())
+    assert left == [30.0, 31.0, 32.0, 33.0]
+
+
+def test_an_invalid_chunk_after_the_answer_ends_the_connection_without_an_error(opened, caplog):
+    wire = opened(ask("/unread", "Transfer-Encoding: chunked", method="POST"))
+    data = b""
+    while not data.endswith(b"\r\n\r\n0"):
+        data += wire.recv(1 << 16)
+    wire.sendall(b"zz\r\n")
+    assert rest(wire) == b""
+    assert [one.name for one in caplog.records if one.levelname == "ERROR"] == []
 
 
 def test_room_is_what_the_machine_allows(monkeypatch):
