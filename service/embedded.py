@@ -12,7 +12,7 @@ import threading
 import time
 from concurrent.futures import Future
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 
 import httpx
 import uvicorn
@@ -65,7 +65,9 @@ class LocalService(httpx.BaseTransport):
 
     def __init__(self, path: Path) -> None:
         self._name, self._jobs = f"embedded-{os.getpid()}", itertools.count(1)
-        self._folder = TemporaryDirectory(prefix="sceneprint-")  # only this user may enter it
+        # The path of a socket has at most 103 bytes on macOS, and 107 on Linux.
+        parent = gettempdir() if len(os.fsencode(gettempdir())) <= 76 else "/tmp"
+        self._folder = TemporaryDirectory("", "sceneprint-", parent)  # only this user may enter it
         address = str(Path(self._folder.name, "socket"))
         self._transport = httpx.HTTPTransport(uds=address, limits=httpx.Limits())
         self._server = _Server(embedded_settings(path), address)
