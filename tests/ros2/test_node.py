@@ -6,6 +6,7 @@ The real rclpy is not tested here.
 from __future__ import annotations
 
 import ast
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -180,6 +181,18 @@ def test_a_node_with_scans_of_a_livox(
     assert node._core.counts["frames"] == 3
     assert node._core.counts["asked"] == 1  # in half a second
     assert len(node._core._joiner[1]) == 3
+    node.destroy_node()
+
+
+def test_a_node_without_the_messages_of_livox(
+    bus: Any, node_module: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "livox_ros_driver2.msg", None)
+    bus.parameters = {"map": "m", "topic": "/livox/lidar", "kind": "livox"}
+    node = node_module.RelocaliserNode()
+    assert node.trigger_configure() == "failure"
+    assert "requires the ROS package livox_ros_driver2" in node.error
+    assert bus.callbacks == {}
     node.destroy_node()
 
 

@@ -27,7 +27,7 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from sceneprint_client import Client, Tracker
-from sceneprint_client.errors import InvalidRequest, SceneprintError
+from sceneprint_client.errors import InvalidRequest, MissingDependency, SceneprintError
 from sceneprint_client.http import DEFAULT_URL
 from sceneprint_client.relocaliser import (
     Level,
@@ -63,7 +63,7 @@ class NodeParameters:
     key: str = described("", "API key; empty: the environment variable SCENEPRINT_KEY")
     map: str = described("", "name of the map in the service")
     topic: str = described("", "topic of the frames")
-    kind: str = described("depth", "depth, compressed_depth or points")
+    kind: str = described("depth", "depth, compressed_depth, points or livox")
     camera_info_topic: str = described("", "camera info; empty: camera_info beside the frames")
     imu_topic: str = described("", "accelerations; empty: none")
     odometry_topic: str = described("", "odometry, if tf does not have it; empty: none")
@@ -195,7 +195,13 @@ class RelocaliserNode(LifecycleNode):  # type: ignore[misc]  # rclpy has no type
         self._listen(TFMessage, "/tf", partial(take, fixed=False), 100)
         self._listen(TFMessage, "/tf_static", partial(take, fixed=True), fixed)
         if p.kind == LIVOX:
-            kind = import_module("livox_ros_driver2.msg").CustomMsg
+            try:
+                kind = import_module("livox_ros_driver2.msg").CustomMsg
+            except ImportError as cause:
+                raise MissingDependency(
+                    "The kind livox requires the ROS package livox_ros_driver2, which is not "
+                    f"found ({cause}). Build it, and source its workspace."
+                ) from cause
             self._listen(kind, p.topic, self._take_frame, sensor, raw=True)
         else:
             self._listen(KINDS[p.kind], p.topic, self._take_frame, sensor)
