@@ -9,6 +9,7 @@ As in tf, a transform converts coordinates of the child frame to those of its pa
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -177,22 +178,40 @@ class TransformTree:
                     del edge.stamps_ns[:old], edge.samples[: 7 * old]
                     self._count -= old
 
-    def excerpt(self, first_ns: int, last_ns: int) -> TransformTree:
-        """Return a tree for stamps from `first_ns` to `last_ns`, with the samples around them."""
+    def sorted_paths(self, *paths: tuple[str, str]) -> TransformTree:
+        """Return a tree of the transforms between pairs (ancestor, child), for `excerpt`.
+
+        The samples of the moving transforms are shared, and sorted by their stamps.
+        """
         part = TransformTree()
-        margin_ns = round((LONGEST_GAP_S + _BACK_S) * 1e9)
+        for ancestor, child in paths:
+            for below, above in pairwise(self.path(ancestor, child) or ()):
+                edge = self._edges[below][above]
+                if self._is_fixed(above, below):
+                    edge = _Edge(True, samples=edge.samples[-7:])
+                elif (np.diff(edge.stamps_ns) < 0).any():
+                    order = np.argsort(edge.stamps_ns, kind="stable")
+                    rows = np.frombuffer(edge.samples, np.float64).reshape(-1, 7)[order]
+                    edge.samples = array("d", rows.tobytes())
+                    edge.stamps_ns = array("q", np.array(edge.stamps_ns)[order].tobytes())
+                part._edges.setdefault(below, {})[above] = edge
+        return part
+
+    def excerpt(self, first_ns: int, last_ns: int) -> TransformTree:
+        """Return a tree for stamps from `first_ns` to `last_ns`, with the samples around them.
+
+        This tree must be a result of `sorted_paths` or of this function.
+        """
+        part = TransformTree()
         part._origin_ns = first_ns
+        margin_ns = round((LONGEST_GAP_S + _BACK_S) * 1e9)
         for child, edges in self._edges.items():
             for parent, edge in edges.items():
-                stamps = np.frombuffer(edge.stamps_ns, np.int64)
-                rows = np.frombuffer(edge.samples, np.float64).reshape(-1, 7)
-                near = (stamps >= first_ns - margin_ns) & (stamps <= last_ns + margin_ns)
-                is_fixed = self._is_fixed(parent, child)
-                part._edges.setdefault(child, {})[parent] = _Edge(
-                    is_fixed,
-                    array("q", [] if is_fixed else stamps[near]),
-                    array("d", rows[-1] if is_fixed else rows[near].ravel()),
-                )
+                if not edge.fixed:
+                    i = bisect_left(edge.stamps_ns, first_ns - margin_ns)
+                    j = bisect_right(edge.stamps_ns, last_ns + margin_ns)
+                    edge = _Edge(False, edge.stamps_ns[i:j], edge.samples[7 * i : 7 * j])
+                part._edges.setdefault(child, {})[parent] = edge
         return part
 
     def frames(self) -> list[str]:

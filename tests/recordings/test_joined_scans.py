@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,9 +14,12 @@ import pytest
 from sceneprint.errors import DatasetError, UnreadableCloud
 from sceneprint.formats.dataset import FrameSequence, find_sequences
 from sceneprint.formats.recording import RecordingOptions
+from sceneprint.formats.recording.scan import BagScan
+from sceneprint.formats.recording.scan_window import scan_windows
 from sceneprint.types import Floats
 from sceneprint_client import Client, Tracker
 from sceneprint_client.frame_files import meta_of
+from sceneprint_client.transforms import TransformTree
 from sceneprint_lab.synth.dataset import premises_and_rng
 from sceneprint_lab.synth.sensors import Rosette, scan
 from sceneprint_lab.synth.trajectories import walk
@@ -178,6 +182,60 @@ def test_a_damaged_scan_is_left_out(tmp_path: Path, ros: SimpleNamespace) -> Non
     ]  # fmt: skip
     with pytest.raises(UnreadableCloud, match="The scan is damaged, or its odometry has a gap"):
         sequence.frames[2].read()
+
+
+def test_empty_and_damaged_scans_at_the_start_change_nothing(
+    tmp_path: Path, ros: SimpleNamespace
+) -> None:
+    def fill(writer: Any) -> None:
+        rows = np.zeros(1, [("x", "<f4")])  # without y and z
+        writer.points(-0.3, rows, "/livox/lidar", frame="livox_frame")
+        rows = np.zeros(0, [(name, "<f4") for name in ("x", "y", "z", "time")])
+        writer.points(-0.2, rows, "/livox/lidar", frame="livox_frame")
+        write_walls(writer, "time")
+
+    (sequence,) = find_sequences(ros.write(tmp_path, fill), JOINED)
+    assert sequence.note.endswith(", corrected for motion")
+
+
+def test_scans_are_read_one_at_a_time(tmp_path: Path, ros: SimpleNamespace) -> None:
+    def fill(writer: Any) -> None:
+        write_odometry(writer, 20)
+        wide = {"names": ["x", "y", "z"], "formats": ["<f4"] * 3, "offsets": [0, 4, 8]}
+        for number in range(20):
+            rows = np.zeros(20, np.dtype({**wide, "itemsize": 100_000}))  # 2 MB
+            for axis, name in enumerate("xyz"):
+                rows[name] = wall(number)[:, axis]
+            writer.points(SCAN_S * number, rows, "/livox/lidar", frame="livox_frame")
+
+    path = ros.write(tmp_path, fill, "sqlite3")
+    (sequence,) = find_sequences(path, RecordingOptions(join_m=2.0, keyframe_m=0))
+    tracemalloc.start()
+    assert len(sequence.frames[-1].read().points) == 400
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6  # all scans have 40 MB
+
+
+def test_a_window_has_the_samples_around_its_scans() -> None:
+    tree, order = TransformTree(), np.random.default_rng(3).permutation(1000)
+    for child in ("base_link", "arm"):
+        for k in order.tolist():
+            tree.add("odom", child, k * 10**8, (0.1 * k, 0, 0, 0, 0, 0, 1), fixed=False)
+    tree.add("base_link", "lidar", 0, (0, 1, 0, 0, 0, 0, 1), fixed=True)
+    scan = BagScan(stamps_ns=[k * 10**8 for k in range(1000)], places=[(k, 0) for k in range(1000)])
+    poses = dict(enumerate(map(pose, np.arange(0.0, 100.0, 0.1))))
+    names = "odom", "lidar", "lidar"
+    windows = scan_windows(scan, tree, poses, [500, 600], names, 1.05)
+    assert [stamp for stamp, _ in windows[500].scans] == [k * 10**8 for k in range(490, 501)]
+    assert windows[500].tree is windows[600].tree
+    assert windows[500].tree.frames() == ["base_link", "lidar", "odom"]
+    near = pickle.loads(pickle.dumps(windows[500])).tree
+    np.testing.assert_allclose(  # 2.5 s before the first scan to 2.5 s after the last one
+        near.samples("odom", "base_link")[:, 0], 0.1 * np.arange(465, 526)
+    )
+    (T,) = near.poses("odom", "lidar", [49_950_000_000])
+    np.testing.assert_allclose(T[:3, 3], [49.95, 1, 0])
 
 
 def write_drive(writer: Any, count: int, seed: int, **drive: float) -> None:

@@ -6,9 +6,11 @@ Bag  --ScanWindow.cloud-->  joined points (N, 3)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +22,9 @@ from sceneprint_client.joiner import MOST_SCANS, Joiner, window_start
 from sceneprint_client.ros_messages import timed_points
 from sceneprint_client.transforms import TransformTree
 
+#: Number of messages of which the first with points determines the duration of a scan.
+_MOST_SKIPPED = 50
+
 
 @dataclass(frozen=True, eq=False)
 class ScanWindow:
@@ -27,40 +32,40 @@ class ScanWindow:
 
     Parameters
     ----------
-    stamp_ns : stamp of the newest scan, nanoseconds
-    first_log_ns : time of recording of the first message
+    scans : stamp of each scan in order, nanoseconds, with the `places` of its BagScan
     metres : length of the way whose scans are joined
-    tree : transforms around the scans
+    tree : transforms with sorted samples, which the windows of a recording share
     world, sensor, frame : parent frame of the odometry, sensor, and frame of the points
-    scans : number of scans
     """
 
-    stamp_ns: int
-    first_log_ns: int
+    scans: Sequence[tuple[int, tuple[int, int]]]
     metres: float
     tree: TransformTree
     world: str
     sensor: str
     frame: str
-    scans: int
 
-    def cloud(self, bag: Bag, topic: BagTopic, log_ns: int) -> Floats32:
-        """Return the joined points (N, 3) in the axes of the newest scan, recorded at `log_ns`.
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "tree": self._near_tree()}
+
+    def _near_tree(self) -> TransformTree:
+        """Return the transforms around the scans."""
+        return self.tree.excerpt(self.scans[0][0], self.scans[-1][0])
+
+    def cloud(self, bag: Bag, topic: BagTopic) -> Floats32:
+        """Return the joined points (N, 3) in the axes of the newest scan.
 
         Raises
         ------
         UnreadableCloud : If the newest scan is damaged, or the odometry does not cover it.
         DatasetError : If the bag is damaged.
         """
-        joiner = Joiner(partial(self.tree.poses, self.world, self.sensor), self.metres)
-        scans = [
-            (bag.stamp_ns(message), message)
-            for message in bag.messages([topic.name], self.first_log_ns, log_ns + 1)
-        ]
+        tree = self._near_tree()
+        joiner = Joiner(partial(tree.poses, self.world, self.sensor), self.metres)
         is_newest_joined = False
-        for stamp_ns, message in sorted(scans, key=lambda scan: scan[0]):
-            if stamp_ns <= self.stamp_ns:
-                is_newest_joined = self._add(joiner, bag, topic, stamp_ns, message)
+        for stamp_ns, place in self.scans:
+            message = bag.at(topic.name, *place)
+            is_newest_joined = self._add(joiner, tree, stamp_ns, bag, topic, message)
         if not is_newest_joined:
             raise UnreadableCloud(
                 "The scan is damaged, or its odometry has a gap or a jump. Upload it without "
@@ -69,15 +74,16 @@ class ScanWindow:
         return joiner.cloud()
 
     def _add(
-        self, joiner: Joiner, bag: Bag, topic: BagTopic, stamp_ns: int, message: RawMessage
-    ) -> bool:
+        self, joiner: Joiner, tree: TransformTree, stamp_ns: int, bag: Bag, topic: BagTopic,
+        message: RawMessage,
+    ) -> bool:  # fmt: skip
         """Add a scan to a joiner; return False if it is left out."""
         try:
             points, seconds = timed_points(bag.decode(message, topic.type))
         except SceneprintError:
             return False
         if self.frame != self.sensor:
-            (T,) = self.tree.poses(self.frame, self.sensor, [stamp_ns])
+            (T,) = tree.poses(self.frame, self.sensor, [stamp_ns])
             if T is None:
                 return False
             # points in a world frame have already been corrected for motion
@@ -104,22 +110,26 @@ def scan_windows(
     order = sorted(poses, key=lambda place: stamps[place])
     rank = {place: i for i, place in enumerate(order)}
     positions = np.array([poses[place][:3, 3] for place in order])
+    _, sensor, frame = names
+    paths = tree.sorted_paths(names[:2], (frame, sensor))
     windows = {}
     for place in keyframes:
         end = rank[place] + 1
         first = max(0, end - MOST_SCANS)
-        window = order[first + window_start(positions[first:end], metres) : end]
-        windows[place] = ScanWindow(
-            stamps[place], min(scan.places[one][0] for one in window), metres,
-            tree.excerpt(stamps[window[0]], stamps[place]), *names, len(window),
-        )  # fmt: skip
+        first += window_start(positions[first:end], metres)
+        scans = [(stamps[one], scan.places[one]) for one in order[first:end]]
+        windows[place] = ScanWindow(scans, metres, paths, *names)
     return windows
 
 
-def scan_seconds(bag: Bag, topic: BagTopic) -> float | None:
-    """Return the time from the stamp of a scan to its last point, or None if unknown."""
-    message = bag.first(topic.name)
-    if message is None:
-        return None
-    _, seconds = timed_points(bag.decode(message, topic.type))
-    return None if seconds is None else max(float(seconds.max()), 0.0)
+def scan_seconds(bag: Bag, topic: BagTopic, scan: BagScan) -> float | None:
+    """Return the time from the stamp of a scan to its last point, or None if unknown.
+
+    Empty and damaged messages at the start of a recording are skipped.
+    """
+    for place in scan.places[:_MOST_SKIPPED]:
+        with suppress(SceneprintError):
+            points, seconds = timed_points(bag.decode(bag.at(topic.name, *place), topic.type))
+            if len(points):
+                return None if seconds is None else max(float(seconds.max()), 0.0)
+    return None

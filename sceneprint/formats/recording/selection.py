@@ -165,10 +165,11 @@ def sequences_of(
         {} if frames.encoding is None else _cameras(bag, frames, info, scan, options.depth_scale)
     )
     sensor = _sensor(bag, scan, frames, options)
-    seconds = scan_seconds(bag, frames.topic) if options.join_m and sensor == frames.frame else None
+    is_timed = options.join_m and sensor == frames.frame
+    seconds = scan_seconds(bag, frames.topic, scan) if is_timed else None
     motions = _motions(bag, scan, frames, sensor, options, seconds or 0.0)
     note = _note(frames, scan, motions)
-    counts = [one.scans for motion in motions for one in motion.windows.values()]
+    counts = [len(one.scans) for motion in motions for one in motion.windows.values()]
     if counts:
         note += f"; each frame joins the scans of {options.join_m:g} m ({np.median(counts):g} "
         note += "of them in the median), "

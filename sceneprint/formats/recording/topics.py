@@ -154,7 +154,7 @@ class BagSource:
         """
         if self.window is not None:
             with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
-                return encode_npy(self.window.cloud(self.bag, self.topic, self.log_ns))
+                return encode_npy(self.window.cloud(self.bag, self.topic))
         message = self.bag.at(self.topic.name, self.log_ns, self.occurrence)
         is_cloud = self.topic.type in CLOUDS
         with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
