@@ -354,3 +354,42 @@ def test_a_recording_becomes_a_map_with_its_coverage(
     assert (about["frames"]["indexed"], about["posed_frames"]) == (6, 6)
     mine.get_by_role("link", name="Coverage, cell by cell").click()
     expect(page.get_by_role("heading", name="Coverage of room-7")).to_be_visible()
+
+
+@pytest.mark.thorough
+def test_coverage_waits_for_no_later_frames_nor_for_a_removed_row(
+    page: Page, serve: Callable[..., Any], settle: Callable[[Page], None], tmp_path: Path
+) -> None:
+    page.allowed.append("429")  # type: ignore[attr-defined]
+    with serve(tmp_path, workers=0) as station:
+        path = station.make_map("fed")
+        form = {"files": {"frame": ("wall.png", wall(0))}}
+        answer = station.client.post(
+            f"{path}/frames", data={"meta": json.dumps({"intrinsics": LENS})}, **form
+        )
+        assert answer.json()["state"] == "received", answer.text  # and stays so
+        page.goto(station.home)
+        settle(page)
+        # the service asks once to wait
+        page.route("**/frames?**", lambda route: route.fulfill(status=429), times=1)
+        steps = page.evaluate(
+            """async (url) => {
+              const { measure } = await import(`${url}/recording.js`);
+              const queue = (await import(`${url}/queue.js`)).queueOf("fed"), steps = [];
+              for (const year of [2001, 2101]) {
+                const result = { summary: { poses: 0 } };
+                const job = { finished_at: `${year}-01-01T00:00:00Z`, result };
+                const item = { stop: new AbortController(), job };
+                queue.items = [item];
+                await measure("fed", item, ({ step }) => {
+                  steps.push([year, step]);
+                  if (step) queue.remove([item]);
+                });
+              }
+              return steps; }""",
+            f"{station.home}/frames",
+        )  # fmt: skip
+        assert steps == [
+            [2001, None], [2101, "Frames of the map to sign: 1"], [2101, None],
+        ]  # fmt: skip
+        page.goto("about:blank")  # it asks no more

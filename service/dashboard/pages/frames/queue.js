@@ -100,6 +100,7 @@ export class Queue {
   /** Forget items: those that are over, or one. */
   remove(items) {
     const gone = new Set(items);
+    for (const item of gone) item.stop?.abort();
     this.items = this.items.filter((one) => !gone.has(one));
     this.tell(null);
   }

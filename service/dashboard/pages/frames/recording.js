@@ -2,7 +2,7 @@
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
-import { followJob, goesOn } from "../lib/products.js";
+import { followJob, goesOn, repeat } from "../lib/products.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { flat } from "../plan/axes.js";
@@ -13,7 +13,6 @@ import { countsCard } from "../coverage/panels.js";
 import { drawCells } from "../coverage/sheet.js";
 import { remember } from "./source.js";
 
-const SIGN_MS = 1000;
 // as `sceneprint upload` names them; empty: as the service chooses
 const OPTIONS = [
   ["topic", "Topic", "the only one"], ["camera_info", "Camera topic", "beside the images"], ["pose_frame", "Frame of poses", "map, odom or world"],
@@ -55,29 +54,35 @@ export function outlineOf(found, choose) {
 
 /**
  * Wait until the frames of an import are signed, measure coverage with them, and keep both in the item.
- * @param {string} map @param {Object<string, any>} item of a queue, whose `step` and `coverage` change
+ * @param {string} map @param {Object<string, any>} item of a queue, whose `step` and `coverage` change; its `stop` ends it
  * @param {(changes: Object<string, any>) => void} change
  */
 export async function measure(map, item, change) {
-  for (;;) {
-    const { frames } = await get(at("maps", map));
-    const left = (frames.received ?? 0) + (frames.signing ?? 0);
-    if (left === 0) break;
-    change({ step: `Signing: ${count(left)} frames left` });
-    await new Promise((resolve) => { setTimeout(resolve, SIGN_MS); });
+  const { signal } = item.stop, { finished_at: end, result: { summary } } = item.job;
+  await repeat(async () => {
+    for (const state of ["received", "signing"]) { // a frame has them in this order, so none is missed
+      // robots may send others all the time: those that came after the import do not count
+      const { items } = await get(at("maps", map, "frames"), { params: { state, received_before: end, limit: 1 }, signal });
+      if (items.length === 0) continue;
+      const { frames } = await get(at("maps", map), { signal });
+      change({ step: `Frames of the map to sign: ${count((frames.received ?? 0) + (frames.signing ?? 0))}` });
+      return false;
+    }
+    return true;
+  }, signal);
+  /** @type {Object<string, any>} */
+  let now = {};
+  if (summary.poses >= 2) {
+    change({ step: "Measuring coverage" });
+    await repeat(async () => { now = (await send("POST", at("maps", map, "coverage"), { json: {}, signal })).data; return true; }, signal);
+    if (signal.aborted) return;
+    await followJob(at("maps", map, "coverage", now.job_id), (told) => {
+      now = told ?? { state: "cancelled" };
+      const { done = 0, total } = now.progress ?? {};
+      if (goesOn(now) && total) change({ step: `Coverage: ${count(done)} of ${count(total)} frames` });
+    }, signal);
   }
-  const { poses } = item.job.result.summary;
-  if (poses < 2) { change({ step: null }); return; }
-  const { data } = await send("POST", at("maps", map, "coverage"), { json: {} });
-  change({ step: "Measuring coverage" });
-  const job = at("maps", map, "coverage", data.job_id);
-  let now = data;
-  await followJob(job, (told) => {
-    now = told ?? { state: "cancelled" };
-    const { done = 0, total } = now.progress ?? {};
-    if (goesOn(now)) change({ step: total ? `Coverage: ${count(done)} of ${count(total)} frames` : "Measuring coverage" });
-  }, new AbortController().signal);
-  change({ step: null, coverage: now.state === "succeeded" ? await get(job) : null });
+  change({ step: null, coverage: now.state === "succeeded" ? now : null });
 }
 
 /** A plan of the map with the cells of a coverage result, and the result in numbers.

@@ -15,19 +15,29 @@ export const goesOn = (one) => !OVER.has(one.state);
  * @param {(now: Object<string, any> | null) => void} onchange null: somebody deleted it
  * @param {AbortSignal} signal
  */
-export async function followJob(path, onchange, signal) {
+export function followJob(path, onchange, signal) {
+  return repeat(async () => {
+    if (document.hidden) return false;
+    const now = await get(path, { signal }).catch((error) => { if (error.status === 404) return null; throw error; });
+    onchange(now);
+    return now === null || !goesOn(now);
+  }, signal);
+}
+
+/**
+ * Repeat requests until they return true, or `signal` aborts.
+ * @param {() => Promise<boolean>} request
+ * @param {AbortSignal} signal
+ */
+export async function repeat(request, signal) {
   for (;;) {
     await new Promise((resolve) => { setTimeout(resolve, POLL_MS); });
     if (signal.aborted) return;
-    if (document.hidden) continue;
     try {
-      const now = await get(path, { signal });
-      onchange(now);
-      if (!goesOn(now)) return;
+      if (await request()) return;
     } catch (error) {
       if (error.name === "AbortError") return;
-      if (error.status === 404) { onchange(null); return; }
-      if (error.status !== 0 && error.status !== 503) throw error; // a service that restarts does not end it
+      if (![0, 429, 503].includes(error.status)) throw error; // a service that restarts does not end it
     }
   }
 }
