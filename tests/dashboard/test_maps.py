@@ -33,7 +33,24 @@ def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle
     empty = card(page, "marked-up")
     expect(empty.get_by_role("heading")).to_have_text(MARKUP)  # letter by letter
     expect(empty).to_contain_text("This map is empty")
-    expect(empty).to_contain_text("No queries in the last hour")
+    counts = [
+        {},
+        {"unvalidated": 1},
+        {"unvalidated": 3},
+        {"found": 2, "failed": 1, "unvalidated": 1},
+    ]
+    shares = page.evaluate(
+        """async ([url, map, counts]) => {
+          const { mapCard } = await import(url), { signal } = new AbortController();
+          return counts.map((recent_queries) => {
+            const { element } = mapCard({ ...map, recent_queries }, { signal });
+            return element.querySelector(".map-share").textContent; }); }""",
+        [f"{station.url}/dashboard/maps/card.js", told, counts],
+    )  # fmt: skip
+    assert shares == [
+        "No queries in the last hour", "1 query without validation in the last hour",
+        "3 queries without validation in the last hour", "66 % of 3 queries found in the last hour",
+    ]  # fmt: skip
     expect(empty.get_by_role("link", name="Upload frames")).to_have_attribute(
         "href", "#/maps/marked-up/upload"
     )
@@ -209,6 +226,7 @@ def test_robots_are_seen_moving_on_the_plan(
     one.scroll_into_view_if_needed()
     robot = one.locator("[data-robot=walker]")
     plan = walked["plan"]
+    outside: list[bool] = []
 
     def stands(answer: dict[str, Any]) -> None:
         p = [answer["location"]["pose"]["translation"][axis] for axis in "xyz"]
@@ -216,6 +234,8 @@ def test_robots_are_seen_moving_on_the_plan(
                 ("x_axis", "y_axis"))  # fmt: skip
         left = (u - plan["left"]) / (plan["width"] * plan["m_per_pixel"])
         top = (plan["top"] - v) / (plan["height"] * plan["m_per_pixel"])
+        outside.append(not (0 <= left <= 1 and 0 <= top <= 1))
+        left, top = (min(max(share, 0), 1) for share in (left, top))  # at the edge
         style = f"left: {round(100 * left, 2):g}%; top: {round(100 * top, 2):g}%"
         expect(robot).to_have_attribute("style", re.compile(f"^{re.escape(style)};"))
 
@@ -231,6 +251,7 @@ def test_robots_are_seen_moving_on_the_plan(
         stands(last)  # each answer is an event, which moves the robot
         places.add(tuple(last["location"]["pose"]["translation"].values()))
     assert len(places) == len(walk)
+    assert any(outside)
     assert not [url for url in asked if "/queries" in url or "/surface" in url]
     expect(one.locator(".map-answers li").first).to_contain_text("walker")
     expect(one.locator(".map-answers a").first).to_have_attribute(
@@ -280,6 +301,15 @@ def test_the_health_is_one_sentence(station: Any, page: Page, settle: Settle) ->
     def of(name: str, **frames: int) -> dict[str, Any]:
         return {"name": name, "frames": frames, "reencoding": None}
 
+    # the fleet page does not tell of a recording whose topic a person has to choose
+    import_job = {"frame_id": None, "followed_by": None, "finished_at": "2101-01-01T00:00:00Z"}
+    recordings = [None, {"recording": None}, {"recording": {"problem": "2 topics have frames."}}]
+    news = page.evaluate(
+        "async ([url, jobs]) => jobs.map((await import(url)).isNews)",
+        [f"{station.url}/dashboard/maps/condition.js",
+         [{**import_job, "progress": one} for one in recordings]],
+    )  # fmt: skip
+    assert news == [True, True, False]
     fine = "Everything is signed; no job failed."
     assert told([], []) == told([of("hall", indexed=3, rejected=1)], []) == ["good", fine, None]
     assert told([of("hall", failed=1), of("b", indexed=2)], []) == [
@@ -293,6 +323,9 @@ def test_the_health_is_one_sentence(station: Any, page: Page, settle: Settle) ->
     assert told([of("a", received=2, signing=1)], [job]) == [
         "bad", "The `associate` job of `hall` failed; 3 frames wait.", "#/operations/jobs/7"
     ]  # fmt: skip
+    assert told([], [{"kind": "associate", "map": None, "job_id": "7"}])[1] == (
+        "The `associate` job failed; nothing waits."
+    )
     assert told([of("a", signing=1)], []) == [
         "neutral", "One frame waits for a signature; no job failed.", None
     ]  # fmt: skip

@@ -69,9 +69,10 @@ export function mapCard(map, { signal, changed }) {
 
   function share() {
     const { recent_queries: counts } = card.map, of = (states) => states.reduce((n, one) => n + (counts[one] ?? 0), 0);
-    const all = of(["found", ...LOST]);
-    put(parts.share, all === 0 ? h("span", { class: "muted" }, "No queries in the last hour")
-      : [h("strong", { class: "number" }, `${Math.floor((100 * of(["found"])) / all)} %`), ` of ${count(all)} ${all === 1 ? "query" : "queries"} found in the last hour`]);
+    const all = of(["found", ...LOST]), others = of(["unvalidated"]);
+    const queries = (n) => `${n === 0 ? "No" : count(n)} ${n === 1 ? "query" : "queries"}`;
+    put(parts.share, all === 0 ? h("span", { class: "muted" }, queries(others), others > 0 && " without validation", " in the last hour")
+      : [h("strong", { class: "number" }, `${Math.floor((100 * of(["found"])) / all)} %`), ` of ${queries(all)} found in the last hour`]);
   }
 
   function show() {

@@ -2,6 +2,16 @@
 import { count } from "../lib/format.js";
 import { link } from "../lib/router.js";
 
+const DAY_MS = 86_400_000; // a job that failed before is no news
+
+/**
+ * Whether a failed job is news. If no frame of a recording can be used, the page of its upload says why.
+ * @param {Object<string, any>} job
+ */
+export function isNews(job) {
+  return !job.frame_id && !job.followed_by && !job.progress?.recording?.problem && Date.now() - Date.parse(job.finished_at) < DAY_MS;
+}
+
 /** Frames of a map that wait for a worker, or are being signed. @param {Object<string, any>} map */
 export function waiting(map) {
   return (map.frames.received ?? 0) + (map.frames.signing ?? 0) + (map.reencoding?.left ?? 0);
@@ -23,7 +33,7 @@ export function conditionOf(maps, jobs) {
   }
   if (jobs.length > 0) {
     const [{ kind, map, job_id: id }] = jobs, many = jobs.length > 1;
-    return { kind: "bad", text: many ? `${things(jobs.length, "job")} failed; ${queue}.` : `The \`${kind}\` job of \`${map}\` failed; ${queue}.`,
+    return { kind: "bad", text: many ? `${things(jobs.length, "job")} failed; ${queue}.` : `The \`${kind}\` job${map === null ? "" : ` of \`${map}\``} failed; ${queue}.`,
       href: many ? link("operations", { tab: "jobs", state: "dead" }) : link("operations", "jobs", id) };
   }
   if (left > 0) return { kind: "neutral", text: `${things(left, "frame")} ${left === 1 ? "waits" : "wait"} for a signature; no job failed.`, href: null };

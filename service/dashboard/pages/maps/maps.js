@@ -6,7 +6,7 @@ import { may, me } from "../lib/session.js";
 import { coded } from "../lib/prose.js";
 import { empty } from "../lib/states.js";
 import { edit, mapCard } from "./card.js";
-import { conditionOf } from "./condition.js";
+import { conditionOf, isNews } from "./condition.js";
 import { inView } from "./turns.js";
 
 export const styles = ["maps/maps.css"];
@@ -17,7 +17,6 @@ const FAILURES = 50; // jobs that are looked through
 const MANY = 6; // from here on one list costs less than each map for itself
 const FILTER_FROM = 9;
 const RENEW_MS = 60_000; // the last hour moves on without an event
-const DAY_MS = 86_400_000; // a job that failed before is no news
 
 /** See lib/router.js. */
 export async function render(root, { signal, go, title, actions }) {
@@ -78,8 +77,7 @@ export async function render(root, { signal, go, title, actions }) {
 
   async function reload() {
     const [found, ...failed] = await Promise.all([get("maps", { signal }), ...["dead", "failed"].map((state) => get("jobs", { params: { state, limit: FAILURES }, signal }))]);
-    const news = (job) => !job.frame_id && !job.followed_by && Date.now() - Date.parse(job.finished_at) < DAY_MS;
-    failures = failed.flatMap((page) => page.items.filter(news));
+    failures = failed.flatMap((page) => page.items.filter(isNews));
     draw(found.items);
   }
 

@@ -8,6 +8,9 @@ import { picture } from "../lib/picture.js";
 const PIXELS = 400; // of the longer side
 const TRAIL = 30; // poses of the way of a robot
 
+/** A share of the plan: a robot outside it is shown at its edge. @param {number} share */
+const clamp = (share) => Math.min(Math.max(share, 0), 1);
+
 /**
  * @param {string} map
  * @param {AbortSignal} signal
@@ -59,15 +62,15 @@ export function thumbnail(map, signal) {
     const tokens = robotTokens([...found.keys()]), colour = (name) => `var(${tokens.get(name)})`;
     for (const [name, one] of robots) if (!found.has(name)) { one.remove(); robots.delete(name); }
     put(ways, [...found].map(([name, way]) => svg("polyline", { points: way.map((p) => p.map((v) => v.toFixed(1)).join(",")).join(" "), style: { stroke: colour(name) } })));
-    for (const [name, way] of found) {
-      const [x, y] = way.at(-1);
+    const places = [...found].map(([name, way]) => ({ name, x: clamp(way.at(-1)[0] / width), y: clamp(way.at(-1)[1] / height) }));
+    for (const { name, x, y } of places) {
       const robot = robots.get(name) ?? h("span", { class: "map-robot", dataset: { robot: name } }, h("span", { class: "map-robot-name" }, name));
-      robot.style.setProperty("left", `${(100 * x / width).toFixed(2)}%`); // it moves there, rather than jumps
-      robot.style.setProperty("top", `${(100 * y / height).toFixed(2)}%`);
+      robot.style.setProperty("left", `${(100 * x).toFixed(2)}%`); // it moves there, rather than jumps
+      robot.style.setProperty("top", `${(100 * y).toFixed(2)}%`);
       robot.style.setProperty("--robot", colour(name));
       if (!robots.has(name)) { robots.set(name, robot); stage.append(robot); }
     }
-    label([...found].map(([name, way]) => ({ name, x: way.at(-1)[0] / width, y: way.at(-1)[1] / height })));
+    label(places);
   }
 
   function label(places) {
