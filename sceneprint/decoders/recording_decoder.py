@@ -55,33 +55,24 @@ class RecordingIndex:
 class RecordingDecoder:
     """A confined process that has a recording open, and is used by one thread.
 
+    The process starts with the first request, and again with the first request after it failed.
+
     Parameters
     ----------
     file : descriptor of the recording
     name : name of its file, whose suffix identifies the format
     seconds : maximum processor time of a request
-
-    Raises
-    ------
-    Busy : If the process cannot be started.
     """
 
     def __init__(self, file: int, name: str, seconds: float) -> None:
-        self._name, self._seconds = name, seconds
-        self._process = DecoderProcess(
-            _PROGRAM, _MORE_BYTES, compiled=False, files=(file,), more=(name,)
-        )
-        try:
-            self._process.await_ready()
-        except (DecoderEnded, DecoderFailure) as error:
-            self._process.end()
-            raise Busy(
-                f"No process can be started to read {name} ({error}). Retry in a minute."
-            ) from error
+        self._file, self._name, self._seconds = file, name, seconds
+        self._process: DecoderProcess | None = None
 
     def close(self) -> None:
         """End the process."""
-        self._process.end()
+        process, self._process = self._process, None
+        if process is not None:
+            process.end()
 
     def outline(self, options: ImportOptions) -> bytes:
         """Return the document from which `RecordingIndex.parse` makes an index.
@@ -89,7 +80,7 @@ class RecordingDecoder:
         Raises
         ------
         UnreadableArchive : If the recording cannot be read with the memory and time of a process.
-        MissingDependency : If rosbags is not installed.
+        Busy : If no process can be started.
         """
         fields = options.model_dump(mode="json", by_alias=True)
         text = self._run({"task": "outline", "options": fields})
@@ -106,10 +97,22 @@ class RecordingDecoder:
         ------
         UnreadableFrame, UnreadableCloud : If the message is damaged.
         UnreadableArchive : If the recording cannot be read.
+        Busy : If no process can be started.
         """
-        data = self._run({"task": "frame", "topic": topic, "place": place})
-        self._process.clear()
-        return data
+        return self._run({"task": "frame", "topic": topic, "place": place})
+
+    def _start(self) -> DecoderProcess:
+        process = self._process = DecoderProcess(
+            _PROGRAM, _MORE_BYTES, compiled=False, files=(self._file,), more=(self._name,)
+        )
+        try:
+            process.await_ready()
+        except (DecoderEnded, DecoderFailure) as error:
+            self.close()
+            raise Busy(
+                f"No process can be started to read {self._name} ({error}). Retry in a minute."
+            ) from error
+        return process
 
     def _run(self, request: dict[str, Any]) -> bytes:
         def checked(process: DecoderProcess, reply: dict[str, Any]) -> bytes:
@@ -118,12 +121,15 @@ class RecordingDecoder:
                 raise ValueError(f"{size} bytes")
             return process.array_of("u1", (size,)).tobytes()
 
+        process = self._process or self._start()
         try:
-            reply = self._process.run(request, b"", self._seconds)
-            data: bytes = self._process.result(reply, checked)
+            reply = process.run(request, b"", self._seconds)
+            data: bytes = process.result(reply, checked)
         except (DecoderEnded, DecoderFailure) as error:
+            self.close()  # a late reply would answer the next request
             raise UnreadableArchive(
                 f"{self._name} cannot be read: {error}. Split the recording, or send only the "
                 "topics of the sensor, its camera, /tf and /tf_static."
             ) from error
+        process.clear()
         return data

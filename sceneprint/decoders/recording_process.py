@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
@@ -122,8 +123,8 @@ def _outline(path: Path, request: dict[str, Any]) -> Reply:
             )
             for one in shown[:MOST_RECORDING_TOPICS]
         ],
-        findings=[printable(line)[:1000] for line in outline.findings[:20]],
-        problem=outline.problem[:4000] or None,
+        findings=[_over_http(printable(line))[:1000] for line in outline.findings[:20]],
+        problem=_over_http(outline.problem)[:4000] or None,
         lost=sum(one.lost for one in outline.sequences if options.with_poses),
     )  # fmt: skip
     topic = None if outline.chosen is None else outline.chosen.topic
@@ -134,6 +135,19 @@ def _outline(path: Path, request: dict[str, Any]) -> Reply:
         "notes": [one.note[:1000] for one in outline.sequences if one.note],
     }  # fmt: skip
     return {}, np.frombuffer(json.dumps(document).encode(), np.uint8)
+
+
+#: Advice that only a user of the command line can follow; the outline lists all topics.
+_FOR_COMMANDS = re.compile(
+    r" `sceneprint bag` lists all topics\.|, or write an intrinsics\.json beside the recording"
+)
+_OPTION = re.compile("--(topic|camera-info|pose-frame|sensor-frame|depth-scale)")
+
+
+def _over_http(text: str) -> str:
+    """Replace options of commands by fields of the request, and omit advice for commands."""
+    text = _FOR_COMMANDS.sub("", text)
+    return _OPTION.sub(lambda option: f"`{option[1].replace('-', '_')}`", text)
 
 
 def _place_of(source: Any) -> list[Any]:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,9 +15,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from sceneprint.decoders.recording_decoder import RecordingDecoder, RecordingIndex
+from sceneprint.engine.ingest import recording_import
+from sceneprint.engine.ingest.archive_import import add_block
+from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.jobs.lifecycle import cancel
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.errors import InvalidRequest, QuotaExceeded, UnreadableArchive
+from sceneprint.errors import Busy, InvalidRequest, QuotaExceeded, UnreadableArchive
 from sceneprint.formats.recording import RecordingOptions, recording_sequences
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import files_of
@@ -141,6 +149,7 @@ def test_topics_are_shown_if_none_can_be_chosen(
     assert failed.progress is not None
     assert failed.progress.recording is not None
     assert failed.error == failed.progress.recording.problem
+    assert str(failed.error).endswith(" messages). Select one with `topic`.")
     used = [one.name for one in failed.progress.recording.topics if one.use == "16UC1"]
     assert used == ["/a/image_raw", "/b/image_raw"]
     begun(engine, path, topic="/b/image_raw")
@@ -148,6 +157,84 @@ def test_topics_are_shown_if_none_can_be_chosen(
     [frame] = engine.list_frames("hall").items
     assert frame.name is not None
     assert frame.name.startswith("b/image_raw/")
+
+
+@pytest.mark.parametrize(
+    ("more", "ends"), [
+        ({"topic": "/none"}, "Select one of /a/image_raw (Image, 1 messages)."),
+        ({}, "topics of CameraInfo are none. Select one with `camera_info`."),
+    ],
+)  # fmt: skip
+def test_a_problem_advises_nothing_that_only_commands_can_do(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path, more: dict[str, str], ends: str
+) -> None:
+    def fill(writer: Any) -> None:
+        writer.image(0, wall(0), topic="/a/image_raw")
+
+    job = begun(engine, ros.write(tmp_path, fill, "mcap"), **more)
+    run_import(engine)
+    assert str(engine.get_job(job.job_id).error).endswith(ends)
+
+
+def test_an_import_fails_at_once_without_rosbags(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = begun(engine, write_drive(ros, tmp_path))
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    assert run_import(engine) == [JobState.FAILED]
+    assert "pip install 'rosbags" in str(engine.get_job(job.job_id).error)
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP])
+def test_only_the_frame_whose_process_fails_is_refused(
+    ros: SimpleNamespace, tmp_path: Path, sent: signal.Signals
+) -> None:
+    path, options = write_drive(ros, tmp_path), ImportOptions.model_validate({"as": "recording"})
+    with path.open("rb") as file, closing(RecordingDecoder(file.fileno(), path.name, 3)) as decoder:
+        index = RecordingIndex.parse(decoder.outline(options))
+        assert index.topic is not None
+        assert decoder._process is not None
+        first, second = (decoder.frame(index.topic, one["place"]) for one in index.frames[:2])
+        os.kill(decoder._process.pid, sent)
+        with pytest.raises(UnreadableArchive):
+            decoder.frame(index.topic, index.frames[0]["place"])
+        assert decoder.frame(index.topic, index.frames[1]["place"]) == second != first
+
+
+def test_a_slice_is_repeated_if_no_process_can_read_a_frame(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path
+) -> None:
+    def read() -> Upload:
+        raise Busy("No process can be started.")
+
+    begun(engine, write_drive(ros, tmp_path))
+    work = engine.claim("test")
+    assert isinstance(work, LongJob)
+    with pytest.raises(Busy):
+        add_block(engine.uploads, work, [("a", read)])
+
+
+@pytest.mark.parametrize(("seconds", "looks"), [(1, 1), (8, FRAMES - 1)])
+def test_blocks_of_slow_frames_are_smaller(
+    engine: Engine, ros: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    seconds: int, looks: int,
+) -> None:  # fmt: skip
+    begun(engine, write_drive(ros, tmp_path))
+    work = engine.claim("test")
+    assert isinstance(work, LongJob)
+    engine.run(work)
+    work = engine.claim("test")
+    assert isinstance(work, LongJob)
+    clock = SimpleNamespace(monotonic=iter(range(0, 1000, seconds)).__next__)
+    monkeypatch.setattr(recording_import, "time", clock)
+    counted = list[bool]()
+
+    def is_over() -> bool:
+        counted.append(False)
+        return False
+
+    assert engine.jobs.handlers["import-bag"](work, is_over).over
+    assert len(counted) == looks
 
 
 def test_a_slice_that_is_run_again_adds_no_frame_twice(

@@ -267,7 +267,7 @@ def test_without_rosbags_the_extra_is_named(
     sceneprint: Run, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bag._types.cache_clear()
-    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
     done = sceneprint("upload", "bag", recording, expect=2)
     assert done.stderr == (
         "sceneprint upload: ROS recordings require rosbags, which is not installed. Run: "

@@ -85,8 +85,7 @@ class SampleRange(ApiRecord):
             return text
         return (
             f"{text}; a median of {self.median:.2g} m from {self.near:.2g} m on is unusual for a "
-            "depth camera: check the unit, and specify the stored units per metre (--depth-scale) "
-            "if it is not the millimetre"
+            "depth camera: check the unit, and specify the depth scale if it is not the millimetre"
         )
 
 

@@ -111,7 +111,7 @@ def add_block(
         try:
             uploaded.append(read())
             outcomes.append(None)
-        except errors.StoreError:
+        except (errors.StoreError, errors.Busy):  # a repeated slice can read the frame
             raise
         except errors.SceneprintError as error:
             outcomes.append(UploadOutcome(None, error=error))

@@ -8,8 +8,10 @@ slices read single messages. A confined process reads the file in all slices.
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,8 +22,9 @@ from sceneprint.decoders.recording_decoder import RecordingDecoder, RecordingInd
 from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.archive_import import add_block
 from sceneprint.engine.ingest.uploads import Upload, Uploads
-from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import SLICE_S, IsOver, LongJob, SliceResult
 from sceneprint.errors import UnreadableArchive
+from sceneprint.formats.recording.bag import require_rosbags
 from sceneprint.store import queue
 from sceneprint.store.database_errors import unusable
 from sceneprint.store.tables import ARCHIVE, IMPORT_FILES
@@ -43,6 +46,7 @@ class RecordingImporter:
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Run a slice: read the recording, or add at least one block of its frames."""
+        require_rosbags()
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             files = queue.files_of(connection, task.job.number)
@@ -107,15 +111,19 @@ class RecordingImporter:
             progress["largest"] = max(len(data), progress["largest"])
             return Upload(data, meta, options.priority, options.if_novel)
 
+        frame_s = math.inf  # duration of a frame of the last block
         while progress["done"] < len(frames) and (not items or not is_over()):
-            # sizes are unknown until a frame is read, so the first block has one
-            count = max(1, min(_AT_ONCE, _BYTES_AT_ONCE // (progress["largest"] or _BYTES_AT_ONCE)))
+            start = time.monotonic()
+            # sizes and durations are unknown until a frame is read, so the first block has one
+            room = _BYTES_AT_ONCE // (progress["largest"] or _BYTES_AT_ONCE)
+            count = max(1, min(_AT_ONCE, room, int(SLICE_S / frame_s)))
             block = frames[progress["done"] :][:count]
             reads = [(str(one["name"]), partial(upload, one)) for one in block]
             for item in add_block(self._uploads, task, reads):
                 items.append(item.model_dump(mode="json"))
                 progress[{202: "received", 200: "there"}.get(item.status, "refused")] += 1
             progress["done"] += len(block)
+            frame_s = (time.monotonic() - start) / len(block)
         if progress["done"] < len(frames):
             return SliceResult(False, progress, items)
         result = self._result(task, options, index, progress, items)

@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -295,6 +296,15 @@ def _advice(path: Path) -> str:
 # Message types and decompression limits of rosbags.
 
 
+def require_rosbags() -> None:
+    """Raise MissingDependency if rosbags is not installed."""
+    if find_spec("rosbags") is None:
+        raise MissingDependency(
+            "ROS recordings require rosbags, which is not installed. "
+            "Run: pip install 'rosbags>=0.11.9,<0.12'"
+        )
+
+
 @lru_cache(maxsize=2)
 def _types(*, ros1: bool) -> Typestore:
     """Return the standard message definitions. Those in the bag are not trusted.
@@ -303,13 +313,9 @@ def _types(*, ros1: bool) -> Typestore:
     ------
     MissingDependency : If rosbags is not installed.
     """
-    try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError as cause:
-        raise MissingDependency(
-            "ROS recordings require rosbags, which is not installed. "
-            "Run: pip install 'rosbags>=0.11.9,<0.12'"
-        ) from cause
+    require_rosbags()
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
     _limit_decompression()
     _read_any_profile()
     types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)

@@ -233,7 +233,7 @@ def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
         if not named:
             raise DatasetError(
                 f"{bag.path}: There is no topic {name!r:.100}. Select one of "
-                f"{listed(one.topic for one in candidates)}; `sceneprint bag` lists all topics."
+                f"{listed(one.topic for one in candidates)}. `sceneprint bag` lists all topics."
             )
         frames = next((one for one in candidates if one.topic.name == name), None)
         if frames is None and named[0].type in (IMAGE, COMPRESSED, *CLOUDS):
@@ -249,8 +249,8 @@ def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
     if not candidates:
         raise DatasetError(
             f"{bag.path}: There is no topic of depth images ({_SUPPORTED}; not {OMITTED_IMAGES}) "
-            f"or of points (PointCloud2, CustomMsg). Images are {_encodings(bag)}. `sceneprint "
-            "bag` lists all topics; --topic selects one."
+            f"or of points (PointCloud2, CustomMsg). Images are {_encodings(bag)}. "
+            "Select one with --topic. `sceneprint bag` lists all topics."
         )
     if len(candidates) > 1:
         raise DatasetError(

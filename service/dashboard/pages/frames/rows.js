@@ -164,7 +164,7 @@ function reasonOf(item, queue, signal) {
     return [item.isMap ? [mapOf(item), h("p", {}, h("a", { href: link("maps", queue.map, "place") }, "See its plan"))] : importOf(item), coverage && measuredPlan(queue.map, coverage, signal),
       coverage ? h("details", {}, h("summary", {}, "Topics and findings"), outline) : outline];
   }
-  if (outline) return [state === "failed" && h("p", {}, coded(item.reason)), outline];
+  if (outline) return [item.reason && h("p", {}, coded(item.reason)), outline];
   if (problem) {
     const rest = Math.max(0, (item.until - Date.now()) / 1000);
     return [
