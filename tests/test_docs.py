@@ -222,7 +222,7 @@ def test_documented_commands_and_examples_run(tmp_path: Path) -> None:
     """README, Getting started and Library, but for `make`, which the tests themselves run under."""
     serve, *rest = commands_of(STARTED + LIBRARY)
     assert serve == commands_of(README)[1]
-    assert len(rest) == 17
+    assert len(rest) == 16
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -249,7 +249,7 @@ def test_documented_commands_and_examples_run(tmp_path: Path) -> None:
             printed[arguments[0]] = done.stdout
     assert "6 indexed" in printed["upload"]
     assert "found" in printed["query"]
-    assert ": found (strong); " in printed["localize"]
+    assert re.search(r": found [0-9.]+ % \(strong\); ", printed["localize"])
     assert "EDGE_SE3:QUAT" in (tmp_path / "loops.g2o").read_text()
     assert "room-000/seq-01" in printed["sessions"]
     assert "building" in printed["maps"]
@@ -257,12 +257,10 @@ def test_documented_commands_and_examples_run(tmp_path: Path) -> None:
     assert "building" in printed["reencode"]
     index = json.loads((tmp_path / "signatures/signatures.json").read_text())
     assert [entry["signed"] for entry in index["frames"]] == [True] * 12
-    assert (tmp_path / "frame.png").stat().st_size > 10_000
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["counts"]["queries"] == 3
     pairs = json.loads((tmp_path / "pairs.json").read_text())
     assert set(pairs["validation"]) >= {"precision", "recall", "accepted"}
-    assert (tmp_path / "plots/contact.png").stat().st_size > 10_000
     (client,) = blocks(README, "python")
     library, place = blocks(LIBRARY, "python")
     assert re.match(r"found x=\S+ y=\S+ z=\S+$", run_example(client, tmp_path).strip())
