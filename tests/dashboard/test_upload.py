@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import FilePayload, Locator, Page, Response, expect
+from playwright.sync_api import FilePayload, Locator, Page, Response, Route, expect
 
 from benchmarks.rooms import circled
 from sceneprint.decoders.child_process import array_samples, text_samples
@@ -393,3 +393,28 @@ def test_coverage_waits_for_no_later_frames_nor_for_a_removed_row(
             [2001, None], [2101, "Frames of the map to sign: 1"], [2101, None],
         ]  # fmt: skip
         page.goto("about:blank")  # it asks no more
+
+
+@pytest.mark.thorough
+def test_a_dead_import_shows_its_reason_beside_the_outline(
+    page: Page, station: Any, settle: Callable[[Page], None], ros: SimpleNamespace,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    def fill(writer: Any) -> None:
+        writer.image(0, np.full((48, 64), 2000))
+
+    def die(route: Route) -> None:
+        answer = route.fetch()
+        job = answer.json()
+        over = {"state": "dead", "error": "its worker died"} if job["state"] == "failed" else {}
+        route.fulfill(response=answer, json=job | over)
+
+    page.route("**/v1/jobs/*", die)
+    chooser = open_upload(page, station, "dead-import", settle)
+    bag = ros.write(tmp_path, fill, "ros1")
+    chooser.set_input_files(bag)
+    page.get_by_role("button", name="Upload 1 file").click()
+    mine = row(page, bag.name)
+    expect(mine.locator(".badge")).to_have_text("dead")
+    expect(mine.locator("tbody tr").first).to_contain_text("/camera/depth/image_raw")
+    expect(mine.locator(".row-more > p").first).to_have_text("its worker died")
