@@ -98,7 +98,7 @@ def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> N
         assert run(asked).split() == ["operator", "robot-7"]
 
         (backup,) = blocks("Backup")
-        run(backup, SCENEPRINT_DATABASE_URL=url)
+        run(backup.replace("/backup", str(tmp_path / "backup")), SCENEPRINT_DATABASE_URL=url)
         run(back, SCENEPRINT_DATABASE_URL=url, FOLDER=str(tmp_path / "again"))
         with Engine(Settings(data_dir=tmp_path / "again")) as engine:
             assert [one.name for one in engine.list_maps()] == ["building"]
