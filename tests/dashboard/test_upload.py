@@ -163,6 +163,7 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
     assert (posed["name"], posed["sequence"]) == ("frame-000001.depth.png", 1)
     page.goto(f"{station.home}#/maps/dropped")
     settle(page)
+    page.get_by_text("Filters", exact=True).click()
     page.get_by_label("Find").fill("frame-000001")
     page.get_by_label("Find").blur()
     settle(page)
