@@ -14,7 +14,9 @@ from __future__ import annotations
 import os
 import random
 import stat
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,6 +48,7 @@ class Disk:
 
     def __init__(self, root: Path, deaf: str = "") -> None:
         self.root, self.deaf = root.resolve(), deaf
+        self._lock = threading.RLock()  # a restore writes in several threads
         self.inodes: dict[int, Inode] = {}
         self.states: list[tuple[str, dict[int, Inode]]] = []
         self._ids: dict[int, int] = {}  # for files with a name, since inode numbers are reused
@@ -62,12 +65,16 @@ class Disk:
 
     def mark(self, what: str) -> None:
         """Record an event elsewhere, such as a commit."""
-        self._look()
-        self._keep(what)
+        with self._lock:
+            self._look()
+            self._keep(what)
 
     def synced(self, descriptor: int) -> None:
         """Record an fsync."""
-        found = os.fstat(descriptor)
+        with self._lock:
+            self._note_sync(os.fstat(descriptor))
+
+    def _note_sync(self, found: os.stat_result) -> None:
         self._look()
         if found.st_ino not in self._ids or found.st_dev != self.root.stat().st_dev:
             return
@@ -83,11 +90,19 @@ class Disk:
 
     def about_to(self, event: str) -> None:
         """Record the changes so far, before a call that opens, renames or removes."""
-        self._look()
-        self._keep(f"before {event}")
+        with self._lock:
+            self._look()
+            self._keep(f"before {event}")
 
     def _look(self) -> None:
         """Update the visible state from the real folder."""
+        with self._lock:
+            while True:
+                with suppress(FileNotFoundError):  # another thread has moved or removed a file
+                    self._read()
+                    return
+
+    def _read(self) -> None:
         found: dict[int, dict[str, int]] = {}
         named = {self.root.stat().st_ino}
         for place, _, _ in os.walk(self.root):
