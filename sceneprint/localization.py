@@ -447,9 +447,8 @@ def _found(
     covariance = None
     if votes and len(covariances) == len(votes):
         poses = np.stack([vote.T for vote in votes])
-        inflations = 1.0 + np.array([vote.separation / p.same_view for vote in votes]) ** 2
-        T, covariance = fuse_votes(average, poses, np.stack(covariances), inflations)
-        average = replace(average, T=T)
+        inflations = 1.0 + np.array([vote.separation / p.half_weight for vote in votes]) ** 2
+        average, covariance = fuse_votes(average, poses, np.stack(covariances), inflations)
     total = sum(len(each.accepted) for each in places)
     guided = sum(vote.match.validation.guided for vote in accepted)
     reason = _found_reason(average, len(accepted), guided, total, place.support, verified_by)

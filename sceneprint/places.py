@@ -45,7 +45,7 @@ class LocalizationParameters:
     confidence: float = 0.99  #: minimum confidence of a pose that is found
     worth: float = 0.05  #: minimum confidence of an alternative
     views: int = 5  #: maximum number of averaged votes, and of alternatives
-    same_view: float = 1 / 30  #: separation of views at which the weight of a vote is halved
+    half_weight: float = 1 / 30  #: separation of views at which the weight of a vote is halved
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong match has weight 1
     outweigh: float = 2.0  #: minimum ratio of the weights of the best two places, without a map
     voted_only: bool = False  #: whether a pose requires the vote of a match

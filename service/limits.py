@@ -241,7 +241,7 @@ class TokenBucket:
 
     Parameters
     ----------
-    what : what is limited, as words in a sentence
+    subject : noun phrase for the error, such as "requests"
     per_s : number of tokens that return per second; 0 for no limit
     burst : number of tokens in a full bucket
     most : number of callers in memory; the one that was not seen for the longest time is dropped
@@ -249,10 +249,10 @@ class TokenBucket:
     """
 
     def __init__(
-        self, what: str, per_s: float, burst: float, most: int = 10_000,
+        self, subject: str, per_s: float, burst: float, most: int = 10_000,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        self.what, self._per_s, self._burst = what, per_s, max(burst, 1.0)
+        self.subject, self._per_s, self._burst = subject, per_s, max(burst, 1.0)
         self._most, self._clock = most, clock
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
@@ -324,7 +324,7 @@ def enforce_rate_limit(
     wait_s = bucket.take(whose, cost)
     if wait_s:
         request.state.wait_s = wait_s
-        raise RateLimited(f"Too many {bucket.what}. Retry in {wait_s} s.")
+        raise RateLimited(f"Too many {bucket.subject}. Retry in {wait_s} s.")
 
 
 def network_of(address: str) -> str:

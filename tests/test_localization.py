@@ -116,6 +116,19 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
     assert (itself.T.tolist(), itself.support) == (found.average.T.tolist(), 1)
 
 
+def test_the_covariance_of_an_earlier_frame_refers_to_the_localized_frame(blank: Geometry) -> None:
+    """Its sensor is 2 m ahead in x, so its errors of rotation move the pose in y and z."""
+    certain = replace(outcome(T=shifted(3.0)), covariance=np.eye(6) * 1e-4)
+    found = localize(
+        [QueryFrame(blank, []), QueryFrame(blank, [match(0, certain)], shifted(2.0))], ROWS
+    )
+    assert found is not None
+    assert found.average is not None
+    np.testing.assert_allclose(found.average.T, shifted(1.0), atol=1e-12)
+    assert found.covariance is not None
+    np.testing.assert_allclose(np.diag(found.covariance)[:3], [1e-4, 5e-4, 5e-4], rtol=1e-6)
+
+
 def test_near_views_and_certain_matches_count_more(blank: Geometry) -> None:
     """The query is at x = 0, and a camera in row 0 looks the same way as the query."""
 

@@ -97,13 +97,13 @@ class Joiner:
             times = _STEP_S * np.arange(np.floor(first / _STEP_S), np.ceil(last / _STEP_S) + 1)
             times = np.unique(np.clip(times, first, last))
         poses = self._odometry([stamp_ns + round(1e9 * one) for one in times])
-        known = [pose for pose in poses if pose is not None]
-        if len(known) < len(times) or _is_jump(np.array(known)[:, :3, 3], times):
+        valid = [pose for pose in poses if pose is not None]
+        if len(valid) < len(times) or _is_jump(np.array(valid)[:, :3, 3], times):
             self.counts["without_odometry"] += 1
             return False
-        T_odom_sensor = known[int(np.argmin(np.abs(times)))]
+        T_odom_sensor = valid[int(np.argmin(np.abs(times)))]
         if len(times) > 1 and seconds is not None:
-            back = np.linalg.inv(T_odom_sensor).astype(np.float64) @ np.array(known)
+            back = np.linalg.inv(T_odom_sensor).astype(np.float64) @ np.array(valid)
             points = _moved_points(points, seconds, times, back)
         if self._scans:
             newest = self._scans[-1]

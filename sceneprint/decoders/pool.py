@@ -16,17 +16,19 @@ import math
 import mmap
 import os
 import select
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +79,19 @@ _ENVIRONMENT = (
     "PYTHONHOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "NUMBA_CPU_NAME",
     "NUMBA_CPU_FEATURES", "PYTHONDONTWRITEBYTECODE",
 )  # fmt: skip
+
+
+@contextmanager
+def inheritable(source: BinaryIO) -> Iterator[int]:
+    """Yield a descriptor of an open file that a decoder process can inherit."""
+    with tempfile.TemporaryFile() as copy:
+        try:
+            descriptor = source.fileno()
+        except OSError:  # a file of an object store has no descriptor
+            shutil.copyfileobj(source, copy)
+            copy.flush()
+            descriptor = copy.fileno()
+        yield descriptor
 
 
 class DecoderEnded(Exception):

@@ -74,8 +74,8 @@ class RecordingDecoder:
         if process is not None:
             process.end()
 
-    def outline(self, options: ImportOptions) -> bytes:
-        """Return the document from which `RecordingIndex.parse` makes an index.
+    def outline(self, options: ImportOptions) -> tuple[bytes, RecordingIndex]:
+        """Return the index of the recording, and the document from which it can be parsed again.
 
         Raises
         ------
@@ -85,10 +85,9 @@ class RecordingDecoder:
         fields = options.model_dump(mode="json", by_alias=True)
         text = self._run({"task": "outline", "options": fields})
         try:
-            RecordingIndex.parse(text)
+            return text, RecordingIndex.parse(text)
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise UnreadableArchive(f"{self._name}: Its outline is invalid.") from error
-        return text
 
     def frame(self, topic: tuple[str, str], place: list[Any]) -> bytes:
         """Return the bytes of the frame at a place.

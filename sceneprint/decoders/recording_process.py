@@ -28,6 +28,7 @@ from sceneprint.formats.recording.bag import BagTopic, load_readers, shared_bag
 from sceneprint.formats.recording.topics import BagSource
 from sceneprint_client.api.frames import (
     MOST_RECORDING_TOPICS,
+    RECORDING_OPTIONS,
     ImportOptions,
     RecordingOutline,
     RecordingTopic,
@@ -92,10 +93,7 @@ def _outline(path: Path, request: dict[str, Any]) -> Reply:
     frames are selected.
     """
     options = ImportOptions.model_validate(request["options"])
-    choice = RecordingOptions(
-        options.topic, options.camera_info, options.pose_frame, options.keyframe_m,
-        options.keyframe_deg, options.keyframe_s, options.sensor_frame, options.depth_scale,
-    )  # fmt: skip
+    choice = RecordingOptions(**{name: getattr(options, name) for name in RECORDING_OPTIONS})
     outline = bag_outline(path, choice)
     frames = [
         {

@@ -331,10 +331,15 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     T = np.eye(4)
     T[:3, :3] = nearest_rotation(members[:, :3, :3].sum(axis=0))
     T[:3, 3] = members[:, :3, 3].mean(axis=0)
-    residuals = _pose_differences(T[None], members)[0]
-    metres, radians = np.sqrt((residuals**2).mean(axis=0)).tolist()
     indices = np.flatnonzero(near[medoid])
-    return PoseAverage(T, metres, radians, len(members), len(poses), indices)
+    return PoseAverage(T, *pose_spread(T, members), len(members), len(poses), indices)
+
+
+def pose_spread(T: Floats, poses: Floats) -> tuple[float, float]:
+    """Return the root mean square difference of poses (n, 4, 4) from T, metres and radians."""
+    differences = _pose_differences(T[None], poses)[0]
+    metres, radians = np.sqrt((differences**2).mean(axis=0)).tolist()
+    return metres, radians
 
 
 def mean_direction(directions: Floats, within: float) -> Floats | None:

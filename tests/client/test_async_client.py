@@ -51,7 +51,7 @@ def test_a_map_from_upload_to_deletion(
 
     async def session() -> None:
         async with AsyncClient(service_url) as client:
-            made = await client.create_map(map_name, model="depth")
+            created = await client.create_map(map_name, model="depth")
             job = await client.import_archive(map_name, archive)
             (job,) = await client.wait([job.job_id], timeout_s=PATIENCE_S)
             assert job.state == "succeeded"
@@ -72,7 +72,7 @@ def test_a_map_from_upload_to_deletion(
             assert [one.counts.map for one in answers] == [3] * 10
             assert len({one.query_id for one in answers}) == 10
             assert answers[0].matches == answers[3].matches
-            await client.delete_map(made.name)
+            await client.delete_map(created.name)
             with pytest.raises(UnknownMap, match=map_name):
                 await anext(client.frames(map_name))
 

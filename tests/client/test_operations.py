@@ -142,7 +142,7 @@ def test_a_stream_is_read_as_the_standard_says() -> None:
     place = StreamPosition(None)
     found = [(one, place.last) for line in lines if (one := place.read(line)) is not None]
     assert found == [(EVENT, "7")]
-    # what was cut off is requested again
+    # the position is still before the incomplete event
     assert place == StreamPosition("7", 0.02)
 
 

@@ -24,11 +24,11 @@ def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle
     station.make_map("marked-up", title=MARKUP)
     page.goto(station.home)
     settle(page)
-    one, told = card(page, "building"), station.client.get("/v1/maps/building").json()
-    assert told["frames"] == {"indexed": 16}
+    one, record = card(page, "building"), station.client.get("/v1/maps/building").json()
+    assert record["frames"] == {"indexed": 16}
     expect(one.get_by_role("heading")).to_have_text("Two rooms")
     expect(one.locator(".map-number")).to_have_text("16")
-    expect(one).to_contain_text(told["model"])
+    expect(one).to_contain_text(record["model"])
     expect(one.get_by_role("link", name="Upload frames")).to_have_count(0)
     empty = card(page, "marked-up")
     expect(empty.get_by_role("heading")).to_have_text(MARKUP)  # letter by letter
@@ -45,7 +45,7 @@ def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle
           return counts.map((recent_queries) => {
             const { element } = mapCard({ ...map, recent_queries }, { signal });
             return element.querySelector(".map-share").textContent; }); }""",
-        [f"{station.url}/dashboard/maps/card.js", told, counts],
+        [f"{station.url}/dashboard/maps/card.js", record, counts],
     )  # fmt: skip
     assert shares == [
         "No queries in the last hour", "1 query without validation in the last hour",
@@ -243,8 +243,8 @@ def test_robots_are_seen_moving_on_the_plan(
     settle(page)
     assert axe(page) == []
     page.mouse.move(0, 0)
-    asked: list[str] = []
-    page.on("request", lambda sent: asked.append(sent.url))
+    requested: list[str] = []
+    page.on("request", lambda sent: requested.append(sent.url))
     places = {tuple(first["location"]["pose"]["translation"].values())}
     for shot in walk[1:]:
         last = ask(station, "walker", shot)
@@ -252,7 +252,7 @@ def test_robots_are_seen_moving_on_the_plan(
         places.add(tuple(last["location"]["pose"]["translation"].values()))
     assert len(places) == len(walk)
     assert any(outside)
-    assert not [url for url in asked if "/queries" in url or "/surface" in url]
+    assert not [url for url in requested if "/queries" in url or "/surface" in url]
     expect(one.locator(".map-answers li").first).to_contain_text("walker")
     expect(one.locator(".map-answers a").first).to_have_attribute(
         "href", f"#/queries/{last['query_id']}"
@@ -350,20 +350,24 @@ def test_labels_and_colours_by_value(station: Any, page: Page, settle: Settle) -
     page.goto(station.home)
     settle(page)
 
-    def run(module: str, expression: str, *given: object) -> Any:
-        script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
-        return page.evaluate(script, [f"{station.url}/dashboard/lib/{module}.js", list(given)])
+    def run(module: str, expression: str, *values: object) -> Any:
+        script = f"async ([url, values]) => {{ const m = await import(url); return {expression}; }}"
+        return page.evaluate(script, [f"{station.url}/dashboard/lib/{module}.js", list(values)])
 
     label = {"x": 50, "y": 50, "width": 30, "height": 20}
     spots = [[8, -26], [8, 6], [-38, -26], [-38, 6], [8, -48]]
-    assert run("labels", "m.spread(given[0])", [label] * 5) == spots
+    assert run("labels", "m.spread(values[0])", [label] * 5) == spots
     far = {**label, "x": 90}  # its first spot is free again, unless the picture ends before
-    assert run("labels", "m.spread(given[0])", [label, far]) == [[8, -26], [8, -26]]
+    assert run("labels", "m.spread(values[0])", [label, far]) == [[8, -26], [8, -26]]
     room = {"width": 100, "height": 60}
-    within = run("labels", "m.spread(...given)", [label, far, far], room)
+    within = run("labels", "m.spread(...values)", [label, far, far], room)
     assert within == [[8, -26], [-38, -48], None]
     # a hash modulo six, and the next that is free; the seventh name begins anew
     names = ["a", "g", "b"]
-    assert run("palette", "[...m.paletteOf(given[0], 6)]", names) == [["a", 1], ["g", 2], ["b", 3]]
-    shown = run("palette", "[...m.robotTokens(given[0])]", ["b", "a", "b"])
+    assert run("palette", "[...m.paletteOf(values[0], 6)]", names) == [
+        ["a", 1],
+        ["g", 2],
+        ["b", 3],
+    ]
+    shown = run("palette", "[...m.robotTokens(values[0])]", ["b", "a", "b"])
     assert shown == [["a", "--robot-1"], ["b", "--robot-2"]]

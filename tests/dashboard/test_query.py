@@ -217,8 +217,8 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
             return np.linalg.norm(pose[:3, 3] - own[:3, 3]) + np.degrees(turn) / 45
 
         assert view == min(poses, key=apart)["frame_id"]
-    told = page.locator(".plan .query-spot-sure").all_text_contents()
-    assert told == [item["figures"][0] for item in items]
+    confidences = page.locator(".plan .query-spot-sure").all_text_contents()
+    assert confidences == [item["figures"][0] for item in items]
     fit = several[1]["evidence"]["score"] / several[0]["evidence"]["score"]
     assert f"from A, fits {100 * fit:.0f} % as well" in said
     # each match stands with the pose that it votes for

@@ -101,8 +101,8 @@ def places(votes: list[Vote]) -> list[float]:
         own = [transform_covariance(one.covariance, one.T_world_match[:3, :3], np.zeros(3))
                for one in several]  # fmt: skip
         average = average_poses(poses)
-        T, covariance = fuse_votes(average, poses, np.array(own), np.ones(len(poses)))
-        error = pose_error(T, several[0].T_world_query)
+        average, covariance = fuse_votes(average, poses, np.array(own), np.ones(len(poses)))
+        error = pose_error(average.T, several[0].T_world_query)
         if average.support > 1 and near(error):
             found.append(square(error, covariance))
     return found
@@ -291,14 +291,14 @@ def test_a_place_from_its_votes() -> None:
     covariances = np.array([np.diag([s] * 6) for s in (4e-4, 4e-4, 4e-4, 7.0)])
     average = average_poses(poses)
     assert average.members.tolist() == [0, 1, 2]
-    T, found = fuse_votes(average, poses, covariances, np.ones(4))
-    np.testing.assert_allclose(T, average.T, atol=1e-12)
+    fused, found = fuse_votes(average, poses, covariances, np.ones(4))
+    np.testing.assert_allclose(fused.T, average.T, atol=1e-12)
     expected = np.diag([4e-4 * (1 / 2 + 1 / 6)] * 6)
     expected[0, 0] += 2 * 0.01**2 / (3 * 2)
     np.testing.assert_allclose(found, expected, atol=1e-12)
     alone = average_poses(poses[3:])
-    T, found = fuse_votes(alone, poses[3:], covariances[3:], np.ones(1))
-    np.testing.assert_allclose(T, poses[3], atol=1e-12)
+    fused, found = fuse_votes(alone, poses[3:], covariances[3:], np.ones(1))
+    np.testing.assert_allclose(fused.T, poses[3], atol=1e-12)
     np.testing.assert_allclose(found, covariances[3], atol=1e-12)
 
 
@@ -307,14 +307,16 @@ def test_votes_are_weighted_by_their_information() -> None:
     poses[1, :3, 3] = (0.03, 0.03, 0.0)
     covariances = np.array([np.diag([1e-4, 4e-4, 1e-4] * 2), np.diag([2e-4, 2e-4, 1e-4] * 2)])
     average = average_poses(poses)
-    T, found = fuse_votes(average, poses, covariances, np.ones(2))
+    fused, found = fuse_votes(average, poses, covariances, np.ones(2))
     # x: 2 parts of the first, 1 of the second; y: 1 part of the first, 2 of the second
-    np.testing.assert_allclose(T[:3, 3], (0.01, 0.02, 0.0), atol=1e-12)
+    np.testing.assert_allclose(fused.T[:3, 3], (0.01, 0.02, 0.0), atol=1e-12)
+    # both are sqrt(5) cm away from it, in x and y
+    assert fused.spread_m == pytest.approx(0.01 * math.sqrt(5))
     own, shared = (4 * 1e-4 + 2e-4) / 9, ((2 * 1e-2 + math.sqrt(2) * 1e-2) / 3) ** 2
     spread = 2 * ((2 / 3 * 0.01) ** 2 + (1 / 3 * 0.02) ** 2)
     assert found[0, 0] == pytest.approx((own + shared) / 2 + spread)
     inflated, _ = fuse_votes(average, poses, covariances, np.array([1.0, 2.0]))
-    np.testing.assert_allclose(inflated[:2, 3], (0.03 / 5, 0.03 / 2), atol=1e-12)
+    np.testing.assert_allclose(inflated.T[:2, 3], (0.03 / 5, 0.03 / 2), atol=1e-12)
 
 
 def test_the_covariance_of_fused_votes_is_that_of_their_errors() -> None:
@@ -331,8 +333,8 @@ def test_the_covariance_of_fused_votes_is_that_of_their_errors() -> None:
         noise = [root @ (common + rng.normal(size=6)) / math.sqrt(2) for root in roots]
         votes = np.array([with_error(np.eye(4), -one) for one in noise])
         average = replace(average_poses(votes), members=np.arange(3))
-        T, covariance = fuse_votes(average, votes, covariances, inflations)
-        errors.append(pose_error(T, np.eye(4)))
+        average, covariance = fuse_votes(average, votes, covariances, inflations)
+        errors.append(pose_error(average.T, np.eye(4)))
         sizes.append(covariance)
     real = np.cov(np.array(errors).T)
     # the spread of the votes is added, and counts the independent half twice

@@ -76,8 +76,10 @@ def _nodes(context: LaunchContext) -> list[Any]:
         parameters |= {"topic": sensor.topic, "kind": sensor.kind, "imu_topic": sensor.imu_topic}
         file = PathJoinSubstitution([FindPackageShare(sensor.package), "launch", sensor.file])
         source = AnyLaunchDescriptionSource(file)
-        given = sensor.arguments.items()
-        actions.append(IncludeLaunchDescription(source, launch_arguments=given, condition=driver))
+        arguments = sensor.arguments.items()
+        actions.append(
+            IncludeLaunchDescription(source, launch_arguments=arguments, condition=driver)
+        )
     node = Node(
         package="sceneprint_ros",
         executable="relocaliser",

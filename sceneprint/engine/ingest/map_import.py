@@ -9,8 +9,6 @@ surface, then the surface with viewpoints. It counts against the map's quota unt
 from __future__ import annotations
 
 import hashlib
-import shutil
-import tempfile
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import PurePath
@@ -20,6 +18,7 @@ import numpy as np
 from numpy.lib import format as npy
 from sqlalchemy import Connection
 
+from sceneprint.decoders.pool import inheritable
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
 from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.archive_import import (
@@ -216,13 +215,7 @@ class MapImporter:
         del is_over, task
         axis = options.up if isinstance(options.up, str) else None
         surface_options = SurfaceOptions(units_per_metre=options.units_per_metre, up=axis)
-        with self._open_file(file) as source, tempfile.TemporaryFile() as local:
-            try:
-                descriptor = source.fileno()
-            except OSError:  # a file of an object store has no descriptor
-                shutil.copyfileobj(source, local)
-                local.flush()
-                descriptor = local.fileno()
+        with self._open_file(file) as source, inheritable(source) as descriptor:
             try:
                 read = read_surface_confined(
                     descriptor, options.name, surface_options, self._limits

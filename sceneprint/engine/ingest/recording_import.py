@@ -9,15 +9,14 @@ slices read single messages. A confined process reads the file in all slices.
 from __future__ import annotations
 
 import math
-import shutil
-import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+from sceneprint.decoders.pool import inheritable
 from sceneprint.decoders.recording_decoder import RecordingDecoder, RecordingIndex
 from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.archive_import import add_block
@@ -61,8 +60,10 @@ class RecordingImporter:
             index = RecordingIndex.parse(stored.read())
         if index.outline.problem is not None:
             raise UnreadableArchive(index.outline.problem)
+        assert index.topic is not None
         with self._decoder(files[ARCHIVE], options.name) as decoder:
-            return self._add(task, options, decoder, index, is_over)
+            read = partial(decoder.frame, index.topic)
+            return self._add(task, options, read, index, is_over)
 
     @contextmanager
     def _decoder(self, file: queue.JobFile, name: str) -> Iterator[RecordingDecoder]:
@@ -70,13 +71,7 @@ class RecordingImporter:
             source = self._store.blobs.open(file.blob)
         except OSError as error:
             raise unusable("The recording cannot be read", error) from error
-        with source, tempfile.TemporaryFile() as local:
-            try:
-                descriptor = source.fileno()
-            except OSError:  # a file of an object store has no descriptor
-                shutil.copyfileobj(source, local)
-                local.flush()
-                descriptor = local.fileno()
+        with source, inheritable(source) as descriptor:
             decoder = RecordingDecoder(descriptor, name, self._seconds)
             try:
                 yield decoder
@@ -85,8 +80,7 @@ class RecordingImporter:
 
     def _read(self, decoder: RecordingDecoder, options: ImportOptions) -> SliceResult:
         """Store the outline, which users see even if no frame can be used, and the index."""
-        text = decoder.outline(options)
-        index = RecordingIndex.parse(text)
+        text, index = decoder.outline(options)
         progress = {
             "done": 0, "total": len(index.frames), "phase": "add", "received": 0, "there": 0,
             "refused": 0, "largest": 0, "recording": index.outline.model_dump(mode="json"),
@@ -97,17 +91,15 @@ class RecordingImporter:
         return SliceResult(False, progress, files=[file])
 
     def _add(
-        self, task: LongJob, options: ImportOptions, decoder: RecordingDecoder,
+        self, task: LongJob, options: ImportOptions, read: Callable[[list[Any]], bytes],
         index: RecordingIndex, is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        topic, frames, progress = index.topic, index.frames, dict(task.progress)
+        frames, progress = index.frames, dict(task.progress)
         items = list[dict[str, Any]]()
 
         def upload(frame: dict[str, Any]) -> Upload:
-            if topic is None:
-                raise UnreadableArchive("The recording has no topic of frames.")
             meta = FrameMeta.model_validate(frame["meta"])
-            data = decoder.frame(topic, frame["place"])
+            data = read(frame["place"])
             progress["largest"] = max(len(data), progress["largest"])
             return Upload(data, meta, options.priority, options.if_novel)
 

@@ -115,7 +115,7 @@ class FrameTopic:
 
     @property
     def is_beside_depth(self) -> bool:
-        """Whether the name indicates colour, infrared, confidence or labels.
+        """Whether the topic is named after colour, infrared, confidence or labels.
 
         Of `/depth/confidence` and `/ir_camera/depth/image`, only the first does.
         """

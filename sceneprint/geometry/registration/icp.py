@@ -19,7 +19,7 @@ pixels are correlated: docs/uncertainty.md measures the effective number of poin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -32,7 +32,13 @@ from sceneprint.geometry.registration.overlap import (
     nearest_alike,
     sample_points,
 )
-from sceneprint.geometry.rigid import PoseAverage, apply_rotation, rotation_angle, solve_positive
+from sceneprint.geometry.rigid import (
+    PoseAverage,
+    apply_rotation,
+    pose_spread,
+    rotation_angle,
+    solve_positive,
+)
 from sceneprint.geometry.surface.camera import (
     BLOCK,
     depth_of,
@@ -623,8 +629,8 @@ def free_directions(
 
 def fuse_votes(
     average: PoseAverage, poses: Floats, covariances: Floats, inflations: Floats
-) -> tuple[Floats, Floats]:
-    """Return the most likely pose (4, 4) of the votes that agree, and its covariance (6, 6).
+) -> tuple[PoseAverage, Floats]:
+    """Return the most likely pose of the votes that agree, and its covariance (6, 6).
 
     All votes share the query, so only half of their covariances is independent. The spread of the
     votes, which contains the errors of the map's poses, is added.
@@ -653,7 +659,8 @@ def fuse_votes(
         errors = np.array([pose_error(T, vote) for vote in members])
         weighted = np.einsum("nij,nj->ni", gains, errors)
         covariance += weighted.T @ weighted * n / (n - 1)
-    return T, covariance
+    metres, radians = pose_spread(T, members)
+    return replace(average, T=T, spread_m=metres, spread_rad=radians), covariance
 
 
 def pose_error(T: Floats, true: Floats) -> Floats:
