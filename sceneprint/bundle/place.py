@@ -47,8 +47,6 @@ class Part(StrictRecord):
     ----------
     kind : `rows/TABLE`, or `blobs` for a list of blobs, which are parts themselves
     digest : SHA-256 of its bytes, and its name
-    bytes : its size
-    rows : number of its rows
     source : digest of its rows in the store
     """
 

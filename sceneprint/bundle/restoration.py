@@ -216,10 +216,6 @@ def check_empty(connection: Connection) -> None:
 def list_bundle_keys(place: str, name: str | None = None) -> list[str]:
     """Return the names of the keys in a bundle, which work again once it is restored.
 
-    Parameters
-    ----------
-    place, name : see `verify_bundle`
-
     Raises
     ------
     BundleError, DamagedBundle, NewerSchema : As for `verify_bundle`.
@@ -257,7 +253,6 @@ def restore_to_folder(
 
     Parameters
     ----------
-    place, name, progress : see `verify_bundle`
     folder : folder that is missing or empty
     keep_keys : False revokes all keys of the bundle
 
@@ -351,7 +346,6 @@ def restore_to_server(
 
     Parameters
     ----------
-    place, name, progress : see `verify_bundle`
     settings : settings with the addresses of the database, whose schema is created if it is
         missing, and of the blobs
     keep_keys : False revokes all keys of the bundle

@@ -48,11 +48,8 @@ def print_rows(
 
     Parameters
     ----------
-    rows : records of one class
     line : function that returns the line of a record in the table
-    header : first line of the table
     none : text that replaces an empty table
-    as_json : whether to print JSON
     """
     empty = True
     for row in rows:

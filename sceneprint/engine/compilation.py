@@ -56,7 +56,6 @@ def compile_kernels(
     Parameters
     ----------
     cache_dir : folder of pair tables, in which the table for signing is created
-    parts : parts of `ALL` to compile
     say : function that receives each line of progress
     stop : event that cancels the compilation
     """

@@ -120,7 +120,6 @@ class Segment:
 
     Parameters
     ----------
-    record : names of the parts
     keys : (N,) int64, ascending keys of all frames in the parts
     index : FAISS index of the signatures in the same order
     sketches : sketches of the frames; None if all frames are compared
@@ -176,7 +175,6 @@ class Segment:
         Parameters
         ----------
         query : (D,) uint8
-        size : number of nearest frames
         gone : (g,) ascending keys of excluded frames
         among : (a,) ascending keys of searchable frames; None selects all others
         exact : whether to compare every searchable frame

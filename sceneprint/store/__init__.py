@@ -67,7 +67,6 @@ class GeometryCache:
 
     Parameters
     ----------
-    blobs : source of the artifacts
     most_bytes : maximum total size of the entries; 0 disables the cache
     """
 
@@ -137,7 +136,6 @@ class Store:
     Parameters
     ----------
     geometry_bytes : maximum size of the cache of geometry artifacts, bytes
-    decoders : decoders of uploads
     """
 
     database: Database
@@ -210,7 +208,6 @@ def open_blobs(
     Parameters
     ----------
     blobs : folder, or URL of an object store
-    database : database that refers to the blobs
     make : whether to create a missing folder
     claim : whether to mark an unclaimed prefix or folder as this database's
 

@@ -98,7 +98,6 @@ def open_answers(blobs: Blobs, folder: Path) -> AnswerFiles:
 
     Parameters
     ----------
-    blobs : blobs of the store
     folder : folder for the answers, if the blobs are in a folder too
     """
     return AnswerObjects(blobs.objects) if isinstance(blobs, ObjectBlobs) else AnswerFolder(folder)

@@ -130,7 +130,6 @@ def surplus_lines(
     ----------
     before : time before which lines are old, seconds since 1970. If a clock was set back, an old
         line behind a younger one stays until both are old
-    limit : maximum number of returned lines
     most_lines : maximum number of lines per tenant
     """
     oldest = connection.execute(

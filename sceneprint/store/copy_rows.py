@@ -94,9 +94,7 @@ class CopiedFrame:
 
     Parameters
     ----------
-    id : id of the frame
     values : values of COPIED_COLUMNS by name
-    signature : signature of the frame
     """
 
     id: str

@@ -85,7 +85,6 @@ class SchemaRange:
 
     Parameters
     ----------
-    revision : schema of the store
     least : oldest revision whose processes may write to the store
     """
 
@@ -262,7 +261,6 @@ class Database:
 
     Parameters
     ----------
-    engine : SQLAlchemy engine
     sealed : database file if it is read-only
     """
 
@@ -410,7 +408,6 @@ class Database:
 
         Parameters
         ----------
-        map_numbers : numbers of the maps
         wait_s : maximum seconds to wait for each map; writers of the other maps wait meanwhile
 
         Raises

@@ -247,12 +247,10 @@ def remove_in_blocks(
 
     Parameters
     ----------
-    database : database of the rows
     find : function that returns the numbers of rows to remove, up to a limit; it is called without
         the lock, because it usually returns none
     remove : function that removes the rows
     most : maximum number of rows; the last block may exceed it
-    block : number of rows per commit
 
     Returns
     -------

@@ -63,7 +63,6 @@ def record_event(
     kind : one of `KINDS` of the API
     map_name, frame_id, job_id : changed objects
     details : data for the audit log only
-    data : data of the event, by kind
     """
     record_events(connection, [event_values(kind, map_name, frame_id, job_id, data)], details)
 
@@ -378,7 +377,6 @@ def surplus_events(
     ----------
     most_events : maximum number of events per map
     anchors : numbers of events that must not be removed
-    limit : maximum number of returned events
     """
     numbers: list[int] = []
     for name, floor in removal_floors(connection, most_events).items():

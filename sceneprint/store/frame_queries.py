@@ -92,7 +92,6 @@ def passing_frames(
 
     Parameters
     ----------
-    wanted : filter
     origin : origin of the query, with session and time if the filter excludes its surroundings
     """
     # a single text is much faster than 100,000 rows
@@ -293,7 +292,6 @@ class RunSummary:
     posed : number of frames with a pose
     first, last : range of the capture times, seconds since 1970
     parents : number of poses by parent frame
-    tags : number of frames by tag
     """
 
     robot: str | None
@@ -451,7 +449,6 @@ class PathFrame:
     Parameters
     ----------
     robot, session, captured_at, name, sequence : metadata, or None if unknown
-    parent : parent frame of the pose
     pose : T_parent_sensor, or None
     is_cloud : whether the frame is a point cloud
     """

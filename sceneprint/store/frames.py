@@ -168,7 +168,6 @@ def write_frame(
     ----------
     connection : writing transaction
     frame : current row
-    values : new values by column
     """
     changed = {name: new for name, new in values.items() if getattr(frame, name) != new}
     if not changed:

@@ -242,7 +242,6 @@ class IdempotentRequest:
     Parameters
     ----------
     actor : name of the caller's API key, or ""
-    key : `Idempotency-Key` of the request
     fingerprint : 64 digits that identify route and content
     """
 

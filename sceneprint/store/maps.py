@@ -407,7 +407,6 @@ def placed_frames(
 
     Parameters
     ----------
-    map_number, parent : map and parent frame
     centre : x, y, z of the point, metres
     within : half of the edge of the cube around the point, metres
     most : maximum number of frames

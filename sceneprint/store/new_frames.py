@@ -251,7 +251,6 @@ def _insert_frames(
 
     Parameters
     ----------
-    event_table : table of the events
     columns : names of the columns of each row
     fixed : values of columns that are equal for all frames, by key
     tagged : whether any frame has a tag

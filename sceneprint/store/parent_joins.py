@@ -120,7 +120,6 @@ def join_parent(connection: Connection, map_number: int, one: ParentJoin, job_id
     Parameters
     ----------
     connection : writing transaction of the map
-    map_number : number of the map
     one : join of two roots
     job_id : id of the association that proposed the join
 

@@ -77,9 +77,7 @@ class NewQuery(_Query):
     status, cause, reason : values of the answer; or `failed`, the type of the error, and its text
     pose_parent, pose : parent frame, and x, y, z, qx, qy, qz, qw of T_parent_query, if found
     confidence : confidence of that pose, or of the best alternative
-    support : support of that pose
     alternatives : number of other poses that the evidence supports
-    milliseconds : duration of the query
     kind : kind of the query frame, if it was decoded
     frame_map, frame_id : map and id of the query frame, if it is a stored frame
     key_id : id of the request's key
@@ -202,7 +200,6 @@ def list_queries(
 
     Parameters
     ----------
-    wanted : conditions
     before : time and number of the last row of the previous page
     limit : maximum number
     """

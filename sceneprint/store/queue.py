@@ -289,7 +289,6 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     Parameters
     ----------
     connection : writing transaction
-    worker : name of the worker
     lease_s : duration of the lease, seconds
     """
     at = now(connection)
@@ -606,7 +605,6 @@ def fail_dead_worker(
     Parameters
     ----------
     connection : writing transaction
-    job_id, token : claim of the dead worker
     error, traceback : description of the worker's death
     counts : whether the job may have caused the death, so that the attempt counts as a failure
 
@@ -690,7 +688,6 @@ class JobFile:
     ----------
     name : unique name within the job, such as mesh.ply
     blob : digest of the content, which must exist
-    bytes : size of the file
     """
 
     name: str
@@ -773,7 +770,6 @@ def remove_parts(
     Parameters
     ----------
     connection : writing transaction
-    items : whether to remove the items
     files : names of the files to remove; default: all files
 
     Returns

@@ -119,7 +119,6 @@ def inspect_blobs(place: Path | str, database: Database) -> Iterator[Blobs]:
     Parameters
     ----------
     place : folder, or URL of an object store
-    database : database that refers to the blobs
 
     Raises
     ------

@@ -49,7 +49,6 @@ class StoredSignature:
 
     Parameters
     ----------
-    model_id : id of the model that signed the frame
     vector : bytes of the signature
     geometry : blob of the artifact
     n_patches, n_pairs : numbers of patches and pairs per level
@@ -105,9 +104,6 @@ def index_claimed_frame(
     Parameters
     ----------
     connection : writing transaction of the frame's map
-    job : claimed job of the frame
-    frame, signature : see `index_frame`
-    map_name : name of the frame's map
 
     Returns
     -------

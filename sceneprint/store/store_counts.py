@@ -111,7 +111,6 @@ class Sample:
     Parameters
     ----------
     at : end of the interval, seconds since 1970
-    data : counts by kind
     """
 
     at: float

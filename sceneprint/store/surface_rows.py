@@ -457,7 +457,6 @@ def forget_scale(
     Parameters
     ----------
     connection, map_number, parent : see `tiles_at`
-    place : place of the coarser tile
     factor : ratio of the widths of the tiles
     """
     c = surface_tiles.c
@@ -595,7 +594,6 @@ def frames_seeing(
 
     Parameters
     ----------
-    surface, parent : surface and parent frame
     places : places of tiles of the finest level
     spot : x, y, z of the spot, metres
     beyond : squared distance and number of the last frame of the previous page

@@ -19,7 +19,6 @@ class TenantRow:
     ----------
     name : unique name
     created_at : seconds since 1970
-    keys : number of keys
     """
 
     name: str

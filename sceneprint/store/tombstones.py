@@ -29,7 +29,6 @@ class Deletion:
     ----------
     number : first revision of the deletion
     at : start of the deletion by the clock of the database, seconds since 1970
-    frames : number of restorable frames
     """
 
     number: int
@@ -84,8 +83,6 @@ def tombstones_of(
 
     Parameters
     ----------
-    connection, map_number, seconds, limit : see `list_deletions`
-    deletion : number of the deletion
     after : number of the last frame of the previous page
     """
     statement = select(frames).where(

@@ -63,7 +63,6 @@ class EventSlice(NamedTuple):
 
     Parameters
     ----------
-    events : events of the slice
     place : number up to which the events are complete
     seen : last number up to it that the reader may see
     """
@@ -78,8 +77,6 @@ def begin(database: Database, wanted: EventFilter, kept: int, after: int | None)
 
     Parameters
     ----------
-    database : database of the events
-    wanted : filter of the reader
     kept : number of newest events of each map that are never removed
     after : number of the reader's last event; None: start with new events
     """
@@ -160,7 +157,6 @@ class Events:
 
         Parameters
         ----------
-        wanted : filter
         after : id of an event, after which the page starts
         cursor : `next_cursor` of the previous page
         limit : maximum number of events

@@ -233,7 +233,6 @@ class Figures:
 
     Parameters
     ----------
-    stats : statistics
     began : number of workers that started in the last hour
     events : number of the newest event
     waiting : queued jobs by tenant
@@ -252,10 +251,8 @@ class StoreCounts:
     Parameters
     ----------
     frames, jobs : numbers by state
-    indexes : see `index_states`
     sizes : bytes on the disk
     at : time of the counts, seconds since 1970
-    seconds : duration of counting
     """
 
     frames: Mapping[str, int]

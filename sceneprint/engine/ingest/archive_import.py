@@ -202,13 +202,7 @@ _MOST_PIXELS = 640
 
 
 class _FileBytes:
-    """Filter that checks the bytes of a map's file or of a recording.
-
-    Parameters
-    ----------
-    name : name of the file
-    is_map : whether the file is a map
-    """
+    """Filter that checks the bytes of a map's file or of a recording."""
 
     def __init__(self, name: str, *, is_map: bool) -> None:
         self._name, self._is_map, self._head, self._size = name, is_map, b"", 0

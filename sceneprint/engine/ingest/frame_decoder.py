@@ -37,7 +37,6 @@ class Read:
 
     Parameters
     ----------
-    frame : frame for the geometry
     cloud : stored description of a cloud: packing, viewpoint, units per metre, number of points,
         and corrections
     base : name of the robot's base frame and T_base_sensor; None if unknown
@@ -55,10 +54,6 @@ class Read:
 
 def read_upload(data: bytes, meta: FrameMeta, decoders: Decoders) -> Read:
     """Decode an upload, and check it as far as is possible without signing it.
-
-    Parameters
-    ----------
-    decoders : pool of decoders
 
     Raises
     ------
@@ -200,7 +195,6 @@ def base_of(
 
     Parameters
     ----------
-    transform : transform in the request
     viewpoint : viewpoint of a cloud. Without `transform`, the cloud's coordinates replace the base
         unless the viewpoint is their origin, so that answers also contain their pose
 

@@ -77,7 +77,6 @@ class StoredSurface:
 
     Parameters
     ----------
-    surface : decoded surface
     poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views to add and of the test
         views; empty until they are chosen
     floor : height of the floor along `up`, metres
@@ -122,8 +121,6 @@ class _Views:
     Parameters
     ----------
     stored : surface and viewpoints
-    parameters : parameters of the sensor
-    options : options of the import
     """
 
     def __init__(
@@ -181,7 +178,6 @@ class MapImporter:
 
     Parameters
     ----------
-    uploads : uploads, for the views
     queries : queries, for the test of the map with held-out views
     """
 
@@ -454,7 +450,6 @@ def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
     Parameters
     ----------
     stored : surface with the poses of the views
-    outcomes : outcomes of the test views, in order
 
     Returns
     -------

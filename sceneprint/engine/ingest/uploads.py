@@ -204,7 +204,6 @@ class Upload:
     Parameters
     ----------
     data : a depth image as PNG or NPY, or a point cloud: see `sceneprint.formats.points`
-    meta : metadata
     priority : frames of a higher priority are signed first; ignored if the frame exists
     if_novel : minimum distance from the nearest frame of the map, as a share of the distance of
         unrelated frames; None: no minimum. For a duplicate that is not signed yet, the weaker
@@ -334,7 +333,6 @@ class Uploads:
 
         Parameters
         ----------
-        map_name, uploads, once : see `add`
         fence : function that is called in the commit before anything is written; if it raises a
             `SceneprintError`, nothing is stored
 
@@ -424,7 +422,6 @@ class Uploads:
         ----------
         row : map, as read before decoding
         ready : decoded uploads by their place
-        results, once, fence : see `add_all`
 
         Returns
         -------

@@ -184,12 +184,7 @@ def _do(one: _Waiting[_Work], connection: Connection) -> None:
 
 
 class NewFrames(_Group[NewFrame]):
-    """Group of threads that insert new frames of many maps by one statement on PostgreSQL.
-
-    Parameters
-    ----------
-    database : PostgreSQL database
-    """
+    """Group of threads that insert new frames of many maps by one statement on PostgreSQL."""
 
     def __init__(self, database: Database) -> None:
         super().__init__()

@@ -36,13 +36,7 @@ LEFT_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A claimed job of a single frame.
-
-    Parameters
-    ----------
-    job : job as claimed
-    frame, map : its frame and map
-    """
+    """A claimed job of a single frame."""
 
     job: JobRow
     frame: FrameRow

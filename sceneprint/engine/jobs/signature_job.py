@@ -87,7 +87,6 @@ def run(
 
     Parameters
     ----------
-    work : claimed job
     lease_s : seconds of each renewal
     longest_s : seconds after which the lease is no longer renewed, as the work may never end
     broke : function that is called after an unexpected error, since the state of this process may

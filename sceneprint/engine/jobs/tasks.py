@@ -54,7 +54,6 @@ class LongJob:
 
     Parameters
     ----------
-    job : job as claimed
     map : map of the job; None for a job without a map
     """
 
@@ -87,7 +86,6 @@ class SliceResult:
     ----------
     over : whether the job is done
     progress : `done` and `total` for users, and the state that the next slice needs
-    items : items of this slice
     files : files of this slice, whose blobs exist
     result : summary, at the end
     drop : names of files of the job to remove

@@ -393,7 +393,6 @@ class FrameFiles:
 
         Parameters
         ----------
-        map_name, frame_id : map and id of an indexed frame
         within : coordinate frame: that of the sensor, the parent frame, or the robot's base
 
         Raises

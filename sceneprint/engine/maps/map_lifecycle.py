@@ -484,7 +484,6 @@ class Catalogue:
 
         Parameters
         ----------
-        name : name of a preset, or id or label of a model
         may_read : function that returns whether the caller may read a map, which hides models of
             other maps; None hides none
 

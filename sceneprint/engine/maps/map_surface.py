@@ -138,7 +138,6 @@ class MapSurfaces:
         Parameters
         ----------
         parent : parent frame; None selects that of most frames
-        level : level of the tiles, 0 for the finest
 
         Raises
         ------
@@ -251,7 +250,6 @@ class MapSurfaces:
 
         Parameters
         ----------
-        map_name, parent, cursor, limit : see `sightings`
         low, high : x, y, z of two opposite corners, metres
         """
         beyond = self._store.seals.moment("frame", cursor)

@@ -47,7 +47,6 @@ def delete_selection(
 
     Parameters
     ----------
-    selection : frames to delete
     tombstones : store of the deleted frames
     seconds : duration after which no further block is started
 
@@ -78,11 +77,6 @@ def edit_selection(
     store: Store, map_name: str, edit: FramesEdit, seconds: float = CALL_S
 ) -> FramesEdited:
     """Edit at most 1000 selected frames in blocks.
-
-    Parameters
-    ----------
-    store, map_name, seconds : see `delete_selection`
-    edit : selection and changes
 
     Raises
     ------
@@ -186,7 +180,6 @@ def delete_session(
     Parameters
     ----------
     robot : robot of the frames; None selects all robots
-    tombstones, seconds : see `delete_selection`
 
     Raises
     ------
@@ -207,8 +200,6 @@ def edit_session(
 
     Parameters
     ----------
-    store, map_name, session, robot, seconds : see `delete_session`
-    edit : changes
     after : id of the last frame of an earlier call, after which this one continues
 
     Returns

@@ -311,8 +311,6 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
         Parameters
         ----------
-        map_name, job_id, cursor, limit : see `page_of_items`
-        min_overlap : minimum overlap
         consistent : True selects supported edges, False outvoted ones, None all
         """
 

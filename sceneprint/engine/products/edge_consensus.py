@@ -42,10 +42,8 @@ def finish_association(
 
     Parameters
     ----------
-    items : items of all edges
     source, target : numbers of the frames of both runs, in chronological order
     stops : frames by number, without deleted ones
-    request : options of the association
     scale : ratio of the model's lengths to those for rooms
 
     Returns

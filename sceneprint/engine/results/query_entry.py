@@ -34,8 +34,6 @@ class StoredAnswer:
 
     Parameters
     ----------
-    answer, query : answer and options of the query
-    model_id : id of the model that signed the query
     vector : (D,) signature of the query
     geometry : geometry of the query as bytes; None without validation
     ranked : numbers of the frames of R, in its order
@@ -113,7 +111,6 @@ class SentQuery:
     Parameters
     ----------
     maps : names of one or more maps to search
-    query : options
     robot, session : origin of the frame
     key_id : id of the caller's key
     frame : stored frame that is the query; None for an upload

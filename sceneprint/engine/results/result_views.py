@@ -85,7 +85,6 @@ class StoredPair:
 
     Parameters
     ----------
-    stored, match : answer and match
     sensor : name of the match's sensor frame
     blob : digest of the match's geometry
     row, number : map and number of the match's frame
@@ -366,7 +365,6 @@ class Inspection:
 
         Parameters
         ----------
-        query_id, frame_id, map_name : see `match`
         colour : meaning of the colours: source, normal, or distance from the other surface
         by : transform of the query's points: the aligned one, its best rival, or none
 
@@ -481,7 +479,6 @@ class PointClouds:
 
         Parameters
         ----------
-        query_id, frame_id, map_name : see `Pairs.find`
         side : frame whose points are returned
         by : transform under which the distances are measured
         limit : maximum number of points

@@ -123,7 +123,6 @@ def answer(
     Parameters
     ----------
     places : one or more maps of one model
-    model : model of the maps
     prepared, query : frame and options of the query
     earlier : earlier frames of the same sequence, which vote for the pose of `prepared`
 

@@ -250,7 +250,6 @@ class IndexPlace:
 
         Parameters
         ----------
-        row : row of the map
         version : current local version; None without an index
         """
         folder = self.folder(row)

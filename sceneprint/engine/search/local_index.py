@@ -53,14 +53,10 @@ class IndexView:
 
     Parameters
     ----------
-    model_id : id of the model of the signatures
-    metric : metric of the model
-    revision : revision of the map
     size : number of searchable frames
     dead : deleted frames in the index or the tail
     damaged : frames that were skipped because their signatures are damaged
     version : version of the index; None without an index
-    tail : newer frames
     """
 
     model_id: str
@@ -121,7 +117,6 @@ class AppendBuffer:
     ----------
     length : length of a signature in bytes
     folder : folder for a mapped file; the system's temporary folder is the fallback
-    capacity : initial capacity in signatures
     """
 
     def __init__(self, length: int, folder: Path, capacity: int = 64) -> None:
@@ -259,14 +254,7 @@ def trusted(connection: Connection, row: MapRow, published: Published | None) ->
 
 
 class Reader:
-    """Reader of a map's signatures for many threads.
-
-    Parameters
-    ----------
-    connection, row : see `view`
-    folder : folder of the index
-    model : model of the signatures
-    """
+    """Reader of a map's signatures for many threads."""
 
     def __init__(self, connection: Connection, row: MapRow, folder: Path, model: Model) -> None:
         self._folder, self._model = folder, model

@@ -67,7 +67,6 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
 
     Parameters
     ----------
-    maps : names of the maps
     ask : function that signs and answers the query with the model of the maps
 
     Raises
@@ -127,7 +126,6 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     Parameters
     ----------
-    a, b : frames
     how : options of the comparison; its names of frames are ignored
 
     Raises
@@ -229,7 +227,6 @@ class Queries:
         Parameters
         ----------
         maps : names of the maps, each once
-        query : options of the query
         since : time of the request by `time.perf_counter`; None stands for the present
         sent : entry of the query log; None leaves the query out of the log
 
@@ -259,7 +256,6 @@ class Queries:
         frames : uploads and metadata in order of capture, with odometry as poses in a common
             parent frame
         query : options of the query of each frame
-        since, sent : see `upload`
 
         Raises
         ------
@@ -305,7 +301,6 @@ class Queries:
 
         Parameters
         ----------
-        maps, query, since, sent : see `upload`
         stored : earlier answer
 
         Raises

@@ -131,7 +131,6 @@ class PreparedQuery:
     home : map of the stored frame
     base : name of the robot's base frame, and T_base_query (4, 4); None if unknown
     artifact : `geometry` as bytes
-    kind : kind of the frame
     up : (3,) unit vector in the sensor frame; None if unknown
     pose : (4, 4) T_parent_sensor of an upload, which is the odometry of a sequence
     """
@@ -330,7 +329,6 @@ class Searched:
 
     Parameters
     ----------
-    parts : searches of the maps
     hits : results of the searches, in the same order
     ranking : R, of frame numbers
     owners : (r,) indexes into `parts` of the frames of R
@@ -375,7 +373,6 @@ def search_maps(
     ----------
     places : one or more maps of one model
     prepared, query : frame and options of the query
-    model : model of the maps
     """
     parts = tuple(_part(store, place, prepared, query) for place in places)
     size = ranking_size(sum(part.passed for part in parts))

@@ -110,7 +110,6 @@ def validated(
     known : validations of an earlier pass, by frame number
     k : number of accepted matches after which to stop
     guided : whether earlier matches may predict the transforms of later candidates
-    retry : see `associate`
     """
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
@@ -181,7 +180,6 @@ def placed(
     ----------
     geometries : loaded geometries of candidates, by frame number
     rows : rows of the candidates, by frame number
-    query_frames : frames of the query with their matches
     prior : prior pose of the robot, with a parent from `parent_key`
     query : options of the query; with options of validation, a pose needs the vote of a match, and
         the mode `paper` ignores the map's other frames

@@ -64,7 +64,6 @@ class Scrubber:
 
     Parameters
     ----------
-    indexes : folder of all indexes
     pause_s : seconds between the starts of two rounds
     """
 
@@ -75,10 +74,6 @@ class Scrubber:
 
     def step(self, folders: Sequence[Path]) -> Path | None:
         """Verify indexes for STEP_S seconds; start a round if it is due.
-
-        Parameters
-        ----------
-        folders : folders of the indexes
 
         Returns
         -------
@@ -122,7 +117,6 @@ class Upkeep:
     ----------
     settings : settings with the maximum number of unindexed frames, the interval of verification,
         and the days after which deletions are forgotten, so that older indexes must be rebuilt
-    place : place of the indexes
     """
 
     def __init__(

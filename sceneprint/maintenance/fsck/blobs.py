@@ -41,7 +41,6 @@ class BlobReference:
 
     Parameters
     ----------
-    number : number of the row
     name : name of the blob within the row: an artifact's model, a file's name, a tile's position
     owner : id of the frame or job
     state, reason : state and reason of the frame; None for rows of other tables
@@ -206,7 +205,6 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
     Parameters
     ----------
     kind : key of `_KINDS`
-    numbers : numbers of the rows that refer to the blobs
     """
     blobs = folder.store.blobs
     for one in read_rows(folder, numbers, partial(_read, kind)):

@@ -70,7 +70,6 @@ def fsck(
 
     Parameters
     ----------
-    settings : settings of the folder
     map_name : map to check; None checks all maps, and data that belongs to no map
     repair : whether to repair the findings; if not, nothing is changed
     quick : whether to check only that blobs and rows exist, without reading their content

@@ -81,7 +81,6 @@ class Folder:
 
     Parameters
     ----------
-    settings : settings of the folder
     store : database and blobs
     map_name : map to check; None checks all maps, and data that belongs to no map
     quick : whether to check only that blobs and rows exist, without reading their content

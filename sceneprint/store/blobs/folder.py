@@ -162,7 +162,6 @@ class IncomingBlob:
 
     Parameters
     ----------
-    file : file to write to
     what : beginning of error messages
     keep : function that makes the file durable under its digest
     """
@@ -366,7 +365,6 @@ class Blobs(ABC):
 
         Parameters
         ----------
-        digest : digest of the blob
         folder : destination, which is created if missing
         """
 

@@ -128,7 +128,6 @@ class Objects:
     ----------
     small, large : clients for requests of few and of many bytes
     once : client for requests that must not be repeated
-    url : URL for messages
     variables : names of the environment variables that configure the store, for messages
     folder : path of the store if it is a folder
     """

@@ -68,7 +68,6 @@ class BucketOwner:
 
         Parameters
         ----------
-        owner : name of the store
         anew : whether to mark an unclaimed prefix
         """
         for _ in range(2):  # another process may claim the prefix first
@@ -89,7 +88,6 @@ class BucketOwner:
 
         Parameters
         ----------
-        owner : name of the store
         before : name of the empty database that receives the store; a service may have claimed the
             prefix with it without using the prefix
         """
@@ -143,7 +141,6 @@ class ObjectBlobs(Blobs):
 
     Parameters
     ----------
-    objects : objects below the prefix
     locks : lock of all processes that share the prefix
     owner : function that returns the name of the blobs' store
     """

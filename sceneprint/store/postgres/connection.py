@@ -236,7 +236,6 @@ class SingleStatement:
 
     Parameters
     ----------
-    map_numbers : numbers of the maps that the statement writes to
     wait_s : maximum seconds to wait for the turn
     maps_wait_s : maximum seconds to wait for each map afterwards; default: `wait_s`
     schema : last known schema, which is checked; None skips the check
@@ -367,7 +366,6 @@ def take_turn(
 
     Parameters
     ----------
-    connection : see `begin`
     wait_s : maximum seconds to wait
     query : query of one row, which is executed in the turn
     map_number : number of the map, if the transaction writes to a single map
