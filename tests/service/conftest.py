@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import ssl
 import subprocess
 import sys
@@ -82,6 +83,18 @@ class Server:
         except json.JSONDecodeError as error:
             raise AssertionError(f"not JSON in the log: {error.doc[:500]!r}") from error
         return [line for line in lines if not message or line["message"] == message]
+
+    def connect(self) -> socket.socket:
+        """Open a connection on which a test can send anything."""
+        url = httpx.URL(self.url)
+        return socket.create_connection((url.host, url.port), timeout=PATIENCE_S)
+
+    def index(self, path: str, shot: Shot, **meta: object) -> str:
+        """Upload a frame to the map at `path`, wait for its signature, and return its id."""
+        wait = {"Prefer": "wait=200"}
+        sent = self.client.post(f"{path}/frames", **shot.form(**meta), headers=wait)
+        assert (sent.status_code, sent.json()["state"]) == (201, "indexed"), sent.text
+        return str(sent.json()["frame_id"])
 
     def ready(self, workers: int = 1) -> None:
         """Wait until `workers` workers have started in total."""

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.thorough
+
 #: Operations that store nothing but an answer.
 READING = {
     "ask", "ask_several", "compare", "copy_map", "localize", "localize_sequence",
@@ -45,7 +47,7 @@ class Recorder:
 
 
 @pytest.fixture(scope="module")
-def recorder(begin: Any) -> Recorder:
+def recorder(begin):
     return Recorder(begin().client)
 
 
@@ -56,8 +58,7 @@ def pose_of(x: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-@pytest.mark.thorough
-def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: Any) -> None:
+def test_each_change_has_its_lines(recorder, small_shots, until):
     do, client, hall = recorder.do, recorder._client, {"map_name": "hall"}
 
     def state(job_id: str) -> str:
@@ -122,10 +123,7 @@ def test_each_change_has_its_lines(recorder: Recorder, small_shots: Any, until: 
     do("delete_map", ["map.deleted"], hall)
 
 
-@pytest.mark.thorough
-def test_each_change_of_a_job_has_its_line(
-    begin: Any, recorder: Recorder, small_shots: Any
-) -> None:
+def test_each_change_of_a_job_has_its_line(begin, recorder, small_shots):
     """Without a worker, so that they wait."""
     idle = Recorder(begin("--workers", "0").client)
     hall = {"map_name": "hall"}
@@ -154,7 +152,6 @@ def test_each_change_of_a_job_has_its_line(
     recorder.tried |= idle.tried
 
 
-@pytest.mark.thorough
-def test_no_operation_was_left_out(recorder: Recorder) -> None:
+def test_no_operation_was_left_out(recorder):
     changing = {name for name, (method, _) in recorder.operations.items() if method != "GET"}
     assert changing - READING - recorder.tried == set()

@@ -6,10 +6,8 @@ import gzip
 import json
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
@@ -26,10 +24,9 @@ def narrow(begin, make_map):
 
 
 @pytest.fixture
-def wire(narrow) -> Iterator[socket.socket]:
+def wire(narrow):
     """A connection on which anything can be said."""
-    address = httpx.URL(narrow.url)
-    with socket.create_connection((address.host, address.port), timeout=PATIENCE_S) as opened:
+    with narrow.connect() as opened:
         yield opened
 
 

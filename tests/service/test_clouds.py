@@ -18,7 +18,7 @@ WAIT = {"Prefer": "wait=200"}
 VIEWPOINT = (2.0, -1.0, 0.5)
 
 
-def points_of(frame: DepthFrame, every: int = 2) -> Floats:
+def points_of(frame: DepthFrame, every: int = 4) -> Floats:
     """What a depth image sees, in its optical frame."""
     depth, k = frame.depth[::every, ::every].astype(float), frame.intrinsics
     y, x = np.nonzero(depth)
@@ -55,16 +55,16 @@ def raw(data: bytes, **params: object) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def clouds(room_frames) -> list[Floats]:
+def clouds(room_frames):
     return [points_of(frame) for frame in room_frames]
 
 
 @pytest.fixture(scope="module")
-def hall(served, make_map, shots, clouds) -> tuple[str, list[str]]:
+def hall(served, make_map, shots, small_shots, clouds):
     """A depth image, a PLY, and a PCD whose viewpoint is not its origin; three places."""
     path = make_map(served, "clouds")
     pose = {"parent_frame": "room"}
-    first = shots[0].form(pose={**pose, "matrix": shots[0].pose})
+    first = small_shots[0].form(pose={**pose, "matrix": shots[0].pose})
     second = form(write_ply(clouds[1]), pose={**pose, "matrix": shots[1].pose})
     third = form(pcd(clouds[2], VIEWPOINT))
     ids = []
@@ -168,7 +168,7 @@ def test_a_viewpoint_is_content_and_a_base_can_be_edited(served, hall, refused):
 
 
 @pytest.fixture(scope="module")
-def gate(served, make_map) -> str:
+def gate(served, make_map):
     return make_map(served, "gate")
 
 
@@ -206,12 +206,12 @@ def test_a_cloud_that_is_none_is_refused_and_nothing_is_stored(served, gate, ref
     assert served.client.get(f"{gate}/frames").json()["items"] == []
 
 
-def test_an_image_has_no_viewpoint_and_needs_a_camera(served, gate, shots, refused):
+def test_an_image_has_no_viewpoint_and_needs_a_camera(served, gate, small_shots, refused):
     for meta, place in (({"viewpoint": None}, "viewpoint"), ({"units_per_metre": 2}, "units_per")):
-        answer = served.client.post(f"{gate}/frames", **shots[0].form(**meta))
+        answer = served.client.post(f"{gate}/frames", **small_shots[0].form(**meta))
         problem = refused(answer, 422, "invalid-request", f"a depth image, and `{place}")
         assert problem["errors"][0]["field"].startswith(place)
-    answer = served.client.post(f"{gate}/frames", **form(shots[0].png))
+    answer = served.client.post(f"{gate}/frames", **form(small_shots[0].png))
     problem = refused(answer, 422, "invalid-request")
     assert [one["field"] for one in problem["errors"]] == ["intrinsics"]
     assert served.client.get(f"{gate}/frames").json()["items"] == []

@@ -10,7 +10,7 @@ import json
 import socket
 import ssl
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from typing import Any
@@ -67,7 +67,7 @@ def running(application: Any, context: ssl.SSLContext | None = None) -> Iterator
 
 
 @pytest.fixture
-def opened(monkeypatch, request, certificate) -> Iterator[Callable[..., socket.socket]]:
+def opened(monkeypatch, request, certificate):
     """Connections to a service that is soon tired of waiting; by TLS where a test asks for it."""
     cert, key = certificate
     asked = context = None
@@ -177,7 +177,7 @@ def test_the_rest_of_a_body_that_was_refused_is_not_read_for_ever(opened):
 
 
 @pytest.fixture
-def lost(monkeypatch) -> Callable[[Any], None]:
+def lost(monkeypatch):
     """Waits until the service has given up the connection of an address."""
     gone: set[Any] = set()
     ended = threading.Event()

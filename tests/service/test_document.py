@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.fixture(scope="module")
-def document(served) -> dict[str, Any]:
+def document(served):
     found: dict[str, Any] = served.client.get("/openapi.json").json()
     return found
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
-from pathlib import Path
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -19,14 +18,14 @@ Batch = tuple[list[EventRow], int]
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
+def database(tmp_path):
     store = open_store(f"sqlite:///{tmp_path / 'sceneprint.db'}", tmp_path / "blobs")
     yield store.database
     store.close()
 
 
 @pytest.fixture(autouse=True)
-def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+def hasty(monkeypatch):
     monkeypatch.setattr(feeds, "POLL_S", 0.01)
 
 

@@ -28,7 +28,7 @@ def guarded(begin):
 
 
 @pytest.fixture(scope="module")
-def keys(guarded) -> dict[str, dict[str, str]]:
+def keys(guarded):
     """Headers that show a key, by what it may."""
     grants: dict[str, Any] = {
         "admin": {"*": "admin"}, "every": {"*": "read"}, "mine": {"mine": "write"}

@@ -13,8 +13,7 @@ def shaken(begin, make_map, small_shots):
     server = begin()
     path = make_map(server, "hall")
     for shot in small_shots[:2]:
-        sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=200"})
-        assert sent.status_code == 201
+        server.index(path, shot)
     return server
 
 
@@ -40,8 +39,7 @@ def test_a_database_that_vanishes_is_told_of_and_comes_back(
     with truth(shaken.folder) as connection:
         connection.exec_driver_sql("ALTER TABLE away RENAME TO jobs")
     until(lambda: shaken.client.get("/readyz").status_code == 200)
-    sent = shaken.client.post(path, **small_shots[2].form(), headers={"Prefer": "wait=200"})
-    assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+    shaken.index("/v1/maps/hall", small_shots[2])
     assert len(shaken.workers) == 1
     assert shaken.log("worker died") == []
 
@@ -56,10 +54,7 @@ def test_a_disk_that_takes_no_blobs_takes_no_frames(shaken, small_shots, refused
     assert shaken.client.get("/readyz").json()["frames"] == before
     blobs.unlink()
     away.rename(blobs)
-    sent = shaken.client.post(
-        "/v1/maps/hall/frames", **small_shots[3].form(), headers={"Prefer": "wait=200"}
-    )
-    assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+    shaken.index("/v1/maps/hall", small_shots[3])
 
 
 def test_what_nobody_thought_of_is_told_by_its_id_alone(shaken, refused, truth):

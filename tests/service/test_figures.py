@@ -25,7 +25,7 @@ from service.metrics import Metrics, Sampler
 from tests.whole_engine import Engine
 
 
-def test_waiting_jobs_have_series_by_kind_while_they_wait(tmp_path: Path) -> None:
+def test_waiting_jobs_have_series_by_kind_while_they_wait(tmp_path):
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
         stats = engine.statistics.collect(1)
     metrics = Metrics()
@@ -111,7 +111,7 @@ def answered(status: str, seconds: float) -> Answer:
     return Answer.model_construct(status=status, milliseconds={"total": 1e3 * seconds})
 
 
-def test_a_sample_is_written_where_something_was_counted(tmp_path: Path):
+def test_a_sample_is_written_where_something_was_counted(tmp_path):
     sampler = Sampler()
     with Engine(Settings(data_dir=tmp_path)) as engine:
         store = engine.store.database

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 
-def test_names_are_sent_in_every_way_and_searched(
-    served: Any, make_map: Callable[..., str], small_shots: list[Any]
-) -> None:
+def test_names_are_sent_in_every_way_and_searched(served, make_map, small_shots):
     path, ask = make_map(served, "frame-names"), served.client
     one, two, three, four = small_shots[:4]
     sent = ask.post(f"{path}/frames", **one.form(session="s", name="depth/2.png", sequence=2))
@@ -50,18 +46,13 @@ def test_names_are_sent_in_every_way_and_searched(
         ({"sequence": 2**53}, "sequence"), ({"sequence": 0.5}, "sequence"),
     ],
 )  # fmt: skip
-def test_what_is_no_name_or_place_is_refused(
-    served: Any, refused: Callable[..., dict[str, Any]], small_shots: list[Any],
-    meta: dict[str, Any], field: str,
-) -> None:  # fmt: skip
+def test_what_is_no_name_or_place_is_refused(served, refused, small_shots, meta, field):
     answer = served.client.post("/v1/maps/unmade/frames", **small_shots[0].form(**meta))
     problem = refused(answer, 422, "invalid-request")
     assert problem["errors"][0]["field"].split(".")[-1] == field
 
 
-def test_lists_refuse_what_they_cannot_have(
-    served: Any, make_map: Callable[..., str], refused: Callable[..., dict[str, Any]]
-) -> None:
+def test_lists_refuse_what_they_cannot_have(served, make_map, refused):
     path = make_map(served, "unordered")
     for more in ({}, {"session": ["a", "b"]}):
         answer = served.client.get(f"{path}/frames", params={"order": "taken", **more})

@@ -66,5 +66,7 @@ def test_as_many_have_a_place_as_may():
                     pass
         async with gate.place():
             pass
+        async with Gate(1, 0, longest_s=1).place():  # none may wait, and one is worked on
+            pass
 
     asyncio.run(test())

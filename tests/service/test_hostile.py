@@ -10,7 +10,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -28,7 +27,6 @@ BIN = Path(sys.executable).parent
 #: Largest file that a process may write from now on, where no disk can be mounted: less than the
 #: log of the database or a frame, more than our own logs.
 NARROW = 1 << 17
-WAIT = {"Prefer": "wait=200"}
 
 
 def pending(server) -> dict[str, int]:
@@ -98,7 +96,7 @@ def mountable() -> tuple[str, ...] | None:
 MOUNT = "mount -t tmpfs -o size=24m tmpfs $0 && exec $1 serve --port 0 --data $0 --workers 1"
 
 
-@pytest.fixture(params=[pytest.param(Mounted, marks=pytest.mark.thorough), Limited])
+@pytest.fixture(params=[Mounted, Limited])
 def narrow(request, begin, tmp_path):
     if request.param is Limited:
         return Limited(begin(folder=tmp_path / "data", job_lease_s=3))
@@ -115,14 +113,14 @@ def tree(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.thorough
 @pytest.mark.sqlite_only("the disk of uploads is that of the database")
 def test_a_full_disk_takes_nothing_and_costs_nothing(
     narrow, make_map, shots, small_shots, refused, until, tmp_path
 ):
     server = narrow.server
     path = make_map(server, "hall")
-    sent = server.client.post(f"{path}/frames", **shots[0].form(), headers=WAIT)
-    assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+    first = server.index(path, shots[0])
     (worker,) = server.workers
     os.kill(worker, signal.SIGSTOP)
     waiting = server.client.post(f"{path}/frames", **shots[1].form())
@@ -137,7 +135,7 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
         assert answer.headers["retry-after"] == retry
     assert tree(narrow.folder / "blobs") == blobs  # no blob without a row, no part
     assert server.client.get("/readyz").json() == before
-    found = server.client.post(f"{path}/queries", json={"frame_id": sent.json()["frame_id"]})
+    found = server.client.post(f"{path}/queries", json={"frame_id": first})
     assert found.status_code == 200
     asked = server.client.post(f"{path}/queries", **shots[0].form())
     assert (asked.status_code, asked.json()["status"]) == (200, "found")
@@ -155,8 +153,7 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
     narrow.free()
     until(lambda: pending(server) == {"succeeded": 2})  # of itself
     assert server.workers == [worker]
-    late = server.client.post(f"{path}/frames", **shots[2].form(), headers=WAIT)
-    assert (late.status_code, late.json()["state"]) == (201, "indexed")
+    server.index(path, shots[2])
     copy = tmp_path / "copy.db"  # SQLite would look for the path in our own namespace
     for end in ("", "-wal"):
         shutil.copy(narrow.folder / f"sceneprint.db{end}", f"{copy}{end}")
@@ -171,8 +168,7 @@ def kept(begin, make_map, small_shots):
     server = begin(concurrent_requests=1, queued_requests=2)
     path = make_map(server, "hall")
     for shot in small_shots[:3]:
-        sent = server.client.post(f"{path}/frames", **shot.form(), headers=WAIT)
-        assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+        server.index(path, shot)
     return server
 
 
@@ -215,13 +211,11 @@ def test_two_services_on_one_folder(kept, begin, small_shots):
     other = begin("--workers", "0", folder=kept.folder)
     path = "/v1/maps/hall"
     for number, (one, two) in enumerate([(kept, other), (other, kept)], start=20):
-        form = small_shots[number].form()
-        sent = one.client.post(f"{path}/frames", **form, headers=WAIT)
-        assert (sent.status_code, sent.json()["state"]) == (201, "indexed")
+        form, sent = small_shots[number].form(), one.index(path, small_shots[number])
         again = two.client.post(f"{path}/frames", **form)
-        assert (again.status_code, again.json()["frame_id"]) == (200, sent.json()["frame_id"])
+        assert (again.status_code, again.json()["frame_id"]) == (200, sent)
         asked = two.client.post(f"{path}/queries", **form)
-        assert asked.json()["matches"][0]["frame_id"] == sent.json()["frame_id"]
+        assert asked.json()["matches"][0]["frame_id"] == sent
         assert asked.json()["matches"][0]["distance"] == 0
     assert other.end(signal.SIGTERM) == 0
     assert kept.client.get("/readyz").json()["status"] == "ready"
@@ -237,7 +231,7 @@ BOUND = "mount --bind $0 $0 && mount -o remount,bind,ro $0 && exec $1 $2 --data 
 
 
 @pytest.fixture(scope="module")
-def stored(small_shots, tmp_path_factory) -> Path:
+def stored(small_shots, tmp_path_factory):
     """A data folder of four indexed frames, closed."""
     folder = tmp_path_factory.mktemp("stored") / "data"
     with Engine(Settings(data_dir=folder, database_url=None)) as engine:
@@ -251,7 +245,7 @@ def stored(small_shots, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(params=[pytest.param("mounted", marks=pytest.mark.thorough), "permissions"])
-def sealed(request, stored) -> Iterator[Callable[..., tuple[str, ...]]]:
+def sealed(request, stored):
     """The words before a command that may read the folder and not write it."""
     sceneprint = str(BIN / "sceneprint")
     if request.param == "mounted":
@@ -310,6 +304,7 @@ def test_a_read_only_folder_is_served_as_it_is(sealed, stored, begin, small_shot
     assert contents(stored) == before
 
 
+@pytest.mark.thorough
 @pytest.mark.sqlite_only("a database in a folder that may be read alone")
 @pytest.mark.parametrize("sealed", ["permissions"], indirect=True)
 def test_workers_and_doctor_say_that_a_folder_is_read_only(sealed, stored):

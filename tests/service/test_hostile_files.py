@@ -27,7 +27,7 @@ def meta_of(shot: Any) -> FrameMeta:
 
 
 @pytest.fixture(scope="module")
-def stored(small_shots, tmp_path_factory) -> Path:
+def stored(small_shots, tmp_path_factory):
     """A folder whose map has two versions, of three and of six frames, and three frames more."""
     folder = tmp_path_factory.mktemp("stored") / "data"
     with opened(folder, unindexed_frames=2) as engine:
@@ -44,7 +44,7 @@ def stored(small_shots, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def folder(stored, tmp_path) -> Path:
+def folder(stored, tmp_path):
     """A copy, to be damaged."""
     return Path(shutil.copytree(stored, tmp_path / "data"))
 
@@ -104,7 +104,6 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
     with opened(Path(shutil.copytree(stored, tmp_path / "trial"))) as engine:
         engine.add_frame("hall", shot.png, meta_of(shot))
         work = engine.claim("w")
-        assert work is not None
         assert engine.run(work) == JobState.SUCCEEDED
         ((artifact,),) = rows(tmp_path / "trial", asked)
     with opened(folder) as engine:
@@ -120,7 +119,6 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
             assert engine.claim("w") is None  # it lets others go first
             other, _ = engine.add_frame("hall", small_shots[31].png, meta_of(small_shots[31]))
             work = engine.claim("w")
-            assert work is not None
             assert work.frame.id == other.frame_id
             assert engine.run(work) == JobState.SUCCEEDED
         due(truth, folder)

@@ -29,11 +29,11 @@ def sent(data: bytes, kind: str = "application/zip", **params: str) -> dict[str,
 
 
 @pytest.fixture(scope="module")
-def yard(served, make_map) -> str:
+def yard(served, make_map):
     return make_map(served, "yard")
 
 
-def test_what_is_wrong_is_said_at_the_door(served, yard, small_shots, refused) -> None:
+def test_what_is_wrong_is_said_at_the_door(served, yard, small_shots, refused):
     http, data = served.client, zipped(small_shots[:1])
 
     def post(**said: Any) -> Any:
@@ -52,30 +52,37 @@ def test_what_is_wrong_is_said_at_the_door(served, yard, small_shots, refused) -
     assert [path for path in (served.folder / "blobs").iterdir() if path.is_file()] == []
 
 
-def test_an_archive_has_a_limit_of_its_own(begin, make_map, small_shots, refused) -> None:
-    server = begin(max_upload_bytes=20_000, max_import_bytes=60_000, workers=0)
-    path = make_map(server, "yard")
-    small = zipped(small_shots[:3])
+def test_an_archive_has_a_limit_of_its_own(open_house, tmp_path, small_shots, refused):
+    limits = {"max_upload_bytes": 20_000, "max_import_bytes": 60_000}
+    with open_house(tmp_path, None, {"boss": {"*": "admin"}}, **limits) as house:
+        house.ask("boss", "POST", "/v1/maps", json={"name": "yard"})
+        post = partial(house.ask, "boss", "POST")
+        check_limits(post, zipped(small_shots[:3]), refused)
+
+
+def check_limits(post: Any, small: bytes, refused: Any) -> None:
+    imports = "/v1/maps/yard/imports"
     assert 20_000 < len(small) < 60_000
-    assert server.client.post(f"{path}/imports", **sent(small)).status_code == 202
+    assert post(imports, **sent(small)).status_code == 202
     large = small + bytes(60_000)
-    refused(server.client.post(f"{path}/imports", **sent(large)), 413, "too-large", "60000")
-    chunks = sent(large)
-    chunks["content"] = iter([large[:30_000], large[30_000:]])  # not said beforehand
-    refused(server.client.post(f"{path}/imports", **chunks), 413, "too-large", "60000")
-    refused(server.client.post(f"{path}/frames", **sent(small)), 413, "too-large", "20000")
+    refused(post(imports, **sent(large)), 413, "too-large", "60000")
+
+    async def chunks() -> Any:  # their length is not sent
+        yield large[:30_000]
+        yield large[30_000:]
+
+    refused(post(imports, **{**sent(large), "content": chunks()}), 413, "too-large", "60000")
+    refused(post("/v1/maps/yard/frames", **sent(small)), 413, "too-large", "20000")
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w:xz") as archive:
         info = tarfile.TarInfo("a.npy")
         info.size = 400_000
         archive.addfile(info, io.BytesIO(bytes(info.size)))
     bomb = sent(made.getvalue(), "application/x-xz")
-    refused(server.client.post(f"{path}/imports", **bomb), 422, "unreadable-archive", "240000")
+    refused(post(imports, **bomb), 422, "unreadable-archive", "240000")
 
 
-def test_recordings_are_sent_with_their_options(
-    served, make_map, refused, ros, tmp_path, until
-) -> None:
+def test_recordings_are_sent_with_their_options(served, make_map, refused, ros, tmp_path, until):
     path = make_map(served, "bags")
 
     def fill(writer: Any) -> None:

@@ -13,10 +13,9 @@ import pytest
 
 from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.types import DepthFrame, Floats
-from sceneprint_lab.synth import SynthRoom
 from tests.service.conftest import Server, Shot, until
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(600)]
 
 
 def _origin(seed: int) -> Floats:
@@ -59,7 +58,7 @@ class Rooms:
         """Queue a job of the map, and return it once it has succeeded."""
         begun = self.server.client.post(f"{self.path}/{path}", json=body)
         assert begun.status_code == 202, begun.text
-        return until(lambda: self._succeeded(begun.headers["location"]))  # type: ignore[no-any-return]
+        return until(lambda: self._succeeded(begun.headers["location"]))
 
     def _succeeded(self, location: str) -> dict[str, Any] | None:
         job: dict[str, Any] = self.server.client.get(location).json()
@@ -72,7 +71,7 @@ class Rooms:
         form["data"] |= {name: json.dumps(value) for name, value in query.items()}
         answer = self.server.client.post(f"{self.path}/queries", **form)
         assert answer.status_code == 200, answer.text
-        return answer.json()  # type: ignore[no-any-return]
+        return answer.json()
 
 
 def _sent(frame: DepthFrame, parent: str, shoot: Callable[..., Shot]) -> Shot:
@@ -89,14 +88,11 @@ def _add(server: Server, path: str, shot: Shot, robot: str, second: int) -> http
     return server.client.post(f"{path}/frames", **form)
 
 
-@pytest.fixture(scope="module", params=[960, pytest.param(2400, marks=pytest.mark.thorough)])
-def rooms(
-    request: pytest.FixtureRequest, served: Server, make_map: Callable[..., str],
-    room_views: Callable[..., SynthRoom], shoot: Callable[..., Shot],
-) -> Rooms:  # fmt: skip
+@pytest.fixture(scope="module")
+def rooms(served, make_map, room_views, shoot):
     """A room of which ann took every third frame, and bob the next ones, after each other."""
-    path = make_map(served, f"joined-{request.param}")
-    room = room_views(21, 0, request.param, along_path=True, step=8)
+    path = make_map(served, "joined")
+    room = room_views(21, 0, 960, along_path=True, step=8)
     of_bob = [_sent(frame, "bob/evening", shoot) for frame in room.frames[1::3]]
     runs = {
         "ann": [_sent(frame, "ann/morning", shoot) for frame in room.frames[::3]], "bob": of_bob,
@@ -112,8 +108,7 @@ def rooms(
     return replace(made, join=join, association=f"{path}/associations/{found['job_id']}")
 
 
-@pytest.mark.thorough
-def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms: Rooms) -> None:
+def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms):
     assert (rooms.join["strength"], rooms.join["root"]) == ("strong", "ann/morning")
     matched = set()
     for frame in rooms.held_out:
@@ -130,8 +125,7 @@ def test_every_answer_is_in_the_parent_frame_of_the_first_session(rooms: Rooms) 
     assert matched == {("ann", "ann/morning"), ("bob", "bob/evening")}
 
 
-@pytest.mark.thorough
-def test_sessions_that_are_joined_can_be_compared_and_covered(rooms: Rooms) -> None:
+def test_sessions_that_are_joined_can_be_compared_and_covered(rooms):
     parents = {
         one["robot"]: one["parent_frames"]
         for one in rooms.server.client.get(f"{rooms.path}/sessions").json()["items"]
@@ -145,8 +139,7 @@ def test_sessions_that_are_joined_can_be_compared_and_covered(rooms: Rooms) -> N
     assert covered["found"] >= 0.8 * covered["frames"]
 
 
-@pytest.mark.thorough
-def test_frames_that_come_later_follow_the_join(rooms: Rooms) -> None:
+def test_frames_that_come_later_follow_the_join(rooms):
     client, frame = rooms.server.client, rooms.held_out[0]
     again = _add(rooms.server, rooms.path, rooms.bob, "bob", 0)
     assert again.status_code == 200  # the same content and metadata as before the join
@@ -174,8 +167,7 @@ def test_frames_that_come_later_follow_the_join(rooms: Rooms) -> None:
     assert client.delete(url).status_code in (200, 204)
 
 
-@pytest.mark.thorough
-def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms: Rooms) -> None:
+def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms):
     frame = rooms.held_out[-1]
     assert frame.pose is not None
     believed = (inverse(ORIGINS["bob/evening"]) @ frame.pose).tolist()
@@ -188,8 +180,7 @@ def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms: Rooms) -> None:
     assert pose_difference(ORIGINS["ann/morning"] @ np.array(pose["matrix"]), frame.pose)[0] < 0.1
 
 
-@pytest.mark.thorough
-def test_a_join_is_undone(rooms: Rooms) -> None:
+def test_a_join_is_undone(rooms):
     """The last test of the map."""
     client, url = rooms.server.client, rooms.association
     of_bob = {"robot": "bob", "limit": 1000}

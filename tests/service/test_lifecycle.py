@@ -107,7 +107,7 @@ def newer(tmp_path_factory, truth):
         "sceneprint serve",
         pytest.param("sceneprint work", marks=pytest.mark.thorough),
         pytest.param("service", marks=pytest.mark.thorough),
-        "worker",
+        pytest.param("worker", marks=pytest.mark.thorough),
     ],
 )
 def test_a_newer_store_is_refused_in_one_line(begin, newer, what):
@@ -132,20 +132,6 @@ def refusal(begin, *arguments: str, folder=None) -> str:
     assert server.process.stdout.read() == ""
     server.gone()
     return line
-
-
-def test_a_folder_that_cannot_be_made_is_refused_in_one_line(begin, tmp_path):
-    (tmp_path / "file").write_text("not a folder")
-    line = refusal(begin, folder=tmp_path / "file" / "data")
-    assert line.startswith(f"sceneprint serve: {tmp_path}/file/data/blobs: The folder cannot be")
-
-
-@pytest.mark.sqlite_only("a file that is damaged")
-def test_a_file_that_is_no_database_is_refused_in_one_line(begin, tmp_path):
-    (tmp_path / "sceneprint.db").write_bytes(b"not a database " * 1000)
-    line = refusal(begin, folder=tmp_path)
-    assert "file is not a database" in line
-    assert (tmp_path / "sceneprint.db").read_bytes() == b"not a database " * 1000
 
 
 @pytest.mark.parametrize("setting", ["port", "workers"])

@@ -8,12 +8,9 @@ import re
 import socket
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 from PIL import Image
-
-from benchmarks.waiting import PATIENCE_S
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +23,7 @@ def shown(served, make_map, small_shots):
                 "tags": ["door"] if i else [],
                 "pose": {"parent_frame": "hall", "translation": {"x": i, "y": 0, "z": 1},
                          "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}}  # fmt: skip
-        added = served.client.post(
-            f"{path}/frames", **shot.form(**meta), headers={"Prefer": "wait=200"}
-        )
-        assert added.json()["state"] == "indexed", added.text
-        ids.append(added.json()["frame_id"])
+        ids.append(served.index(path, shot, **meta))
     return path, ids
 
 
@@ -122,11 +115,11 @@ def test_who_does_not_read_an_upload_costs_no_memory(served, make_map):
         status = Path(f"/proc/{served.process.pid}/status").read_text()
         return int(re.findall(r"VmRSS:\s+(\d+) kB", status)[0]) << 10
 
-    url, before, wires = httpx.URL(served.url), resident(), []
+    before, wires = resident(), []
     head = f"GET {path}/frames/{sent.json()['frame_id']}/upload HTTP/1.1\r\nHost: localhost\r\n\r\n"
     try:
         for _ in range(12):
-            wires.append(wire := socket.create_connection((url.host, url.port), timeout=PATIENCE_S))
+            wires.append(wire := served.connect())
             wire.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             wire.sendall(head.encode())
             assert wire.recv(12) == b"HTTP/1.1 200"

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import os
-import socket
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import httpx
 import pytest
-
-from benchmarks.waiting import PATIENCE_S
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +16,7 @@ def busy(begin, make_map, small_shots):
     server = begin(concurrent_requests=1, queued_requests=1)
     path = make_map(server, "hall")
     for shot in small_shots[:2]:
-        sent = server.client.post(f"{path}/frames", **shot.form(), headers={"Prefer": "wait=200"})
-        assert sent.status_code == 201
+        server.index(path, shot)
     return server
 
 
@@ -90,7 +86,7 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, s
     lines = [f"POST {request.url.path} HTTP/1.1".encode()]
     lines += [key + b": " + value for key, value in request.headers.raw]
     before = {one["frame_id"] for one in busy.client.get("/v1/maps/hall/frames").json()["items"]}
-    with socket.create_connection((request.url.host, request.url.port), timeout=PATIENCE_S) as wire:
+    with busy.connect() as wire:
         wire.sendall(b"\r\n".join(lines) + b"\r\n\r\n" + request.read())
 
         def came() -> set[str]:
@@ -119,11 +115,8 @@ def test_slow_uploads_hold_their_places_for_a_while_and_no_queries(busy, small_s
     with ExitStack() as opened:
         wires = []
         for _ in range(2):
-            wire = socket.create_connection(
-                (request.url.host, request.url.port), timeout=PATIENCE_S
-            )
-            wires.append(opened.enter_context(wire))
-            wire.sendall(whole[: len(whole) // 2])
+            wires.append(opened.enter_context(busy.connect()))
+            wires[-1].sendall(whole[: len(whole) // 2])
         answers = [busy.client.post("/v1/maps/hall/frames", **small_shots[21].form())]
         asked = busy.client.post("/v1/maps/hall/queries", **small_shots[0].form())
         assert asked.status_code == 200
@@ -134,22 +127,3 @@ def test_slow_uploads_hold_their_places_for_a_while_and_no_queries(busy, small_s
         refused(answers[-1], 503, "busy")
         answers.append(busy.client.post("/v1/maps/hall/frames", **small_shots[21].form()))
     assert answers[-1].status_code in (200, 202)
-
-
-def test_where_none_may_wait_one_is_still_worked_on(begin, make_map, small_shots):
-    server = begin("--workers", "0", concurrent_requests=1, queued_requests=0)
-    path = make_map(server, "hall")
-    sent = [server.client.post(f"{path}/frames", **shot.form()) for shot in small_shots[:3]]
-    assert [answer.status_code for answer in sent] == [202, 202, 202]
-
-
-def test_waiting_for_a_frame_that_is_there_and_not_signed_yet(begin, make_map, small_shots):
-    """Sent again by a robot that lost the first answer, it is waited for all the same."""
-    server = begin("--workers", "0")
-    path, shot = make_map(server, "waits"), small_shots[0]
-    first = server.client.post(f"{path}/frames", **shot.form())
-    assert (first.status_code, first.headers.get("preference-applied")) == (202, None)
-    again = server.client.post(f"{path}/frames", headers={"Prefer": "wait=1"}, **shot.form())
-    assert (again.status_code, again.headers["preference-applied"]) == (200, "wait=1")
-    assert again.json() == first.json()
-    assert again.json()["state"] == "received"

@@ -44,7 +44,7 @@ _ROWS = [
 
 @pytest.mark.parametrize("rows", [[], _ROWS[:1], _ROWS], ids=len)
 @pytest.mark.parametrize("cursor", [None, 'a"b'])
-def test_a_page_is_the_text_that_pydantic_writes(rows: list[_Row], cursor: str | None):
+def test_a_page_is_the_text_that_pydantic_writes(rows, cursor):
     page = Page[_Row](items=rows, next_cursor=cursor)
     assert page_response(page).body == TypeAdapter(Page[_Row]).dump_json(page, by_alias=True)
 

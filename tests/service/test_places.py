@@ -9,8 +9,7 @@ import asyncio
 import errno
 import json
 import threading
-from collections.abc import Awaitable, Callable, Iterator
-from pathlib import Path
+from collections.abc import Awaitable, Callable
 from tempfile import SpooledTemporaryFile
 from types import SimpleNamespace
 from typing import Any
@@ -75,7 +74,7 @@ class Asked:
 
 
 @pytest.fixture
-def inside(tmp_path: Path) -> Iterator[Callable[..., Any]]:
+def inside(tmp_path):
     """Runs a test's coroutine with an application of these settings."""
 
     def run(test: Callable[[FastAPI], Awaitable[Any]], **settings: Any) -> Any:

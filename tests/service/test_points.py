@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from typing import Any
 
 import pytest
 
@@ -11,15 +10,10 @@ KIND = "application/vnd.sceneprint.points"
 
 
 @pytest.fixture(scope="module")
-def drawn(served, make_map, small_shots) -> dict[str, Any]:
+def drawn(served, make_map, small_shots):
     """A map of two views, and an answer to one of them."""
-    path, ids = make_map(served, "drawn"), []
-    for i in (0, 1):
-        sent = served.client.post(
-            f"{path}/frames", **small_shots[i].form(), headers={"Prefer": "wait=200"}
-        )
-        assert sent.json()["state"] == "indexed", sent.text
-        ids.append(sent.json()["frame_id"])
+    path = make_map(served, "drawn")
+    ids = [served.index(path, shot) for shot in small_shots[:2]]
     reply = served.client.post(f"{path}/queries", json={"frame_id": ids[0], "seed": 1})
     assert reply.status_code == 200
     return {"path": path, "ids": ids, "answer": reply.json()}

@@ -64,5 +64,10 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
     refused(house.ask("robot", "DELETE", "/v1/queries", **delete), 403, "forbidden")
     assert house.ask("boss", "DELETE", "/v1/queries", **delete).status_code == 204
     assert [one["map"] for one in listed(house, "boss")] == ["bravo"]
+    answer = f"/v1/queries/{listed(house, 'boss')[0]['query_id']}"
+    assert house.ask("other", "GET", answer).status_code == 200
     assert house.ask("boss", "DELETE", "/v1/maps/bravo").status_code == 204
     assert listed(house, "boss") == []
+    refused(house.ask("other", "GET", answer), 404, "unknown-query")
+    house.ask("boss", "POST", "/v1/maps", json={"name": "bravo", "model": "depth"})
+    refused(house.ask("other", "GET", answer), 404, "unknown-query")  # of the map before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ JSON = {"content-type": "application/json"}
 
 
 @pytest.fixture(scope="module")
-def hall(served, make_map) -> str:
+def hall(served, make_map):
     return make_map(served, "refusals")
 
 
@@ -228,3 +229,62 @@ def test_a_name_that_breaks_its_rule_gets_the_rule(served, hall, refused, reques
     problem = refused(served.client.post(**request_of), 422, "invalid-request", f"must be {rule}")
     assert problem["errors"][0]["field"] == place
     assert "^" not in problem["detail"]
+
+
+@pytest.mark.parametrize(
+    ("given", "field", "text"),
+    [
+        ('{"robot"', "filter", "not JSON"),
+        ("[1]", "filter", ""),
+        ('{"robots": "r1"}', "filter.robots", ""),
+        ('{"robot": []}', "filter.robot", "at least 1"),
+        ('{"robot": "a\\nb"}', "filter.robot.0", ""),
+        ('{"not_within_s": 0}', "filter.not_within_s", "greater than 0"),
+        ('{"not_within_s": NaN}', "filter.not_within_s", "finite"),
+        ('{"not_within_s": 1e999}', "filter.not_within_s", "finite"),
+        ('{"captured_after": "2026-11-16T09:30:00"}', "filter.captured_after", "timezone"),
+        ('{"captured_after": "2026-11-16T09:30:00Z", "captured_before": "2026-11-16T09:29:59Z"}',
+         "filter.captured_before", "earlier than `captured_after`"),
+        ('{"tags": [' + '"a",' * 32 + '"a"]}', "filter.tags", "at most 32"),
+        ('{"exclude_frames": [' + '"a",' * 1000 + '"a"]}', "filter.exclude_frames", "1000"),
+        ('{"region": {"parent_frame": "house", "min": {"x": 0, "y": 1, "z": 0}, "max": {"x": 1, '
+         '"y": 0, "z": 1}}}', "filter.region.max", "y: less than in `min`"),
+        ('{"region": {"parent_frame": "house", "min": {"x": 0, "y": 1, "z": Infinity}, "max": '
+         '{"x": 1, "y": 1, "z": 1}}}', "filter.region.min.z", "finite"),
+        ('{"region": {"min": {"x": 0, "y": 1, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}}',
+         "filter.region.parent_frame", "required"),
+        ("[" * 5000, "filter", "not JSON"),
+    ],
+)  # fmt: skip
+def test_a_filter_that_makes_no_sense_is_named(
+    served, hall, small_shots, refused, given, field, text
+):
+    form = small_shots[0].form()
+    form["data"] |= {"stages": "retrieve", "k": "50", "filter": given}
+    answer = served.client.post(f"{hall}/queries", **form)
+    problem = refused(answer, 422, "invalid-request")
+    assert [one["field"] for one in problem["errors"]] == [field]
+    assert text in problem["errors"][0]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("count", "poses", "more", "told"),
+    [
+        (1, True, {}, "The sequence has 1 frames"),
+        (2, False, {}, "frame 0 has no pose"),
+        (2, True, {"k": "0"}, "greater than or equal to 1"),
+        (2, True, {"colour": "red"}, "colour"),
+        (2, True, {"stages": "retrieve"}, "stages"),
+    ],
+)
+def test_what_is_no_sequence_is_refused(
+    served, hall, small_shots, refused, count, poses, more, told
+):
+    odometry = {"pose": {"matrix": np.eye(4).tolist(), "parent_frame": "odom"}} if poses else {}
+    forms = [shot.form(**odometry) for shot in small_shots[:count]]
+    metas = [json.loads(form["data"]["meta"]) for form in forms]
+    answer = served.client.post(
+        f"{hall}/localize/sequence", data={"metas": json.dumps(metas), **more},
+        files=[("frame", form["files"]["frame"]) for form in forms],
+    )  # fmt: skip
+    assert told in str(refused(answer, 422, "invalid-request"))

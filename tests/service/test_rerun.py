@@ -1,6 +1,4 @@
-"""Tests of stored queries that are repeated without another upload, with the same or other
-options.
-"""
+"""Tests of stored queries: their results, and repetitions with the same or other options."""
 
 from __future__ import annotations
 
@@ -13,23 +11,26 @@ from PIL import Image
 
 
 @pytest.fixture(scope="module")
-def asked(served, make_map, shots) -> dict[str, Any]:
+def shots(small_shots):
+    """Three views of each of two rooms."""
+    return small_shots[::16]
+
+
+@pytest.fixture(scope="module")
+def asked(served, make_map, shots):
     """Three views of a room in a map, and the answer to an upload with a base and a session."""
     path = make_map(served, "again")
     for i in (0, 1, 3):
-        sent = served.client.post(
-            f"{path}/frames",
-            **shots[i].form(session="s", captured_at=f"2026-11-16T09:30:0{i}Z"),
-            headers={"Prefer": "wait=200"},
-        )
-        assert sent.json()["state"] == "indexed"
+        served.index(path, shots[i], session="s", captured_at=f"2026-11-16T09:30:0{i}Z")
     base = {"base_frame": "base_link", "matrix": np.eye(4).tolist()}
     form = shots[0].form(
         session="s", robot="r", captured_at="2026-11-16T09:30:00Z", T_base_sensor=base
     )
     form["data"] |= {"seed": "3", "validation": '{"residual_m": 0.05}'}
-    answer: dict[str, Any] = served.client.post(f"{path}/queries", **form).json()
+    reply = served.client.post(f"{path}/queries", **form)
+    answer: dict[str, Any] = reply.json()
     assert answer["status"] == "found"
+    assert served.client.get(f"/v1/queries/{answer['query_id']}").text == reply.text
     return answer
 
 
@@ -85,7 +86,7 @@ def test_the_question_is_told(served, asked):
 
 def test_a_stored_frame_is_asked_again_of_other_maps(served, asked, make_map, shots):
     path = make_map(served, "again-too")
-    served.client.post(f"{path}/frames", **shots[2].form(), headers={"Prefer": "wait=200"})
+    served.index(path, shots[2])
     frame_id = asked["matches"][0]["frame_id"]
     first = served.client.post(
         "/v1/maps/again/queries", json={"frame_id": frame_id, "stages": "retrieve"}
@@ -158,3 +159,36 @@ def test_what_cannot_be_asked_again(served, asked, shots, refused):
     body = {"maps": ["again-paper"], "query_id": asked["query_id"]}
     reply = served.client.post("/v1/queries", json=body)
     refused(reply, 409, "not-indexed", "not signed with the model")
+
+
+def test_stored_results_that_are_not_there(served, asked, shots, refused):
+    form = shots[1].form()
+    form["data"]["keep"] = "false"
+    unkept = served.client.post("/v1/maps/again/queries", **form).json()
+    assert served.client.get(f"/v1/queries/{unkept['query_id']}").status_code == 404
+    path, best = f"/v1/queries/{asked['query_id']}", asked["matches"][0]["frame_id"]
+    for tail in ("", "/cloud.ply", "/similarities", "/matches/x", "/matches/x/overlay.ply"):
+        for query_id in ("0" * 32, "..%2fsceneprint.db", "x", asked["query_id"].upper()):
+            reply = served.client.get(f"/v1/queries/{query_id}{tail}")
+            assert reply.status_code == 404
+            if "%" not in query_id:
+                refused(reply, 404, "unknown-query", "expired")
+    refused(served.client.get(f"{path}/matches/nobody"), 404, "unknown-frame", "has no match")
+    reply = served.client.get(f"{path}/matches/{best}?map=elsewhere")
+    refused(reply, 404, "unknown-frame", "in map 'elsewhere'")
+    for wrong in ("color=pink", "transform=best"):
+        reply = served.client.get(f"{path}/matches/{best}/overlay.ply?{wrong}")
+        refused(reply, 422, "invalid-request", wrong.partition("=")[0])
+    for limit in (0, 201, "many"):
+        refused(
+            served.client.get(f"{path}/similarities?limit={limit}"), 422, "invalid-request", "limit"
+        )
+    wall = asked["matches"][-1]["frame_id"]
+    reply = served.client.get(f"{path}/matches/{wall}/overlay.ply?transform=rival")
+    refused(reply, 422, "invalid-request", "has no rival")
+    bare = {"frame_id": best, "stages": "retrieve"}
+    quick = served.client.post("/v1/maps/again/queries", json=bare).json()
+    reply = served.client.get(f"/v1/queries/{quick['query_id']}/cloud.ply")
+    refused(reply, 409, "not-indexed", "without validation")
+    assert served.client.delete(f"/v1/maps/again/frames/{best}").status_code == 204
+    refused(served.client.get(f"{path}/matches/{best}"), 404, "unknown-frame", "was deleted")

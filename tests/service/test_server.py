@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import signal
 import socket
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
+from sceneprint.cli import main
 from sceneprint.errors import UnusableStore
 from sceneprint.settings import Settings
 from sceneprint_client import Client
@@ -48,10 +46,5 @@ def test_by_two_settings_the_service_speaks_https(begin, certificate, monkeypatc
     monkeypatch.setenv("SSL_CERT_FILE", str(cert))
     with Client(server.url) as client:  # which keeps its connection until the service ends
         assert client.status().version == answer.json()["version"]
-        command = str(Path(sys.executable).with_name("sceneprint"))
-        done = subprocess.run(
-            [command, "maps", "--url", f"https://localhost:{port}"],
-            capture_output=True, text=True, timeout=PATIENCE_S, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
+        assert main(["maps", "--url", f"https://localhost:{port}"]) == 0
         assert server.end(signal.SIGTERM) == 0

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Awaitable, Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -41,7 +40,7 @@ async def _lived(front: Front, test: Callable[[httpx.AsyncClient], Awaitable[Any
 
 
 @pytest.fixture
-def slow(tmp_path: Path) -> tuple[Front, threading.Event]:
+def slow(tmp_path):
     """A front whose application comes once the event is set."""
     settings, go = Settings(data_dir=tmp_path), threading.Event()
 
@@ -52,9 +51,7 @@ def slow(tmp_path: Path) -> tuple[Front, threading.Event]:
     return Front(settings, load, lambda: None), go
 
 
-def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(
-    slow: tuple[Front, threading.Event],
-) -> None:
+def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(slow):
     front, go = slow
 
     async def test(client: httpx.AsyncClient) -> None:
@@ -83,7 +80,7 @@ def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(
     asyncio.run(_lived(front, test))
 
 
-def test_an_application_that_cannot_be_made_ends_the_service(tmp_path: Path) -> None:
+def test_an_application_that_cannot_be_made_ends_the_service(tmp_path):
     ended = threading.Event()
 
     def load() -> FastAPI:
@@ -100,9 +97,7 @@ def test_an_application_that_cannot_be_made_ends_the_service(tmp_path: Path) -> 
     assert str(front.error) == "the disk is gone"
 
 
-def test_a_service_that_cannot_be_loaded_ends_with_the_error(
-    tmp_path: Path,
-) -> None:
+def test_a_service_that_cannot_be_loaded_ends_with_the_error(tmp_path):
     """It listens by then, and stops itself by the signal that an operator would send."""
     code = (
         "import sys; sys.modules['service.app'] = None; "
@@ -118,8 +113,8 @@ def test_a_service_that_cannot_be_loaded_ends_with_the_error(
 
 
 def test_while_kernels_are_compiled_readyz_says_so_and_who_needs_them_waits(
-    open_house: Any, tmp_path: Path, until: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    open_house, tmp_path, until, monkeypatch
+):
     monkeypatch.setattr("service.routes.admin.KERNEL_CHECK_S", 0.05)
     monkeypatch.setattr("sceneprint.engine.signers.KERNELS_S", 0.05)
     with open_house(tmp_path, None, {"robot": {"*": "write"}}) as house:

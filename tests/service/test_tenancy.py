@@ -6,8 +6,6 @@ They use HTTP with keys on both databases, and execute the jobs in this process.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from typing import Any
 
 from sceneprint_client.api.admin import Scope
 
@@ -17,7 +15,7 @@ KEYS: dict[str, dict[str, Scope]] = {
 }  # fmt: skip
 
 
-def test_a_quota_is_the_operators(house, refused: Callable[..., dict[str, Any]]) -> None:
+def test_a_quota_is_the_operators(house, refused):
     path = "/v1/maps/alpha"
     for body in ({"quota_frames": 10}, {"quota_bytes": None}, {"title": "x", "quota_frames": 1}):
         for key in ("tenant", "robot"):
@@ -71,6 +69,17 @@ def test_beyond_the_quota_nothing_is_taken(house, refused, small_shots):
     assert (other["used_frames"], other["quota_frames"]) == (0, None)
 
 
+def test_a_frame_that_is_there_and_not_signed_yet_is_waited_for(house, small_shots):
+    """Sent again by a robot that lost the first answer."""
+    path, form = "/v1/maps/alpha/frames", small_shots[0].form()
+    first = house.ask("robot", "POST", path, **form)
+    assert (first.status_code, first.headers.get("preference-applied")) == (202, None)
+    again = house.ask("robot", "POST", path, headers={"Prefer": "wait=1"}, **form)
+    assert (again.status_code, again.headers["preference-applied"]) == (200, "wait=1")
+    assert again.json() == first.json()
+    assert again.json()["state"] == "received"
+
+
 def test_retention_is_tried_set_and_told(house, small_shots):
     path = "/v1/maps/alpha"
     house.ask("robot", "POST", f"{path}/frames", **small_shots[0].form())
@@ -84,30 +93,3 @@ def test_retention_is_tried_set_and_told(house, small_shots):
     assert (told["frames"], told["used_bytes"], told["overdue"]) == ({"deleted": 1}, 0, 0)
     [event] = house.ask("robot", "GET", "/v1/events?kind=frame.deleted").json()["items"]
     assert event["data"] == {"reason": "retention"}
-
-
-def test_an_answer_goes_with_its_map_and_with_its_frame(house, refused, small_shots):
-    path = "/v1/maps/alpha"
-    for i, shot in enumerate(small_shots[:3]):
-        house.ask("robot", "PUT", f"{path}/frames/f{i}", **shot.form())
-    house.work()
-    asked = [
-        house.ask("robot", "POST", f"{path}/queries", json={"frame_id": f"f{i}"}).json()["query_id"]
-        for i in (0, 1)
-    ]
-    assert [house.ask("robot", "GET", f"/v1/queries/{one}").status_code for one in asked] == [
-        200
-    ] * 2
-    house.ask("tenant", "DELETE", f"{path}/frames/f0")
-    refused(house.ask("robot", "GET", f"/v1/queries/{asked[0]}"), 404, "unknown-query")
-    assert house.ask("robot", "GET", f"/v1/queries/{asked[1]}").status_code == 200
-    house.ask("tenant", "DELETE", path)
-    for made_anew in (False, True):
-        if made_anew:
-            house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "depth"})
-        for place in ("", "/points", "/question", "/preview.png", "/similarities"):
-            answer = house.ask("robot", "GET", f"/v1/queries/{asked[1]}{place}")
-            refused(answer, 404, "unknown-query")
-        body = {"maps": ["alpha"], "query_id": asked[1]}
-        again = house.ask("robot", "POST", "/v1/queries", json=body)
-        refused(again, 404, "unknown-query")

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import re
-import socket
 import time
 from contextlib import ExitStack
 from pathlib import Path
 
-import httpx
 import pytest
 from prometheus_client import generate_latest
 from sqlalchemy import select
@@ -71,12 +69,8 @@ def test_two_authorization_headers_are_refused_whoever_sends_them(shared, refuse
 
 
 def test_keys_of_a_tenant_share_its_streams_and_leave_some_to_others(shared, until):
-    url = httpx.URL(shared.server.url)
-
     def listen(key: str, stack: ExitStack) -> bytes:
-        wire = stack.enter_context(
-            socket.create_connection((url.host, url.port), timeout=PATIENCE_S)
-        )
+        wire = stack.enter_context(shared.server.connect())
         wire.sendall(
             "GET /v1/events HTTP/1.1\r\nHost: localhost\r\nAccept: text/event-stream\r\n"
             f"Authorization: Bearer {shared.secrets[key]}\r\n\r\n".encode()

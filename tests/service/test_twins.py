@@ -198,7 +198,7 @@ def plain(told: list[str]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory, small_shots, small_model, postgres, open_house) -> list[list[str]]:
+def both(tmp_path_factory, small_shots, small_model, postgres, open_house):
     """All that is told, of the quiet one, the busy one, and a busy one on PostgreSQL."""
     found = []
     server = postgres.create(f"twin{secrets.token_hex(6)}")

@@ -1,10 +1,9 @@
-"""Tests of uploads under an id, as bodies, with idempotency keys and in batches."""
+"""Tests of uploads under an id, as bodies, with idempotency keys, priorities and in batches."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -15,7 +14,7 @@ BASE = {"translation": {"x": 0.1, "y": 0.0, "z": 0.4}, "rotation": {"x": 0, "y":
 
 
 @pytest.fixture(scope="module")
-def hall(served, make_map) -> str:
+def hall(served, make_map):
     return make_map(served, "put-hall")
 
 
@@ -31,7 +30,7 @@ def query(shot, **more: object) -> dict[str, Any]:
 
 def test_depth_that_does_not_look_like_it_is_taken_when_trusted(
     served, hall, small_shots, refused, until
-) -> None:
+):
     """It is signed from the store as well, where nobody says it again."""
     http, shot = served.client, small_shots[0]
     noise = (2000 * np.random.default_rng(3).gamma(60, 1 / 60, (120, 160))).astype(np.uint16)
@@ -63,23 +62,24 @@ def test_depth_that_does_not_look_like_it_is_taken_when_trusted(
 
 
 @pytest.mark.parametrize("name", [".hidden", "-x", "_x", "a b", "ä", "x" * 65, "a%0ab"])
-def test_an_id_that_is_none_is_refused(served, hall, small_shots, refused, name) -> None:
+def test_an_id_that_is_none_is_refused(served, hall, small_shots, refused, name):
     answer = served.client.put(f"{hall}/frames/{name}", **small_shots[0].form())
     refused(answer, 422, "invalid-request", "frame id")
 
 
-def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_shots) -> None:
+def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_shots):
     http, shot = served.client, small_shots[2]
     said = {"session": "raw", "robot": "r2", "tags": "a,b", "captured_at": "2026-01-02T03:04:05Z"}
     pose, base = "1,2,3,0,0,0,1", "0.1,0,0.4,0,0,0,1"
     raw = http.put(
-        f"{hall}/frames/raw", **query(shot, **said, pose=pose, base=base, parent_frame="hall")
+        f"{hall}/frames/raw",
+        **query(shot, **said, pose=pose, base=base, parent_frame="hall", up="0.6,-0.8,0"),
     )
     assert raw.status_code == 202
     form = shot.form(
         session="raw", robot="r2", tags=["a", "b"], captured_at="2026-01-02T03:04:05Z",
         pose={"translation": {"x": 1, "y": 2, "z": 3}, "rotation": BASE["rotation"],
-              "parent_frame": "hall"}, T_base_sensor=BASE,
+              "parent_frame": "hall"}, T_base_sensor=BASE, up=[0.6, -0.8, 0],
     )  # fmt: skip
     again = http.put(f"{hall}/frames/raw", **form)
     assert (again.status_code, again.json()["frame_id"]) == (200, "raw")
@@ -87,6 +87,7 @@ def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_sh
     assert (told["base_frame"], told["T_base_sensor"]["translation"]["z"]) == ("base_link", 0.4)
     assert told["T_base_sensor"]["child_frame"] == "raw.optical"
     assert told["pose"]["matrix"][0][3] == 1
+    assert told["up"] == pytest.approx({"x": 0.6, "y": -0.8, "z": 0.0})
     meta = {"params": {"meta": json.dumps({"intrinsics": shot.camera})}, "content": shot.png}
     octets = http.put(
         f"{hall}/frames/octets", **meta, headers={"Content-Type": "application/octet-stream"}
@@ -104,7 +105,7 @@ def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_sh
     assert (camera["width"], camera["height"]) == (40, 30)
 
 
-def test_a_query_may_be_a_body_too(served, hall, small_shots) -> None:
+def test_a_query_may_be_a_body_too(served, hall, small_shots):
     http, shot = served.client, small_shots[3]
     sent = http.put(f"{hall}/frames/asked", **shot.form(), headers={"Prefer": "wait=200"})
     assert sent.status_code == 201
@@ -130,9 +131,7 @@ def test_a_query_may_be_a_body_too(served, hall, small_shots) -> None:
         ({"fx": "40", "fy": "40", "cx": "1", "cy": "1", "priority": "high"}, "priority"),
     ],
 )
-def test_what_is_wrong_in_the_query_string_is_said(
-    served, hall, small_shots, params, reason
-) -> None:
+def test_what_is_wrong_in_the_query_string_is_said(served, hall, small_shots, params, reason):
     answer = served.client.post(
         f"{hall}/frames", content=small_shots[0].png, params=params,
         headers={"Content-Type": "image/png"},
@@ -141,7 +140,7 @@ def test_what_is_wrong_in_the_query_string_is_said(
     assert reason in answer.text
 
 
-def test_other_types_and_no_json_are_refused(served, hall, small_shots, refused) -> None:
+def test_other_types_and_no_json_are_refused(served, hall, small_shots, refused):
     http = served.client
     jpeg = http.post(f"{hall}/frames", content=b"x", headers={"Content-Type": "image/jpeg"})
     refused(jpeg, 415, "unsupported-type", "image/png")
@@ -156,7 +155,7 @@ def test_other_types_and_no_json_are_refused(served, hall, small_shots, refused)
     refused(no_json, 400, "malformed-body", "not JSON")
 
 
-def test_a_key_makes_an_upload_take_effect_once(served, hall, small_shots, refused) -> None:
+def test_a_key_makes_an_upload_take_effect_once(served, hall, small_shots, refused):
     http, shot, key = served.client, small_shots[5], {"Idempotency-Key": "upload 1"}
     first = http.post(f"{hall}/frames", **shot.form(session="k"), headers=key)
     assert "idempotent-replayed" not in first.headers
@@ -187,9 +186,7 @@ def batch(shots: list[Any], metas: object, **fields: str) -> dict[str, Any]:
     return {"files": files, "data": {"metas": json.dumps(metas), **fields}}
 
 
-def test_a_batch_that_is_none_is_refused_whole(
-    served, hall, small_shots, refused: Callable[..., Any]
-) -> None:
+def test_a_batch_that_is_none_is_refused_whole(served, hall, small_shots, refused):
     http, shot, meta = served.client, small_shots[12], {"intrinsics": small_shots[12].camera}
 
     def post(**sent: Any) -> httpx.Response:
@@ -207,24 +204,21 @@ def test_a_batch_that_is_none_is_refused_whole(
     assert not any(one["bytes"] == len(shot.png) for one in frames)
 
 
-def test_up_goes_there_and_back(served, make_map, small_shots):
-    path, told = make_map(served, "ups"), {"x": 0.6, "y": -0.8, "z": 0.0}
-    sent = served.client.post(f"{path}/frames", **small_shots[0].form(up=told))
-    assert sent.status_code == 202, sent.text
-    frame = f"{path}/frames/{sent.json()['frame_id']}"
-    assert served.client.get(frame).json()["up"] == pytest.approx(told)
-    listed = served.client.get(f"{path}/frames").json()["items"]
-    assert [one["up"] for one in listed] == [pytest.approx(told)]
-    # the same as a list, and beside a frame that is the body
-    again = served.client.post(f"{path}/frames", **small_shots[0].form(up=[0.6, -0.8, 0]))
-    camera = {name: str(value) for name, value in small_shots[0].camera.items()}
-    bare = served.client.post(
-        f"{path}/frames", params={**camera, "up": "0.6,-0.8,0"}, content=small_shots[0].png,
-        headers={"Content-Type": "image/png"},
-    )  # fmt: skip
-    assert [(one.status_code, one.json()["frame_id"]) for one in (again, bare)] == [
-        (200, sent.json()["frame_id"])
-    ] * 2
-    edited = served.client.patch(frame, json={"up": [0, 0, 1]})
-    assert edited.json()["up"] == {"x": 0, "y": 0, "z": 1}
-    assert served.client.patch(frame, json={"up": None}).json()["up"] is None
+@pytest.mark.parametrize("given", ["11", "1.0", "high", "", "٣"])
+def test_a_priority_is_a_small_whole_number(served, hall, small_shots, refused, given):
+    form = small_shots[30].form()
+    form["data"] |= {"priority": given}
+    problem = refused(served.client.post(f"{hall}/frames", **form), 422, "invalid-request")
+    assert [one["field"] for one in problem["errors"]] == ["priority"]
+    query = served.client.post(f"{hall}/queries", **form)
+    refused(query, 422, "invalid-request", "an unknown part 'priority'")
+
+
+def test_a_frame_says_its_priority(served, hall, small_shots):
+    for shot, given, told in ((31, "-10", -10), (32, "+3", 3), (33, None, 0)):
+        form = small_shots[shot].form()
+        form["data"] |= {} if given is None else {"priority": given}
+        answer = served.client.post(f"{hall}/frames", **form)
+        assert answer.status_code == 202, answer.text
+        job = served.client.get(answer.headers["location"]).json()
+        assert job["priority"] == told
